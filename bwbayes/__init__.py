@@ -1,0 +1,1 @@
+"""Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model."""

@@ -1,0 +1,341 @@
+"""From the columns of a file to a record that can be trusted.
+
+Every reader turns its file into a :class:`Table`: columns as they stand in the file, with the
+units in their names. :func:`build_record` converts the units and checks what all formats share:
+lengths, finite numbers, a uniform time grid, a voltage and a displacement that move. A problem is
+one line, ``file:line: column: problem; what to do``; files without lines name the sample, counted
+from 0.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.data.record import Record, VoltageIs, require_voltage_is
+from bwbayes.errors import InputError, InputWarning
+
+__all__ = ["MINIMUM_SAMPLES", "Column", "Table", "build_record", "named_columns", "parse_name"]
+
+MINIMUM_SAMPLES = 10
+MAXIMUM_SAMPLES = 10**8
+
+# Powers of ten that lead from a column's unit to s, V and um. Both micro signs of Unicode count.
+_TIME = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
+_VOLTAGE = {"V": 0, "mV": -3, "kV": 3, "uV": -6, "µV": -6, "μV": -6}
+_LENGTH = {"um": 0, "µm": 0, "μm": 0, "nm": -3, "mm": 3, "m": 6}
+_UNITS = {"time": _TIME, "voltage": _VOLTAGE, "displacement": _LENGTH, "truth": _LENGTH}
+_NAMES = {
+    "time": "time_s",
+    "voltage": "voltage_V",
+    "displacement": "displacement_um",
+    "truth": "truth_um",
+}
+_SHORTEST = 1e-12  # s
+_LATEST = 1e12  # s
+_LARGEST = 1e9  # V or um: beyond it a unit is wrong, whatever the actuator
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column as it stands in a file: its name there, its values, its power of ten."""
+
+    name: str
+    values: NDArray[Any]
+    power: int
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
+
+    `notes` holds what the file says in words: `voltage_is`, `origin`, `interval_s`. `first_line`
+    is the line of the first sample in a text file. `names` are all names that the file has.
+    """
+
+    path: Path
+    columns: Mapping[str, Column]
+    notes: Mapping[str, str] = field(default_factory=dict)
+    first_line: int | None = None
+    names: tuple[str, ...] = ()
+
+    def error(self, problem: str, quantity: str = "", sample: int | None = None) -> InputError:
+        """Return the error ``file:line: column: problem``; sample and quantity may be left out."""
+        where = str(self.path)
+        if sample is not None and self.first_line is not None:
+            where += f":{self.first_line + sample}"
+        elif sample is not None:
+            where += f":sample {sample}"
+        if quantity in self.columns:
+            where += f": {self.columns[quantity].name}"
+        elif quantity:
+            where += f": {_NAMES[quantity]}"
+        return InputError(f"{where}: {problem}")
+
+
+def parse_name(name: str) -> tuple[str, int]:
+    """Return quantity and power of ten of a column's name, such as ``voltage_mV``.
+
+    Raises
+    ------
+    ValueError
+        With the text ``problem; what to do`` if the name is none that is known.
+    """
+    quantity, _, unit = name.strip().rpartition("_")
+    units = _UNITS.get(quantity.lower())
+    if units is None and name.strip().lower() in _UNITS:
+        raise ValueError(f"no unit in the name; write {_NAMES[name.strip().lower()]}")
+    if units is None:
+        known = [_NAMES[key] for key in ("time", "voltage", "displacement")]
+        near = difflib.get_close_matches(name.strip(), known, 1, 0.4)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        raise ValueError(f"unknown column; {hint}")
+    if unit not in units:
+        raise ValueError(f"unknown unit {unit!r}; write one of {', '.join(units)}")
+    return quantity.lower(), units[unit]
+
+
+def named_columns(
+    path: Path, names: Iterable[str], size: Callable[[str], int], load: Callable[[str], Any]
+) -> dict[str, Column]:
+    """Return the columns among the named arrays of a binary file; other arrays are passed over.
+
+    `size` gives the number of values of an array before `load` reads it, so that a damaged file
+    cannot ask for all memory.
+    """
+    columns: dict[str, Column] = {}
+    for name in names:
+        try:
+            quantity, power = parse_name(name)
+        except ValueError:
+            continue
+        if quantity in columns:
+            problem = f"{name}: {quantity} is also in {columns[quantity].name}; remove one"
+            raise InputError(f"{path}: {problem}")
+        if size(name) > MAXIMUM_SAMPLES:
+            raise InputError(f"{path}: {name}: {size(name)} values; give at most {MAXIMUM_SAMPLES}")
+        columns[quantity] = Column(name, _real_vector(path, name, load(name)), power)
+    return columns
+
+
+def _real_vector(path: Path, name: str, values: Any) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        kinds = {"c": "complex numbers", "b": "logical values"}
+        problem = kinds.get(array.dtype.kind, "text or another type that is no number")
+        raise InputError(f"{path}: {name}: holds {problem}; store real numbers")
+    if array.size != max(array.shape, default=1):
+        raise InputError(f"{path}: {name}: shape {array.shape} is no vector; store one row")
+    return array.ravel()
+
+
+def build_record(
+    table: Table, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
+) -> Record:
+    """Return the record of a table after all checks that do not depend on the format.
+
+    Parameters
+    ----------
+    voltage_is : "command", "output" or None
+        Overrides what the file says; None leaves it to the file, and "output" if it says nothing.
+    need_displacement : bool
+        False also accepts a planned voltage without a displacement column.
+
+    Raises
+    ------
+    InputError
+        For the first problem found, in one line.
+
+    Warns
+    -----
+    InputWarning
+        If the displacement looks clipped.
+    """
+    needed = ["time", "voltage"] + ["displacement"] * need_displacement
+    _check_lengths(table, needed)
+    start, interval = _time_grid(table)
+    values = {name: _converted(table, name) for name in table.columns if name != "time"}
+    samples = values["voltage"].size
+    if samples < MINIMUM_SAMPLES:
+        raise table.error(f"too short, samples: {samples}; give at least {MINIMUM_SAMPLES}")
+    displacement = values.get("displacement")
+    _check_moving(table, "voltage", values["voltage"])
+    if displacement is not None:
+        _check_moving(table, "displacement", displacement)
+        _warn_if_clipped(table, values["voltage"], displacement)
+    try:
+        kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
+    except InputError as error:
+        raise table.error(str(error)) from error
+    origin = table.notes.get("origin") or table.path.name
+    return Record(
+        values["voltage"], displacement, interval, start, kind, origin, values.get("truth")
+    )
+
+
+def _check_lengths(table: Table, needed: Iterable[str]) -> None:
+    for quantity in needed:
+        if quantity not in table.columns:
+            names = [name for name in table.names if name]
+            near = difflib.get_close_matches(_NAMES[quantity], names, 1)
+            found = f"did you mean {near[0]!r}?" if near else f"found: {', '.join(names[:10])}"
+            header = None if table.first_line is None else -1  # the line above the first sample
+            raise table.error(f"missing; add it ({found})", quantity, header)
+    samples = table.columns["time"].values.size
+    for quantity, column in table.columns.items():
+        if column.values.size != samples:
+            problem = f"{column.values.size} values where time has {samples}; store one per time"
+            raise table.error(problem, quantity)
+    if samples < 2:
+        raise table.error(f"too short, samples: {samples}; give at least {MINIMUM_SAMPLES}")
+
+
+def _converted(table: Table, quantity: str) -> FloatArray:
+    """Return a column in the package's unit after refusing what is not finite or absurdly large."""
+    column = table.columns[quantity]
+    with np.errstate(all="ignore"):
+        values = np.asarray(column.values, dtype=np.float64)
+        values = _scaled(values, column.power)
+        refused = ~(np.abs(values) <= (_LATEST if quantity == "time" else _LARGEST))
+    if refused.any():
+        sample = int(np.argmax(refused))
+        raw = column.values[sample]
+        if np.isfinite(raw):
+            problem = f"{raw:g} is absurdly large; check the unit in the column's name"
+        else:
+            problem = f"{raw} is not a finite number; mend or remove the sample"
+        raise table.error(problem, quantity, sample)
+    return values
+
+
+def _scaled(values: FloatArray, power: int) -> FloatArray:
+    # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
+    return values * 10.0**power if power >= 0 else values / 10.0**-power
+
+
+def _time_grid(table: Table) -> tuple[float, float]:
+    """Return start and interval in s of the time column after checking that it is uniform."""
+    column = table.columns["time"]
+    time = _converted(table, "time")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        sample = int(np.argmax(steps <= 0))
+        before, after = time[sample], time[sample + 1]
+        if after == before:
+            problem = f"{after:.9g} s is repeated; remove one of the two samples"
+        else:
+            problem = f"time goes back from {before:.9g} s to {after:.9g} s; sort the samples"
+        raise table.error(problem, "time", sample + 1)
+    interval = float((time[-1] - time[0]) / steps.size)
+    if np.median(steps) < _SHORTEST:
+        problem = f"steps of {np.median(steps):.3g} s are absurdly small; check the unit"
+        raise table.error(problem, "time")
+    tolerance = _time_tolerance(time, interval, column)
+    deviation = np.abs(time - (time[0] + interval * np.arange(time.size)))
+    if not (deviation <= tolerance).all():
+        raise _uneven(table, time, steps, deviation)
+    return float(time[0]), _declared_interval(table, interval, tolerance / steps.size)
+
+
+def _time_tolerance(time: FloatArray, interval: float, column: Column) -> float:
+    """Return how far a time may be off the grid: 1 % of the interval, or what printing rounds off.
+
+    Rounding moves a time and the grid's ends by half a unit of the last decimal each. A whole
+    unit is already an uneven sample, and 0.4 intervals keep a missing sample apart from rounding.
+    """
+    largest = float(np.abs(time).max())
+    rounded = 0.0
+    digits = math.floor(math.log10(interval))
+    for unit in (10.0**digits, 10.0 ** (digits - 1), 10.0 ** (digits - 2)):
+        counts = time / unit
+        if np.all(np.abs(counts - np.rint(counts)) <= 1e-6 + 1e-15 * np.abs(counts)):
+            rounded = 0.999 * unit
+            break
+    if column.values.dtype.kind == "f":
+        rounded = max(rounded, largest * float(np.finfo(column.values.dtype).eps))
+    return max(0.01 * interval, min(rounded, 0.4 * interval))
+
+
+def _uneven(table: Table, time: FloatArray, steps: FloatArray, deviation: FloatArray) -> InputError:
+    """Return the error that says where the times leave the grid, and by how much."""
+    usual = float(np.median(steps))
+    off = np.abs(steps - usual) > _time_tolerance(time, usual, table.columns["time"])
+    if not off.any():
+        sample = int(np.argmax(deviation))
+        problem = f"irregular sampling: {deviation[sample]:.3g} s off the uniform grid"
+        return table.error(f"{problem}; resample it or print more decimals", "time", sample)
+    sample = int(np.argmax(off)) + 1
+    step, before = float(steps[sample - 1]), float(time[sample - 1])
+    if step > 1.5 * usual:
+        missing = round(step / usual) - 1
+        problem = f"gap of {step:.6g} s after {before:.9g} s, about {missing} missing"
+        return table.error(f"{problem}; fill it or cut the record there", "time", sample)
+    problem = f"irregular sampling: {step:.6g} s after the sample before, {usual:.6g} s elsewhere"
+    return table.error(f"{problem}; resample it on a uniform grid", "time", sample)
+
+
+def _declared_interval(table: Table, measured: float, tolerance: float) -> float:
+    """Return the interval that the file declares, to the last bit, if its times agree with it."""
+    text = table.notes.get("interval_s")
+    if text is None:
+        return float(f"{measured:.12g}")  # the digits after these are the rounding of the times
+    try:
+        declared = float(text)
+    except ValueError:
+        declared = math.nan
+    if not (declared > 0 and abs(declared - measured) <= tolerance):
+        problem = f"interval_s {text!r} contradicts the time column, {measured:.9g} s"
+        raise table.error(f"{problem}; remove or correct it")
+    return declared
+
+
+def _check_moving(table: Table, quantity: str, values: FloatArray) -> None:
+    if np.ptp(values) == 0:
+        problem = f"constant at {values[0]:g}; give a record in which it moves"
+        raise table.error(problem, quantity)
+
+
+def _warn_if_clipped(table: Table, voltage: FloatArray, displacement: FloatArray) -> None:
+    """Warn if the displacement stays at its largest or smallest value while the voltage moves on.
+
+    A coarse sensor repeats its extreme value too, in two ways that are harmless. At rest the
+    voltage stands still: only runs in which it travels count, over 2 % of its range and over what
+    three steps of the sensor are worth. At a smooth peak the next level lasts as well: a parabola
+    stays at its top level up to 2.4 times as long as at the next, a clipped one far longer.
+    """
+    levels = np.unique(displacement)
+    if levels.size < 3:
+        return
+    resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
+    travel = max(0.02, 3 * resolution) * float(np.ptp(voltage))
+    padded = np.append(voltage, voltage[-1])  # so that a run may end behind the last sample
+    for side, extreme, following in (("largest", -1, -2), ("smallest", 0, 1)):
+        first, last = _runs(displacement == levels[extreme])
+        borders = np.column_stack([first, last]).ravel()
+        highest = np.maximum.reduceat(padded, borders)[::2]
+        lowest = np.minimum.reduceat(padded, borders)[::2]
+        stuck = (last - first >= 5) & (highest - lowest > travel)
+        held = int((last - first)[stuck].sum())
+        if held >= 10 and held > 3 * np.count_nonzero(displacement == levels[following]):
+            where = table.error(
+                f"clipped sensor? {held} samples stay at the {side} value {levels[extreme]:g} um"
+                " while the voltage moves; leave these times out or use a wider range",
+                "displacement",
+                int(first[stuck][0]),
+            )
+            warnings.warn(str(where), InputWarning, stacklevel=2)
+
+
+def _runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return first index and index after the last one of every run of true values."""
+    edges = np.diff(mask.astype(np.int8), prepend=0, append=0)
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)

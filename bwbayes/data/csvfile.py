@@ -1,0 +1,222 @@
+"""Records as text: ``time_s,voltage_V,displacement_um``, one sample per line.
+
+Lines ``# key: value`` may stand above the header; ``voltage`` (command or output), ``origin`` and
+``interval_s`` are understood, others are comments. NumPy's C parser reads the numbers; only when
+it fails does a slow pass look for the line that is wrong, and says what is wrong with it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.checks import Column, Table, parse_name
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+
+__all__ = ["read_csv", "write_csv"]
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
+_EXAMPLE = "time_s,voltage_V,displacement_um"
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+
+
+def read_csv(path: Path) -> Table:
+    """Return the columns of a text file.
+
+    Raises
+    ------
+    InputError
+        If the file is not UTF-8 text with a header of known columns above lines of numbers; the
+        text names the line and the column.
+    """
+    text = _decoded(path, path.read_bytes())
+    header_line, header, body, notes = _header_and_body(path, text)
+    columns = _header_columns(path, header_line, header)
+    ended = body.endswith("\n")
+    body = body.rstrip("\n ")
+    if not body:
+        raise InputError(f"{path}:{header_line}: no samples below the header; add them")
+    lines = body.split("\n")
+    values = _numbers(lines, len(columns))
+    names = [name for name, _, _ in columns]
+    if values is None:
+        raise _fault(f"{path}:", lines, names, header_line + 1, ended)
+    if not ended and _looks_cut(lines):
+        last = header_line + len(values)
+        raise InputError(f"{path}:{last}: {names[-1]}: the last line is cut off; remove it")
+    return Table(
+        path,
+        {quantity: Column(name, values[:, i], p) for i, (name, quantity, p) in enumerate(columns)},
+        notes,
+        first_line=header_line + 1,
+        names=tuple(names),
+    )
+
+
+def write_csv(record: Record, path: Path) -> None:
+    """Write a record as text, all floats with the shortest digits that give them back exactly."""
+    columns = {"time_s": record.time, "voltage_V": record.voltage}
+    if record.displacement is not None:
+        columns["displacement_um"] = record.displacement
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(f"# voltage: {record.voltage_is}\n")
+        if record.origin:
+            file.write(f"# origin: {record.origin}\n")
+        file.write(f"# interval_s: {record.interval!r}\n")
+        file.write(",".join(columns) + "\n")
+        texts = [map(repr, column.tolist()) for column in columns.values()]
+        file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def _decoded(path: Path, data: bytes) -> str:
+    """Return the text without a byte order mark and with line ends as on Unix."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: the text is UTF-16; save it as UTF-8")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        byte = f"0x{data[error.start]:02x}"
+        raise InputError(f"{path}:{line}: byte {byte} is not UTF-8; save it as UTF-8") from error
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise InputError(f"{path}:{line}: NUL byte; is the file binary or UTF-16? Save it as UTF-8")
+    return text
+
+
+def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, str]]:
+    """Return the header's line number, the header, the text below it, and the notes above it."""
+    notes: dict[str, str] = {}
+    offset = line = 0
+    while offset < len(text):
+        end = text.find("\n", offset)
+        end = len(text) if end < 0 else end
+        content = text[offset:end].strip(" ")
+        offset, line = end + 1, line + 1
+        if content.startswith("#"):
+            key, _, value = content[1:].partition(":")
+            key = key.strip().lower()
+            notes["voltage_is" if key == "voltage" else key] = value.strip()
+        elif content:
+            return line, content, text[offset:], notes
+    raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
+
+
+def _header_columns(path: Path, line: int, header: str) -> list[tuple[str, str, int]]:
+    """Return name, quantity and power of ten of every column."""
+    where = f"{path}:{line}:"
+    for separator, words in _SEPARATORS.items():
+        if separator in header:
+            raise InputError(f"{where} {words} separate the columns; separate them by commas")
+    if "," not in header and len(header.split()) > 1:
+        raise InputError(f"{where} blanks separate the columns; separate them by commas")
+    names = [cell.strip() for cell in header.split(",")]
+    if all(_NUMBER.fullmatch(name) for name in names):
+        raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
+    columns: list[tuple[str, str, int]] = []
+    for number, name in enumerate(names, start=1):
+        try:
+            quantity, power = parse_name(name)
+        except ValueError as error:
+            raise InputError(
+                f"{where} {_quoted(name)[1:-1] or f'column {number}'}: {error}"
+            ) from None
+        if quantity == "truth":
+            raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
+        if quantity in [known for _, known, _ in columns]:
+            raise InputError(f"{where} {name}: second {quantity} column; remove one")
+        columns.append((name, quantity, power))
+    return columns
+
+
+def _numbers(lines: list[str], columns: int) -> FloatArray | None:
+    """Return the numbers, (samples, columns), or None if any is missing, wrong or not finite."""
+    try:
+        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    if values.shape != (len(lines), columns) or not np.isfinite(values).all():
+        return None
+    return values
+
+
+def _fault(
+    where: str, lines: list[str], names: list[str], first_line: int, ended: bool
+) -> InputError:
+    """Return the error that names the first line that cannot be read."""
+    for number, line in enumerate(lines, start=first_line):
+        fault = _fault_in_line(line, names)
+        if fault is None:
+            continue
+        column, problem = fault
+        last = number == first_line + len(lines) - 1
+        if last and (not ended or problem.startswith("missing")):
+            problem = f"the last line is cut off ({problem.partition(';')[0]}); remove it"
+        return InputError(f"{where}{number}: {column + ': ' if column else ''}{problem}")
+    return InputError(f"{where} cannot be read as numbers; write it anew")
+
+
+def _fault_in_line(line: str, names: list[str]) -> tuple[str, str] | None:
+    """Return column and ``problem; what to do`` of a line, or None if nothing is wrong."""
+    if not line.strip():
+        return "", "empty line; remove it"
+    if line.lstrip().startswith("#"):
+        return "", "comment among the samples; move it above the header"
+    cells = [cell.strip() for cell in line.split(",")]
+    if len(cells) != len(names):
+        return _fault_in_fields(line, cells, names)
+    for name, cell in zip(names, cells, strict=True):
+        problem = _fault_in_cell(cell)
+        if problem:
+            return name, problem
+    return None
+
+
+def _fault_in_fields(line: str, cells: list[str], names: list[str]) -> tuple[str, str]:
+    for separator, words in _SEPARATORS.items():
+        if separator in line:
+            return "", f"{words} separate the fields; write commas, and points in numbers"
+    counts = f"{len(cells)} fields for {len(names)} columns"
+    if len(cells) < len(names):
+        return names[len(cells)], f"missing field, {counts}; complete the line or remove it"
+    halves = [bool(_INTEGER.fullmatch(a)) and b.isdecimal() for a, b in pairwise(cells)]
+    if any(halves):
+        column = names[min(halves.index(True), len(names) - 1)]
+        sure = len(cells) == 2 * len(names) and all(halves[::2])
+        problem = "decimal comma" if sure else "decimal comma or extra field"
+        return column, f"{problem}, {counts}; write 1.5 instead of 1,5"
+    return f"field {len(names) + 1}", f"extra field {_quoted(cells[-1])}, {counts}; remove it"
+
+
+def _fault_in_cell(cell: str) -> str | None:
+    if not cell:
+        return "empty cell; give a number or remove the line"
+    if _NUMBER.fullmatch(cell):
+        if math.isfinite(float(cell)):
+            return None
+        return f"{_quoted(cell)} is too large for a number; mend or remove the line"
+    if cell.lstrip("+-").lower() in ("nan", "inf", "infinity"):
+        return f"{_quoted(cell)} is not a finite number; mend or remove the line"
+    return f"{_quoted(cell)} is not a number; write it like 1.5 or 1.5e-3"
+
+
+def _looks_cut(lines: list[str]) -> bool:
+    """Whether the last number has fewer decimals than all the numbers above it have alike."""
+    cells = [line.rpartition(",")[2].strip() for line in lines[-50:]]
+    if len(cells) < 6 or any("e" in cell.lower() for cell in cells):
+        return False
+    decimals = [len(cell.partition(".")[2]) for cell in cells]
+    return len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
+
+
+def _quoted(cell: str) -> str:
+    """Return a cell as it may stand in a one-line message, or nothing for an empty one."""
+    return repr(cell if len(cell) <= 30 else cell[:30] + "...") if cell else ""

@@ -1,0 +1,234 @@
+"""One measurement of an actuator: voltage in, displacement out, sampled at a steady rate.
+
+A :class:`Record` is what every file is read into and what every later step starts from. Its units
+are volts, micrometres and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
+names the data exactly. Parts of a record are addressed by time: a window is the pair (start, stop).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.errors import InputError
+
+__all__ = ["Record", "Split", "VoltageIs", "Window", "require_voltage_is"]
+
+VoltageIs = Literal["command", "output"]
+"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
+
+Window = tuple[float, float]
+"""A stretch of time in s: start <= time < stop."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Training and held-out windows of one record, as slices of its samples.
+
+    The slices belong to the whole record, so that one simulation from its first sample serves
+    every window.
+    """
+
+    training: tuple[slice, ...]
+    held_out: tuple[slice, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Voltage and displacement on the uniform time grid ``start + interval * arange(samples)``.
+
+    Parameters
+    ----------
+    voltage : array (samples,), V
+    displacement : array (samples,), um, or None
+        None for a planned voltage without a measurement.
+    interval : float, s
+        Sampling interval.
+    start : float, s
+        Time of the first sample.
+    voltage_is : "command" or "output"
+        What the voltage column is: the command that a DAC holds until the next sample, or the
+        amplifier's output, which is continuous.
+    origin : str
+        Where the record comes from: a file's name or free text. Line breaks and other characters
+        that do not print become blanks.
+    truth : array (samples,), um, or None
+        Noise-free displacement, known for simulated records only.
+
+    Raises
+    ------
+    InputError
+        If an array is not a vector of finite numbers, lengths differ, the interval is not a
+        positive number, or `voltage_is` is unknown.
+    """
+
+    voltage: FloatArray
+    displacement: FloatArray | None
+    interval: float
+    start: float = 0.0
+    voltage_is: VoltageIs = "output"
+    origin: str = ""
+    truth: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        samples = np.size(self.voltage)
+        for name in ("voltage", "displacement", "truth"):
+            values = getattr(self, name)
+            if values is not None:
+                object.__setattr__(self, name, _frozen_vector(name, values, samples))
+        if not (math.isfinite(self.interval) and self.interval > 0):
+            raise InputError(f"interval: {self.interval} s is not a positive time; give it in s")
+        if not math.isfinite(self.start):
+            raise InputError(f"start: {self.start} s is not a time; give it in s")
+        object.__setattr__(self, "interval", float(self.interval))
+        object.__setattr__(self, "start", float(self.start))
+        object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
+        object.__setattr__(self, "origin", _printable(self.origin))
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.voltage.size
+
+    @property
+    def time(self) -> FloatArray:
+        """Times of the samples, (samples,), s."""
+        return self.start + self.interval * np.arange(self.samples, dtype=np.float64)
+
+    @property
+    def duration(self) -> float:
+        """Length of the record in s: samples times interval, the last one's included."""
+        return self.samples * self.interval
+
+    @property
+    def range_voltage(self) -> tuple[float, float]:
+        """Smallest and largest voltage, V."""
+        return float(self.voltage.min()), float(self.voltage.max())
+
+    @property
+    def sha256(self) -> str:
+        """Hex digest of the data: voltage, displacement, interval and start, not the origin."""
+        digest = hashlib.sha256(f"{self.samples} {self.displacement is not None}\n".encode())
+        digest.update(np.array([self.interval, self.start], dtype="<f8").tobytes())
+        digest.update(self.voltage.astype("<f8").tobytes())
+        if self.displacement is not None:
+            digest.update(self.displacement.astype("<f8").tobytes())
+        return digest.hexdigest()
+
+    def window_slice(self, start: float, stop: float) -> slice:
+        """Return the slice of the samples with start <= time < stop.
+
+        Times within half an interval of a border count as on it, so windows that share a border
+        share no sample and leave none out.
+
+        Raises
+        ------
+        InputError
+            If the window is empty or reaches outside the record; the text names the record's span.
+        """
+        # Whole samples from the record's start, rounded half down: border - interval/2 <= time.
+        first = math.ceil(_offset(self, start) - 0.5)
+        last = math.ceil(_offset(self, stop) - 0.5)
+        if first < 0 or last > self.samples:
+            problem = "reaches outside the record"
+        elif first >= last:
+            problem = "holds no sample"
+        else:
+            return slice(first, last)
+        raise InputError(
+            f"window {start:g} to {stop:g} s: {problem}; choose start < stop within"
+            f" {self.start:g} to {self.start + self.duration:g} s"
+        )
+
+    def window(self, start: float, stop: float) -> Record:
+        """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
+        return self._part(self.window_slice(start, stop))
+
+    def decimate(self, factor: int) -> Record:
+        """Return the record of every `factor`-th sample, from the first one on.
+
+        No filter is applied: a filter would round off the voltage's turning points, which the
+        hysteresis remembers. Leaving samples out moves them too, by less than one new interval, so
+        the decimated voltage drives a hysteresis only approximately as the whole one does.
+        """
+        if factor != int(factor) or factor < 1:
+            raise InputError(f"decimate: {factor} is not a whole number of samples; give 1 or more")
+        return self._part(slice(0, self.samples, int(factor)))
+
+    def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
+        """Return training and held-out windows as slices of this record.
+
+        Parameters
+        ----------
+        training, held_out : sequences of (start, stop), s
+
+        Raises
+        ------
+        InputError
+            If a window is empty or outside the record, if a training window overlaps a held-out
+            one (nothing would be held out) or another training window (samples would count twice).
+        """
+        trained = [(window, self.window_slice(*window)) for window in training]
+        held = [(window, self.window_slice(*window)) for window in held_out]
+        for index, (one, one_slice) in enumerate(trained):
+            for kind, others in (("training", trained[:index]), ("held-out", held)):
+                for other, other_slice in others:
+                    if one_slice.start < other_slice.stop and other_slice.start < one_slice.stop:
+                        raise InputError(
+                            f"training window {one[0]:g} to {one[1]:g} s: overlaps the {kind}"
+                            f" window {other[0]:g} to {other[1]:g} s; move one of them"
+                        )
+        return Split(tuple(part for _, part in trained), tuple(part for _, part in held))
+
+    def _part(self, part: slice) -> Record:
+        return replace(
+            self,
+            voltage=self.voltage[part],
+            displacement=None if self.displacement is None else self.displacement[part],
+            truth=None if self.truth is None else self.truth[part],
+            interval=self.interval * (part.step or 1),
+            start=self.start + self.interval * part.start,
+        )
+
+
+def require_voltage_is(text: str) -> VoltageIs:
+    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
+    for known in get_args(VoltageIs):
+        if text == known:
+            return known  # type: ignore[no-any-return]
+    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
+
+
+def _offset(record: Record, time: float) -> float:
+    """Return the samples from the start to `time`, cut off where it is outside anyway."""
+    offset = (time - record.start) / record.interval
+    if math.isnan(offset):
+        raise InputError(f"window: {time} s is not a time; give it in s")
+    return min(max(offset, -2.0), record.samples + 2.0)
+
+
+def _frozen_vector(name: str, values: ArrayLike, samples: int) -> FloatArray:
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not numbers ({error}); give real numbers") from error
+    if vector.ndim != 1 or vector.size == 0:
+        raise InputError(f"{name}: shape {vector.shape} is not a vector; give (samples,)")
+    if vector.size != samples:
+        raise InputError(f"{name}: {vector.size} samples, voltage has {samples}; give the same")
+    finite = np.isfinite(vector)
+    if not finite.all():
+        sample = int(np.argmin(finite))
+        raise InputError(f"{name}: {vector[sample]} at sample {sample}; give finite numbers")
+    vector.setflags(write=False)
+    return vector
+
+
+def _printable(text: str) -> str:
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

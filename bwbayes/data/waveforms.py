@@ -1,0 +1,399 @@
+"""The voltages that drive an actuator: the paper's signals, and parts to build others from.
+
+A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`,
+:class:`Multisine`) times an amplitude :class:`Decay`, switched on at a start time and sampled at a
+rate; a step is a staircase of one level. The paper's own signals are made of these parts by
+:func:`identification_signal`, :func:`verification_signal` and :func:`step_signal`, and
+:func:`signal` finds them by name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.errors import InputError
+
+__all__ = [
+    "Carrier",
+    "Decay",
+    "Multisine",
+    "Sine",
+    "Staircase",
+    "Triangle",
+    "Waveform",
+    "identification_signal",
+    "signal",
+    "signal_names",
+    "step_signal",
+    "verification_signal",
+]
+
+
+def _require_finite(where: str, value: float) -> None:
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {value} is not finite; give a finite number")
+
+
+def _require_positive(where: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{where}: {value} is not above zero; give a positive, finite number")
+
+
+def _require_not_negative(where: str, value: float) -> None:
+    if not (math.isfinite(value) and value >= 0):
+        raise InputError(f"{where}: {value} is below zero or not finite; give zero or more")
+
+
+class Carrier(Protocol):
+    """A voltage as a function of the time since its start."""
+
+    @property
+    def highest_frequency(self) -> float:
+        """Highest frequency that a sampling has to resolve, Hz."""
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+
+
+@dataclass(frozen=True)
+class _Periodic:
+    """What a sine and a triangle share."""
+
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = type(self).__name__.lower()
+        _require_finite(f"{where}: amplitude", self.amplitude)
+        _require_positive(f"{where}: frequency", self.frequency)
+        _require_finite(f"{where}: phase", self.phase)
+
+    @property
+    def highest_frequency(self) -> float:
+        """The fundamental frequency, Hz."""
+        return self.frequency
+
+
+class Sine(_Periodic):
+    """``v = amplitude sin(2 pi frequency t + phase)``: equation (1) of the paper.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    frequency : float
+        Hz, above zero.
+    phase : float
+        Phase at the start, rad; with pi the voltage goes down first.
+
+    Raises :class:`InputError` if a value is not finite or the frequency is not above zero.
+    """
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+        return self.amplitude * np.sin(2 * np.pi * self.frequency * elapsed + self.phase)
+
+
+class Triangle(_Periodic):
+    """A triangle with the zeros and peaks of the :class:`Sine` of the same parameters.
+
+    Its slope is ``+-4 amplitude frequency`` (V/s); the harmonics of its corners alias.
+    """
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+        cycles = self.frequency * elapsed + self.phase / (2 * np.pi)
+        return self.amplitude * (4 * np.abs((cycles + 0.75) % 1.0 - 0.5) - 1)
+
+
+@dataclass(frozen=True)
+class Staircase:
+    """Levels held one after the other; the last one stays.
+
+    Parameters
+    ----------
+    levels : tuple of float
+        Levels in V, in their order; at least one.
+    dwell : float
+        Time on each level, s, above zero.
+
+    Raises :class:`InputError` if there is no level, one is not finite or the dwell is not positive.
+    """
+
+    levels: tuple[float, ...]
+    dwell: float
+
+    def __post_init__(self) -> None:
+        if not self.levels:
+            raise InputError("staircase: levels: there is none; give at least one voltage")
+        for level in self.levels:
+            _require_finite("staircase: levels", level)
+        _require_positive("staircase: dwell", self.dwell)
+
+    @classmethod
+    def up_and_down(cls, amplitude: float, steps: int, dwell: float) -> Staircase:
+        """Build a staircase from zero to the amplitude (V) and back, so many equal steps each way.
+
+        Raises :class:`InputError` as the class does, and if there is no step.
+        """
+        if steps < 1:
+            raise InputError(f"staircase: steps: {steps} is too few; give at least one")
+        up = [amplitude * step / steps for step in range(steps + 1)]
+        return cls((*up, *up[-2::-1]), dwell)
+
+    @property
+    def highest_frequency(self) -> float:
+        """Frequency of a square wave of the same dwell, Hz; 0 for a single level."""
+        return 0.5 / self.dwell if len(self.levels) > 1 else 0.0
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+        # A sample at the very end of a level belongs to the next one, whatever the rounding.
+        passed = np.floor(elapsed / self.dwell + 1e-9)
+        index = np.minimum(passed, len(self.levels) - 1).astype(np.int64)
+        return np.asarray(self.levels, dtype=np.float64)[index]
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """A sum of sines, ``v = sum_i amplitude_i sin(2 pi frequency_i t + phase_i)``.
+
+    Parameters
+    ----------
+    sines : tuple of Sine
+        The components; at least one.
+
+    Raises :class:`InputError` if there is no component.
+    """
+
+    sines: tuple[Sine, ...]
+
+    def __post_init__(self) -> None:
+        if not self.sines:
+            raise InputError("multisine: sines: there is none; give at least one")
+
+    @classmethod
+    def flat(cls, amplitude: float, frequencies: tuple[float, ...]) -> Multisine:
+        """Build ``count`` equal sines of ``amplitude / count`` (V) each, with a low crest factor.
+
+        The phases are Schroeder's for a flat spectrum, ``-pi i (i - 1) / count``; the frequencies
+        are in Hz. Raises :class:`InputError` if there is none, or one that is not above zero.
+        """
+        count = len(frequencies)
+        phases = (-np.pi * i * (i - 1) / count for i in range(1, count + 1))
+        return cls(
+            tuple(Sine(amplitude / count, f, p) for f, p in zip(frequencies, phases, strict=True))
+        )
+
+    @property
+    def highest_frequency(self) -> float:
+        """The highest component's frequency, Hz."""
+        return max(sine.frequency for sine in self.sines)
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+        total = np.zeros_like(elapsed)
+        for sine in self.sines:
+            total += sine(elapsed)
+        return total
+
+
+@dataclass(frozen=True)
+class Decay:
+    """The factor that lets an amplitude die out; with rate 0, the default, it stays.
+
+    With ``e = max(0, t - start)`` the factor is ``max(0, 1 - rate e)`` (linear, equations (3) and
+    (4) of the paper) or ``exp(-rate e)`` (exponential).
+
+    Parameters
+    ----------
+    start : float
+        Time from which the amplitude decays, counted from the first sample, s.
+    rate : float
+        Decay rate, 1/s, not below zero.
+    kind : {"linear", "exponential"}
+        The law of the decay.
+
+    Raises :class:`InputError` if a value is not finite, the rate below zero or the kind unknown.
+    """
+
+    start: float = 0.0
+    rate: float = 0.0
+    kind: Literal["linear", "exponential"] = "linear"
+
+    def __post_init__(self) -> None:
+        _require_finite("decay: start", self.start)
+        _require_not_negative("decay: rate", self.rate)
+        if self.kind not in ("linear", "exponential"):
+            raise InputError(f"decay: kind: no {self.kind!r}; give 'linear' or 'exponential'")
+
+    def __call__(self, time: FloatArray) -> FloatArray:
+        """Return the factor (samples,) at the times (samples,) in s since the first sample."""
+        elapsed = np.maximum(time - self.start, 0.0)
+        if self.kind == "exponential":
+            return np.exp(-self.rate * elapsed)
+        return np.maximum(1.0 - self.rate * elapsed, 0.0)
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """A voltage that rests at its bias until a start time and then follows its carrier.
+
+    ``V(t) = bias`` before the start and ``V(t) = bias + carrier(t - start) decay(t)`` from then
+    on: equations (1) and (3) of the paper, whose bias is zero.
+
+    Parameters
+    ----------
+    carrier : Carrier
+        Voltage as a function of the time since the start.
+    duration : float
+        Length of the signal, s, above zero.
+    start : float
+        Time at which the carrier starts, s, not below zero and within the duration.
+    decay : Decay
+        Factor on the carrier; it counts time from the first sample, as the paper's q(t) does.
+    bias : float
+        V; it does not decay.
+
+    Raises :class:`InputError` if a value is not finite, the duration is not above zero or the start
+    is outside it.
+    """
+
+    carrier: Carrier
+    duration: float
+    start: float = 0.0
+    decay: Decay = Decay()
+    bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_positive("waveform: duration", self.duration)
+        _require_not_negative("waveform: start", self.start)
+        _require_finite("waveform: bias", self.bias)
+        if self.start >= self.duration:
+            raise InputError(
+                f"waveform: start: {self.start:g} s is not before the end at "
+                f"{self.duration:g} s; start earlier or make the signal longer"
+            )
+
+    def __call__(self, time: ArrayLike) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the first sample."""
+        times = np.asarray(time, dtype=np.float64)
+        driven = self.carrier(np.maximum(times - self.start, 0.0)) * self.decay(times)
+        return self.bias + np.where(times >= self.start, driven, 0.0)
+
+    def sample(self, rate: float) -> tuple[FloatArray, FloatArray]:
+        """Sample the waveform at ``t_k = k / rate`` over its duration, the end left out.
+
+        Parameters
+        ----------
+        rate : float
+            Sampling rate, Hz, more than twice the carrier's highest frequency.
+
+        Returns
+        -------
+        time : (samples,) array
+            s.
+        voltage : (samples,) array
+            V.
+
+        Raises :class:`InputError` if the rate is not above zero or too low for the carrier, or the
+        duration holds fewer than two samples.
+        """
+        _require_positive("sampling: rate", rate)
+        lowest = 2 * self.carrier.highest_frequency
+        if rate <= lowest:
+            raise InputError(
+                f"sampling: rate: {rate:g} Hz cannot resolve {lowest / 2:g} Hz; "
+                f"sample faster than {lowest:g} Hz"
+            )
+        samples = round(self.duration * rate)
+        if samples < 2:
+            raise InputError(
+                f"sampling: {self.duration:g} s at {rate:g} Hz is fewer than two samples; "
+                "sample faster or make the signal longer"
+            )
+        time = np.arange(samples) / rate
+        return time, self(time)
+
+
+def identification_signal() -> Waveform:
+    """Return the signal that the paper identifies its model with, equations (1)-(4).
+
+    Rest for 0.5 s, then a sine of 100 V and 1 Hz whose amplitude decays from 4 s on at 0.1 per
+    second; 16 s long, 16,000 samples at 1000 Hz.
+
+    Notes
+    -----
+    Two misprints are read as the text means them. Equation (2) lost its sine: it is
+    ``100 sin(2 pi t)``, whose phase at 0.5 s is pi, so the voltage goes down first. The factor
+    ``1 - 0.1 (t - 4)`` of equations (3) and (4) turns negative after 14 s; the text lets the
+    amplitude decay to zero, so from 14 s on the voltage is zero.
+    """
+    return Waveform(Sine(100.0, 1.0, phase=math.pi), 16.0, start=0.5, decay=Decay(4.0, 0.1))
+
+
+def verification_signal() -> Waveform:
+    """Return the signal that the paper verifies its model with (section 4.2).
+
+    Rest for 5 s, then a sine of 100 V and 0.1 Hz that decays from 25 s on.
+
+    Notes
+    -----
+    The paper gives neither the decay nor the length. ASSUMPTIONS: the amplitude decays linearly,
+    as in equation (3), at 0.05 per second, so it is zero from 45 s on; the signal is 50 s long;
+    the sine counts its phase from the first sample, as equation (2) does: ``100 sin(0.2 pi t)``
+    has the phase pi at 5 s, so the voltage goes down first here too.
+    """
+    return Waveform(Sine(100.0, 0.1, phase=math.pi), 50.0, start=5.0, decay=Decay(25.0, 0.05))
+
+
+def step_signal(amplitude: float) -> Waveform:
+    """Step from zero to the amplitude at 1 s; the paper's are 10, 50 and 100 V (its Fig. 5).
+
+    Parameters
+    ----------
+    amplitude : float
+        Height of the step, V.
+
+    Raises :class:`InputError` if the amplitude is not finite.
+
+    Notes
+    -----
+    The paper does not give the length. ASSUMPTION: 11 s, ten of them after the step.
+    """
+    return Waveform(Staircase((amplitude,), dwell=10.0), duration=11.0, start=1.0)
+
+
+def signal_names() -> tuple[str, ...]:
+    """Return the names that :func:`signal` knows."""
+    return ("identification", "verification", "step10", "step50", "step100")
+
+
+def signal(name: str) -> Waveform:
+    """Return one of the paper's signals by its name.
+
+    Parameters
+    ----------
+    name : {"identification", "verification", "step10", "step50", "step100"}
+        Which one.
+
+    Raises :class:`InputError` for any other; the text lists the names and the nearest one.
+    """
+    match name:
+        case "identification":
+            return identification_signal()
+        case "verification":
+            return verification_signal()
+        case "step10" | "step50" | "step100":
+            return step_signal(float(name.removeprefix("step")))
+    nearest = difflib.get_close_matches(name, signal_names(), n=1, cutoff=0.0)[0]
+    raise InputError(
+        f"signal: no {name!r}; did you mean {nearest!r}? (known: {', '.join(signal_names())})"
+    )

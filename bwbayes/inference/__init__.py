@@ -1,0 +1,1 @@
+"""From a record to a posterior: parameters, noise, point fit, sampling, convergence."""

@@ -1,0 +1,106 @@
+"""Prior distributions by the names engineers use, all of them scipy's.
+
+``normal``, ``lognormal``, ``uniform``, ``halfnormal`` and ``beta`` take the arguments one would
+write on paper; any other continuous distribution of ``scipy.stats`` goes by scipy's name, with
+scipy's shape arguments and ``loc`` and ``scale``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from bwbayes.errors import InputError
+
+__all__ = ["Distribution"]
+
+FAMILIAR = {
+    "normal": ("mean", "sd"),
+    "lognormal": ("median", "sigma"),
+    "uniform": ("lower", "upper"),
+    "halfnormal": ("scale",),
+    "beta": ("a", "b"),
+}
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A continuous distribution: its name and its arguments.
+
+    ``normal(mean, sd)``; ``lognormal(median, sigma)`` with sigma the sd of the logarithm;
+    ``uniform(lower, upper)``; ``halfnormal(scale)``; ``beta(a, b)`` on 0 to 1 or, with ``lower``
+    and ``upper``, between those; or a name and arguments of ``scipy.stats``.
+
+    Raises
+    ------
+    InputError
+        Unknown name, wrong arguments, or arguments outside the distribution's domain.
+    """
+
+    name: str
+    arguments: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, value in self.arguments.items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise InputError(f"{self.name}: {key} is {value!r}; give a number")
+            if not np.isfinite(value):
+                raise InputError(f"{self.name}: {key} is {value}; give a finite number")
+        middle = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
+        if not np.isfinite(middle).all() or not middle[0] < middle[2]:
+            raise InputError(f"{self}: no proper distribution; check its arguments")
+
+    def __str__(self) -> str:
+        inside = ", ".join(f"{key} = {value:.6g}" for key, value in self.arguments.items())
+        return f"{self.name}({inside})"
+
+    @cached_property
+    def frozen(self) -> Any:
+        """The frozen distribution of scipy."""
+        given = dict(self.arguments)
+        if self.name not in FAMILIAR:
+            return self._by_scipy_name(given)
+        wanted, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
+        missing = [key for key in wanted if key not in given]
+        unknown = [key for key in given if key not in (*wanted, *optional)]
+        if missing or unknown:
+            wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
+            raise InputError(f"{self.name}: {wrong}; it takes {', '.join((*wanted, *optional))}")
+        lower, upper = given.get("lower", 0.0), given.get("upper", 1.0)
+        if not lower < upper:
+            raise InputError(
+                f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
+            )
+        match self.name:
+            case "normal":
+                return stats.norm(given["mean"], given["sd"])
+            case "lognormal":
+                return stats.lognorm(given["sigma"], scale=given["median"])
+            case "uniform":
+                return stats.uniform(lower, upper - lower)
+            case "halfnormal":
+                return stats.halfnorm(scale=given["scale"])
+        return stats.beta(given["a"], given["b"], loc=lower, scale=upper - lower)
+
+    def _by_scipy_name(self, given: dict[str, float]) -> Any:
+        family = getattr(stats, self.name, None)
+        if not isinstance(family, stats.rv_continuous):
+            known = [*FAMILIAR, *(n for n, f in vars(stats).items() if _is_continuous(f))]
+            near = difflib.get_close_matches(self.name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(FAMILIAR)}"
+            raise InputError(f"{self.name}: unknown distribution; {hint}")
+        try:
+            return family(**given)
+        except TypeError:
+            takes = ", ".join(filter(None, [family.shapes, "loc", "scale"]))
+            raise InputError(f"{self.name}: wrong arguments; scipy's takes {takes}") from None
+
+
+def _is_continuous(candidate: object) -> bool:
+    return isinstance(candidate, stats.rv_continuous)

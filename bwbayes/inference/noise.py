@@ -1,0 +1,135 @@
+"""What the model leaves over: sensor noise, and honest discrepancy.
+
+The residual of a Bouc-Wen fit to a measured record is correlated over many samples: most of it is
+what the model does not know about the actuator. Calling it white makes the parameters look several
+times better known than they are. So the residual is the sum of two parts,
+
+    r(t) = x(t) + e(t),   x an Ornstein-Uhlenbeck process (sd σ, correlation time τ),   e white (s),
+
+and its exact log density costs one recursion over the samples: the innovations of the steady-state
+Kalman filter, which has constant coefficients, and one scalar correction for the start, where the
+filter is less sure than in the steady state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["DiscrepancyNoise", "Noise", "NoiseKind", "WhiteNoise", "noise_model"]
+
+NoiseKind = Literal["white", "discrepancy"]
+
+LOG_TWO_PI = float(np.log(2 * np.pi))
+
+
+class Noise(Protocol):
+    """A Gaussian model of the residual between a reading and the forward model."""
+
+    parameters: tuple[str, ...]
+
+    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
+        """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
+
+    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sd of the discrepancy and of the sensor, each (models,), um."""
+
+
+def noise_model(kind: NoiseKind, interval: float) -> Noise:
+    """Return the noise model of that name for samples ``interval`` seconds apart."""
+    return WhiteNoise() if kind == "white" else DiscrepancyNoise(interval)
+
+
+@dataclass(frozen=True)
+class WhiteNoise:
+    """Sensor noise alone: independent normal errors. Right only if the model is."""
+
+    parameters: tuple[str, ...] = ("sensor_sd",)
+
+    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return Σ log N(r; 0, s²); shapes as in :class:`Noise`."""
+        sensor = theta[:, 0]
+        squares = np.sum((residual / sensor[:, np.newaxis]) ** 2, axis=1)
+        samples = residual.shape[1]
+        density: FloatArray = -0.5 * squares - samples * (np.log(sensor) + 0.5 * LOG_TWO_PI)
+        return density
+
+    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """No discrepancy; sd of the sensor."""
+        return np.zeros(theta.shape[0]), theta[:, 0]
+
+
+@dataclass(frozen=True)
+class DiscrepancyNoise:
+    """Ornstein-Uhlenbeck discrepancy plus white sensor noise, exact in O(samples).
+
+    With φ = exp(−Δ/τ), q = σ² (1 − φ²): the predicted variance of x in the steady state is the
+    positive root p of p² + p (1 − φ²)(s² − σ²) = q s², an innovation has variance S = p + s², and
+    errors of the prediction die out by a = φ s²/S a sample. The steady-state innovations are
+
+        η[t] = r[t] − x̂[t],   x̂[t+1] = a x̂[t] + (φ − a) r[t],   x̂[0] = 0.
+
+    At the start x has its stationary variance, larger than p by δ = σ² − p. Put this surplus into
+    an unknown mean ξ ~ N(0, δ) of x[0]: it shifts η[t] by −aᵗ ξ, and integrating ξ out gives
+
+        log p(r) = Σ log N(η; 0, S) − ½ log(1 + δ A) + ½ B² δ / (1 + δ A),
+        A = Σ a²ᵗ / S,   B = Σ aᵗ η[t] / S.
+
+    Exact, and well behaved for σ → 0, s → 0 and any τ.
+
+    Parameters
+    ----------
+    interval
+        Sampling interval Δ, s.
+    """
+
+    interval: float
+    parameters: tuple[str, ...] = ("sensor_sd", "discrepancy_sd", "discrepancy_time")
+
+    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the exact log density; shapes as in :class:`Noise`."""
+        samples = residual.shape[1]
+        phi, variance, surplus, log_a = self._steady_state(theta)
+        a = np.exp(log_a)
+        eta_squares, b = np.empty_like(a), np.empty_like(a)
+        for row, values in enumerate(residual):
+            eta = lfilter((1.0, -phi[row]), (1.0, -a[row]), values)
+            eta_squares[row] = np.sum(eta * eta)
+            # Powers of a below exp(-40) add nothing.
+            memory = int(min(samples, 1 - 40 / log_a[row]))
+            b[row] = np.sum(np.power(a[row], np.arange(memory)) * eta[:memory])
+        gain = 1 + surplus / variance * np.expm1(2 * samples * log_a) / np.expm1(2 * log_a)
+        squares = (eta_squares - b**2 * surplus / variance / gain) / variance
+        logs = samples * (np.log(variance) + LOG_TWO_PI) + np.log(gain)
+        density: FloatArray = -0.5 * (squares + logs)
+        return density
+
+    def whiten(self, theta: FloatArray, series: FloatArray) -> FloatArray:
+        """Return steady-state innovations of series (rows, samples) over their sd, at one θ."""
+        phi, variance, _, log_a = (float(v[0]) for v in self._steady_state(theta))
+        innovations: FloatArray = lfilter((1.0, -phi), (1.0, -np.exp(log_a)), series, axis=1)
+        return innovations / np.sqrt(variance)
+
+    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Stationary sd of the discrepancy; sd of the sensor."""
+        return theta[:, 1], theta[:, 0]
+
+    def _steady_state(
+        self, theta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return φ, S, δ and log a, each (models,), without cancellation at either extreme."""
+        sensor, process = theta[:, 0] ** 2, theta[:, 1] ** 2
+        log_phi = -self.interval / theta[:, 2]
+        fresh = -np.expm1(2 * log_phi)
+        half = fresh * (process - sensor) / 2
+        root = np.sqrt(half**2 + fresh * process * sensor)
+        apart = np.where(half > 0, 1, root - half)
+        predicted = np.where(half > 0, half + root, fresh * process * sensor / apart)
+        with np.errstate(divide="ignore"):
+            log_a = np.minimum(log_phi - np.log1p(predicted / sensor), -1e-300)
+        return np.exp(log_phi), predicted + sensor, process - predicted, log_a

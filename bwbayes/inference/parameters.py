@@ -1,0 +1,260 @@
+"""Parameters: what they are called, what is known of them, and where they may lie.
+
+Each parameter is either fixed or has a prior. The priors are independent but for the physical
+constraints, which cut the joint prior: 0 < α < d, |γ| ≤ β, an initial state inside the hysteresis
+ceiling. :class:`JointPrior` draws from the cut prior and gives its log density, up to the one
+constant that the cut leaves, and maps parameters to coordinates without bounds and back, in which
+a posterior is nearly Gaussian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import expit, log_expit, logit
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.distributions import Distribution
+from bwbayes.model.boucwen import ceiling
+
+__all__ = ["JointPrior", "Parameter"]
+
+Values = dict[str, FloatArray]
+
+POSITIVE = (
+    "d",
+    "alpha",
+    "beta",
+    "lag",
+    "mass",
+    "damping",
+    "stiffness",
+    "sensor_sd",
+    "discrepancy_sd",
+    "discrepancy_time",
+)
+
+# A mapped coordinate beyond this is no actuator: exp(300) times anything.
+FARTHEST = 300.0
+
+# Stands for an infinite ceiling (β + γ = 0), um.
+HIGHEST_CEILING = 1e9
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter: names for people, and a prior or a fixed value.
+
+    ``lower`` and ``upper`` cut the prior; physical bounds hold besides. ``unit`` and ``label``
+    (LaTeX, without the dollar signs) go to tables and pictures.
+
+    Raises
+    ------
+    InputError
+        Neither prior nor fixed value, both, or bounds that leave nothing of the prior.
+    """
+
+    name: str
+    unit: str
+    label: str
+    description: str
+    prior: Distribution | None = None
+    fixed: float | None = None
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    def __post_init__(self) -> None:
+        if (self.prior is None) == (self.fixed is None):
+            raise InputError(f"{self.name}: give either a prior or a fixed value")
+        if self.fixed is not None:
+            self._check_fixed(self.fixed)
+        elif not self.mass_between[0] < self.mass_between[1]:
+            raise InputError(f"{self.name}: the bounds leave nothing of its prior; widen them")
+
+    def _check_fixed(self, value: float) -> None:
+        if not np.isfinite(value) or not self.lower <= value <= self.upper:
+            raise InputError(f"{self.name}: fixed at {value}; give a finite value in its bounds")
+        low = 1.0 if self.name == "exponent" else 0.0
+        if (self.name in POSITIVE and value <= 0) or (self.name == "exponent" and value < 1):
+            raise InputError(f"{self.name}: fixed at {value:g}; must be above {low:g}")
+
+    @cached_property
+    def support(self) -> tuple[float, float]:
+        """Where prior, bounds and sign allow the parameter."""
+        assert self.prior is not None
+        low, high = self.prior.frozen.support()
+        floor = 0.0 if self.name in POSITIVE else 1.0 if self.name == "exponent" else -np.inf
+        return max(float(low), self.lower, floor), min(float(high), self.upper)
+
+    @cached_property
+    def mass_between(self) -> tuple[float, float]:
+        """The prior's cumulative probability at both ends of the support."""
+        assert self.prior is not None
+        low, high = self.support
+        return float(self.prior.frozen.cdf(low)), float(self.prior.frozen.cdf(high))
+
+
+class JointPrior:
+    """The joint prior of the parameters, cut by the physical constraints.
+
+    Parameters
+    ----------
+    parameters
+        All parameters of the model and the noise, in the order of θ's columns; α after d, γ after
+        β, and the initial state after both, because their bounds depend on those.
+    """
+
+    def __init__(self, parameters: Iterable[Parameter]) -> None:
+        self.parameters = tuple(parameters)
+        self.names = tuple(p.name for p in self.parameters)
+        self.free = tuple(p for p in self.parameters if p.fixed is None)
+        self.free_names = tuple(p.name for p in self.free)
+        self._fixed = {p.name: p.fixed for p in self.parameters if p.fixed is not None}
+        self._check_fixed_pairs()
+
+    def _check_fixed_pairs(self) -> None:
+        fixed = self._fixed
+        if fixed.get("alpha", 0.0) >= fixed.get("d", np.inf):
+            raise InputError("alpha: fixed at or above d; must be below it")
+        if abs(fixed.get("gamma", 0.0)) > fixed.get("beta", np.inf):
+            raise InputError("gamma: fixed beyond beta; must lie between -beta and beta")
+
+    @property
+    def dimensions(self) -> int:
+        """The number of free parameters."""
+        return len(self.free)
+
+    def theta(self, free: FloatArray) -> FloatArray:
+        """Put free parameters (models, free) and fixed ones together: (models, parameters)."""
+        columns = dict(zip(self.free_names, free.T, strict=True))
+        ones = np.ones(free.shape[0])
+        return np.stack(
+            [columns[n] if n in columns else self._fixed[n] * ones for n in self.names], axis=1
+        )
+
+    def log_density(self, free: FloatArray) -> FloatArray:
+        """Log density (models,) of free parameters (models, free), up to a constant."""
+        values = self._values(free)
+        result = np.zeros(free.shape[0])
+        inside = np.ones(free.shape[0], dtype=bool)
+        for parameter in self.free:
+            assert parameter.prior is not None
+            result += parameter.prior.frozen.logpdf(values[parameter.name])
+            inside &= self._inside(parameter, values)
+        return np.where(inside, result, -np.inf)
+
+    def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
+        """Draw ``size`` vectors of free parameters, (size, free), from the cut prior.
+
+        Raises
+        ------
+        InputError
+            Fewer than one in ten thousand draws of the single priors meets the constraints.
+        """
+        kept = np.empty((0, self.dimensions))
+        tried = 0
+        while kept.shape[0] < size:
+            batch = np.stack([_draw_single(p, generator, size) for p in self.free], axis=1)
+            kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
+            tried += size
+            if kept.shape[0] < 1e-4 * tried - 10:
+                raise InputError("priors: hardly a draw has 0 < alpha < d and |gamma| <= beta")
+        return kept[:size]
+
+    def unconstrain(self, free: FloatArray) -> FloatArray:
+        """Map free parameters (models, free), inside their bounds, to coordinates."""
+        values = self._values(free)
+        columns = []
+        for parameter in self.free:
+            low, high = self._limits(parameter, values)
+            x = values[parameter.name]
+            if np.isfinite(low).all() and np.isfinite(high).all():
+                columns.append(logit((x - low) / (high - low)))
+            elif np.isfinite(low).all():
+                columns.append(np.log(x - low))
+            elif np.isfinite(high).all():
+                columns.append(-np.log(high - x))
+            else:
+                columns.append(x)
+        return np.clip(np.stack(columns, axis=1), *self._coordinate_limits)
+
+    def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates (models, free) to free parameters and the log Jacobian (models,).
+
+        A parameter between two bounds comes from a logistic, with one bound from an exponential,
+        without bounds as it is. As each bound depends on earlier parameters alone, the Jacobian is
+        triangular. It is −∞ where a coordinate is beyond anything physical.
+        """
+        values: Values = self._values(None, rows=coordinates.shape[0])
+        safe = np.clip(coordinates, *self._coordinate_limits)
+        log_jacobian = np.where((safe == coordinates).all(axis=1), 0.0, -np.inf)
+        for parameter, z in zip(self.free, safe.T, strict=True):
+            low, high = self._limits(parameter, values)
+            if np.isfinite(low).all() and np.isfinite(high).all():
+                # Where earlier parameters leave no room, the density is zero.
+                log_jacobian = np.where(low < high, log_jacobian, -np.inf)
+                width = np.where(low < high, high - low, 1.0)
+                x = low + width * expit(z)
+                log_jacobian += np.log(width) + log_expit(z) + log_expit(-z)
+            elif np.isfinite(low).all():
+                x = low + np.exp(z)
+                log_jacobian += z
+            elif np.isfinite(high).all():
+                x = high - np.exp(-z)
+                log_jacobian -= z
+            else:
+                x = z
+            values[parameter.name] = x
+        return np.stack([values[name] for name in self.free_names], axis=1), log_jacobian
+
+    @cached_property
+    def _coordinate_limits(self) -> tuple[FloatArray, FloatArray]:
+        mapped = [np.isfinite(p.support).any() or p.name in ("gamma", "initial") for p in self.free]
+        farthest = np.where(mapped, FARTHEST, np.inf)
+        return -farthest, farthest
+
+    def _values(self, free: FloatArray | None, rows: int = 0) -> Values:
+        size = rows if free is None else free.shape[0]
+        values = {name: np.full(size, value) for name, value in self._fixed.items()}
+        if free is not None:
+            values.update(zip(self.free_names, free.T, strict=True))
+        return values
+
+    def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Bounds (models,) of a parameter, given those that come before it."""
+        support_low, support_high = parameter.support
+        low = np.asarray(support_low)
+        high = np.asarray(support_high)
+        match parameter.name:
+            case "d" if "alpha" in self._fixed:
+                low = np.maximum(low, self._fixed["alpha"])
+            case "alpha" if "d" in values:
+                high = np.minimum(high, values["d"])
+            case "beta" if "gamma" in self._fixed:
+                low = np.maximum(low, abs(self._fixed["gamma"]))
+            case "gamma" if "beta" in values:
+                low, high = np.maximum(low, -values["beta"]), np.minimum(high, values["beta"])
+            case "initial":
+                top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
+                top = np.minimum(top, HIGHEST_CEILING)
+                low, high = np.maximum(low, -top), np.minimum(high, top)
+        return low, high
+
+    def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
+        low, high = self._limits(parameter, values)
+        x = values[parameter.name]
+        inside: BoolArray = (low <= x) & (x <= high)
+        if parameter.name in ("d", "alpha"):
+            inside &= (x > 0) & (values["alpha"] < values["d"])
+        return inside
+
+
+def _draw_single(parameter: Parameter, generator: np.random.Generator, size: int) -> FloatArray:
+    assert parameter.prior is not None
+    uniform = generator.uniform(*parameter.mass_between, size)
+    draws: FloatArray = np.asarray(parameter.prior.frozen.ppf(uniform), dtype=np.float64)
+    return draws

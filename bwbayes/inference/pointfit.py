@@ -1,0 +1,237 @@
+"""The point fit: where the posterior is, how wide it is, and what the data leave open.
+
+Least squares from several prior draws finds the optima of the physical parameters; from the best
+ones the posterior's own mode follows by Newton steps, with all noise parameters. The curvature
+there is the Gaussian approximation: it starts the sampler and is never the answer itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, optimize
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
+
+__all__ = ["PointFit", "fit"]
+
+# Prior draws that are tried, and the best of them that least squares starts from.
+DRAWS = 128
+STARTS = 8
+
+# Residuals that least squares looks at: more would not move an optimum it is only to find.
+RESIDUALS = 4000
+
+# An optimum less probable than the best by this much (nats per sample) is no place to start from.
+WORSE_PER_SAMPLE = 0.5
+
+# Optima whose sums of squares and coordinates agree to this part are one.
+SAME = 1e-2
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """The posterior's mode and its Gaussian approximation, in unconstrained coordinates.
+
+    ``mode`` (free,), ``covariance`` (free, free), ``log_density`` at the mode; ``optima``
+    (found, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
+    is that of the prior's draws.
+    """
+
+    mode: FloatArray
+    covariance: FloatArray
+    log_density: float
+    optima: FloatArray
+    prior_covariance: FloatArray
+
+
+def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
+    """Find the mode of a posterior and the Gaussian approximation there.
+
+    Raises
+    ------
+    InputError
+        No prior draw has a finite posterior density.
+    """
+    prior = posterior.prior
+    draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
+    centre, spread = np.median(draws, axis=0), np.cov(draws, rowvar=False)
+    density = posterior.log_density(draws[:DRAWS])
+    if not np.isfinite(density).any():
+        raise InputError("priors: no draw has a finite posterior density; check priors and record")
+    least_squares = _LeastSquares(posterior, centre, np.sqrt(np.diag(spread)))
+    starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
+    valleys = _valleys(least_squares, [least_squares.optimum(start) for start in starts])
+    modes = [_mode(posterior, valley, spread) for valley in valleys]
+    modes.sort(key=lambda mode: -mode.log_density)
+    best = modes[0]
+    worst = best.log_density - WORSE_PER_SAMPLE * least_squares.samples
+    optima = _distinct([m.place for m in modes if m.log_density > worst], best.covariance)
+    return PointFit(best.place, best.covariance, best.log_density, optima, spread)
+
+
+def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:
+    """Keep one place for each distinct optimum of least squares, the best first."""
+    costs = least_squares.costs(np.stack(places))
+    kept: list[int] = []
+    for i in np.argsort(costs, kind="stable").tolist():
+        apart = [
+            np.max(np.abs(places[i] - places[j]) / least_squares.spread) > SAME
+            or costs[i] > (1 + SAME) * costs[j]
+            for j in kept
+        ]
+        if all(apart):
+            kept.append(i)
+    return [places[i] for i in kept]
+
+
+class _LeastSquares:
+    """Least squares in the coordinates of the physical parameters, with a weak pull to the prior.
+
+    The noise parameters do not enter; they stay at the prior's median.
+    """
+
+    def __init__(self, posterior: Posterior, centre: FloatArray, spread: FloatArray) -> None:
+        self.posterior, self.centre, self.spread = posterior, centre, spread
+        self.physical = np.array([n in posterior.actuator.parameters for n in posterior.names])
+        rows = np.concatenate([np.arange(w.start, w.stop) for w in posterior.training])
+        self.samples = rows.size
+        self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
+        self.target = posterior.displacement[self.rows]
+        # A hundredth of the range is about what a Bouc-Wen model leaves over.
+        self.scale = 0.01 * float(np.ptp(self.target)) * np.sqrt(self.rows.size)
+
+    def residuals(self, coordinates: FloatArray) -> FloatArray:
+        """Residuals (models, rows + physical) at coordinates (models, free)."""
+        free, _ = self.posterior.prior.constrain(coordinates)
+        simulated = self.posterior.simulate(self.posterior.prior.theta(free))[:, self.rows]
+        pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
+        return np.concatenate([(simulated - self.target) / self.scale, 1e-2 * pull], axis=1)
+
+    def costs(self, coordinates: FloatArray) -> FloatArray:
+        """Sum of squares (models,)."""
+        return np.sum(self.residuals(coordinates) ** 2, axis=1)
+
+    def optimum(self, start: FloatArray) -> FloatArray:
+        """Return the coordinates (free,) of the optimum that ``start`` leads to."""
+        if not self.physical.any():
+            return self.centre
+
+        def place(values: FloatArray) -> FloatArray:
+            everywhere = np.tile(self.centre, (np.atleast_2d(values).shape[0], 1))
+            everywhere[:, self.physical] = values
+            return everywhere
+
+        def jacobian(values: FloatArray) -> FloatArray:
+            steps = 1e-5 * self.spread[self.physical]
+            both = np.concatenate([values + np.diag(steps), values - np.diag(steps)])
+            plus, minus = np.split(self.residuals(place(both)), 2)
+            slopes: FloatArray = ((plus - minus) / (2 * steps[:, np.newaxis])).T
+            return slopes
+
+        found = optimize.least_squares(
+            lambda values: self.residuals(place(values))[0],
+            start[self.physical],
+            jac=jacobian,
+            x_scale=self.spread[self.physical],
+            max_nfev=60,
+        )
+        return place(found.x)[0]
+
+
+@dataclass(frozen=True)
+class _Mode:
+    place: FloatArray
+    covariance: FloatArray
+    log_density: float
+
+
+def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
+    """Climb from a start (free,) to the mode it leads to, by Newton steps within a trust region."""
+    surface = _Surface(posterior, start, np.sqrt(np.diag(spread)))
+    place, curvature = start, None
+    for _ in range(4):
+        # Each round measures in the units of the last curvature: finite differences need them.
+        found = optimize.minimize(
+            surface.value,
+            surface.inwards(place),
+            jac=surface.gradient,
+            hess=surface.hessian,
+            method="trust-exact",
+            options={"gtol": 1e-2, "maxiter": 60},
+        )
+        place = surface.outwards(found.x)
+        curvature = surface.hessian(found.x)
+        settled = found.success and np.allclose(np.diag(curvature), 1, atol=0.2)
+        surface = surface.rescaled(place, curvature)
+        if settled:
+            break
+    return _Mode(
+        place, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(place)))
+    )
+
+
+class _Surface:
+    """Minus the log density over w, coordinates = centre + axes w, with batched differences."""
+
+    STEP = 0.1
+
+    def __init__(self, posterior: Posterior, centre: FloatArray, axes: FloatArray) -> None:
+        self.posterior, self.centre = posterior, centre
+        self.axes = np.diag(axes) if axes.ndim == 1 else axes
+        size = centre.size
+        one = self.STEP * np.eye(size)
+        pairs = [(i, j) for i in range(size) for j in range(i)]
+        self._pairs = tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
+        two = one[self._pairs[0]], one[self._pairs[1]]
+        self._star = np.concatenate([np.zeros((1, size)), one, -one])
+        self._cross = np.concatenate([two[0] + two[1], -two[0] - two[1]])
+
+    def outwards(self, w: FloatArray) -> FloatArray:
+        place: FloatArray = self.centre + w @ self.axes.T
+        return place
+
+    def inwards(self, place: FloatArray) -> FloatArray:
+        return linalg.solve(self.axes, place - self.centre)
+
+    def values(self, w: FloatArray) -> FloatArray:
+        # A finite wall keeps the trust region's arithmetic alive where the density is zero.
+        return np.minimum(-self.posterior.log_density(self.outwards(w)), 1e12)
+
+    def value(self, w: FloatArray) -> float:
+        return float(self.values(w[np.newaxis])[0])
+
+    def gradient(self, w: FloatArray) -> FloatArray:
+        _, plus, minus = np.split(self.values(w + self._star), [1, 1 + w.size])
+        slope: FloatArray = (plus - minus) / (2 * self.STEP)
+        return slope
+
+    def hessian(self, w: FloatArray) -> FloatArray:
+        here, plus, minus = np.split(self.values(w + self._star), [1, 1 + w.size])
+        forth, back = np.split(self.values(w + self._cross), 2)
+        i, j = self._pairs
+        cross = forth + back - plus[i] - plus[j] - minus[i] - minus[j] + 2 * here
+        result = np.diag((plus + minus - 2 * here) / self.STEP**2)
+        result[i, j] = result[j, i] = cross / (2 * self.STEP**2)
+        return result
+
+    def rescaled(self, centre: FloatArray, curvature: FloatArray) -> _Surface:
+        """Return the same surface, measured so that its curvature is the identity."""
+        size, directions = linalg.eigh((curvature + curvature.T) / 2)
+        # Where the surface is flat or bends the wrong way, keep the old unit of length.
+        axes = self.axes @ (directions / np.sqrt(np.maximum(size, 1e-2)))
+        return _Surface(self.posterior, centre, axes)
+
+
+def _distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
+    """Keep the places that lie more than a standard deviation or so from those before them."""
+    inverse = linalg.inv(covariance)
+    kept: list[FloatArray] = []
+    for place in places:
+        apart = [(place - other) @ inverse @ (place - other) for other in kept]
+        if all(distance > place.size for distance in apart):
+            kept.append(place)
+    return np.stack(kept)

@@ -1,0 +1,91 @@
+"""The posterior: forward model, noise and prior put together around one record.
+
+A :class:`Posterior` gives the log density of a batch of models in the unconstrained coordinates
+in which everything downstream works: the point fit, the sampler, the diagnostics. The model is
+simulated from the record's first sample; only the training windows enter the likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.noise import Noise
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.model.actuator import Actuator
+
+__all__ = ["Posterior"]
+
+# Models simulated together: enough to share the loop over turns, few enough for the cache.
+BATCH = 64
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The posterior of an actuator's parameters, given a record.
+
+    Parameters
+    ----------
+    voltage
+        (samples,), V, from the record's first sample on.
+    displacement
+        (samples,), um.
+    training
+        Slices of the samples that enter the likelihood. The discrepancy of one window is taken as
+        independent of that of the next, so windows should lie several correlation times apart.
+    actuator, noise, prior
+        The model; the prior's parameters are those of the actuator followed by those of the noise.
+    """
+
+    voltage: FloatArray
+    displacement: FloatArray
+    training: tuple[slice, ...]
+    actuator: Actuator
+    noise: Noise
+    prior: JointPrior
+
+    def __post_init__(self) -> None:
+        expected = (*self.actuator.parameters, *self.noise.parameters)
+        if self.prior.names != expected:
+            raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of the coordinates."""
+        return self.prior.free_names
+
+    def log_density(self, coordinates: FloatArray) -> FloatArray:
+        """Log density (models,) at coordinates (models, free): likelihood, prior and Jacobian.
+
+        −∞ where the prior is zero; never +∞. A density that is not a number comes out as −∞ too,
+        and :meth:`log_likelihood` shows it.
+        """
+        free, log_jacobian = self.prior.constrain(coordinates)
+        possible = np.isfinite(log_jacobian)
+        result = np.full(coordinates.shape[0], -np.inf)
+        result[possible] = self.prior.log_density(free[possible]) + log_jacobian[possible]
+        possible = np.isfinite(result)
+        if possible.any():
+            result[possible] += self.log_likelihood(self.prior.theta(free[possible]))
+        return result
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log likelihood (models,) at θ (models, parameters), fixed parameters included."""
+        pieces = range(0, theta.shape[0], BATCH)
+        return np.concatenate([self._piece(theta[i : i + BATCH]) for i in pieces])
+
+    def simulate(self, theta: FloatArray) -> FloatArray:
+        """Displacement (models, samples) up to the last training sample, um."""
+        end = max(window.stop for window in self.training)
+        model = theta[:, : len(self.actuator.parameters)]
+        return self.actuator.displacement(model, self.voltage[:end])
+
+    def _piece(self, theta: FloatArray) -> FloatArray:
+        residual = self.displacement[: max(w.stop for w in self.training)] - self.simulate(theta)
+        noise = theta[:, len(self.actuator.parameters) :]
+        parts = [self.noise.log_density(noise, residual[:, window]) for window in self.training]
+        total: FloatArray = np.sum(parts, axis=0)
+        return total

@@ -1,0 +1,151 @@
+"""The actuator: voltage in, displacement out, for a batch of parameter vectors at once.
+
+Hysteresis takes its part of the drive, w = d u − h, linear dynamics follow the drive, and the
+sensor adds its offset (equations (6) to (8) of the paper). An :class:`Actuator` says which dynamics
+there are, what the voltage does between samples, and how long those are apart; the parameters come
+as the columns of a matrix θ. A long record can be walked through in pieces: the
+:class:`State` at the end of one piece starts the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.linear import Hold, Recursion, first_order_lag, second_order
+
+__all__ = ["Actuator", "Dynamics", "State"]
+
+Dynamics = Literal["none", "lag", "second-order"]
+
+HYSTERESIS_PARAMETERS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a batch of models remembers after a piece of a record.
+
+    ``voltage`` is the last sample in V; ``hysteretic`` is h there, (models,), um; ``rest`` is the
+    drive at the record's first sample, at which the dynamics were at rest, (models,), um;
+    ``filter`` is the state of the recursion, (models, taps - 1).
+    """
+
+    voltage: float
+    hysteretic: FloatArray
+    rest: FloatArray
+    filter: FloatArray
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A Bouc-Wen actuator with linear dynamics.
+
+    Parameters
+    ----------
+    dynamics
+        ``"none"``; ``"lag"``, one first-order lag; ``"second-order"``, equation (7).
+    hold
+        ``"first"``: the drive goes straight from sample to sample (a measured voltage);
+        ``"zero"``: it is held until the next sample (the command of a DAC).
+    interval
+        Sampling interval, s.
+    """
+
+    dynamics: Dynamics = "lag"
+    hold: Hold = "first"
+    interval: float = 1e-3
+
+    @property
+    def dynamics_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of the dynamics."""
+        names: dict[Dynamics, tuple[str, ...]] = {
+            "none": (),
+            "lag": ("lag",),
+            "second-order": ("mass", "damping", "stiffness"),
+        }
+        return names[self.dynamics]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of θ's columns."""
+        return (*HYSTERESIS_PARAMETERS, *self.dynamics_parameters, "offset")
+
+    def displacement(self, theta: ArrayLike, voltage: ArrayLike) -> FloatArray:
+        """Displacement of every model along one voltage.
+
+        Parameters
+        ----------
+        theta
+            (models, parameters), the columns as in :attr:`parameters`: d, α in um/V; β, γ in
+            um^(1−n)/V; n; initial h in um; the lag in s, or mass, damping, stiffness in kg, N s/m,
+            N/m; offset in um.
+        voltage
+            (samples,), V.
+
+        Returns
+        -------
+        FloatArray
+            (models, samples), um.
+
+        Raises
+        ------
+        InputError
+            θ of a wrong shape or outside the model's domain (see
+            :func:`~bwbayes.model.boucwen.hysteresis`).
+        """
+        return self.advance(theta, voltage)[0]
+
+    def advance(
+        self, theta: ArrayLike, voltage: ArrayLike, state: State | None = None
+    ) -> tuple[FloatArray, State]:
+        """Displacement along the next piece of a record, and the state at its end.
+
+        Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here:
+        h is θ's initial one and the dynamics are at rest at the first drive.
+        """
+        models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
+        if models.ndim != 2 or models.shape[1] != len(self.parameters):
+            raise InputError(
+                f"theta: has shape {models.shape}; its columns are {', '.join(self.parameters)}"
+            )
+        path = np.asarray(voltage, dtype=np.float64)
+        column = dict(zip(self.parameters, models.T, strict=True))
+        recursion = self._recursion(column)
+        h = self._hysteresis(column, path, state)
+        drive = column["d"][:, np.newaxis] * path
+        drive -= h
+        rest = drive[:, 0].copy() if state is None else state.rest
+        memory = recursion.at_rest() if state is None else state.filter.copy()
+        # The recursion sees the drive's distance from rest, so that it starts at zero exactly.
+        drive -= rest[:, np.newaxis]
+        result = recursion.run(drive, memory)
+        result += (rest + column["offset"])[:, np.newaxis]
+        return result, State(float(path[-1]), h[:, -1].copy(), rest, memory)
+
+    def _hysteresis(
+        self, column: dict[str, FloatArray], path: FloatArray, state: State | None
+    ) -> FloatArray:
+        shape = {name: column[name] for name in ("alpha", "beta", "gamma", "exponent")}
+        if state is None:
+            return hysteresis(path, **shape, initial=column["initial"])
+        joined = np.concatenate([[state.voltage], path])
+        return hysteresis(joined, **shape, initial=state.hysteretic)[:, 1:]
+
+    def _recursion(self, column: dict[str, FloatArray]) -> Recursion:
+        for name in self.dynamics_parameters:
+            allowed = column[name] > 0 if name in ("mass", "stiffness") else column[name] >= 0
+            if not allowed.all():
+                raise InputError(f"{name}: {column[name].min():.6g}; must be positive")
+        if self.dynamics == "second-order":
+            return second_order(
+                column["mass"], column["damping"], column["stiffness"], self.interval, self.hold
+            )
+        lag = column["lag"] if self.dynamics == "lag" else np.zeros_like(column["d"])
+        if self.dynamics == "none":
+            return Recursion(np.ones((lag.size, 1)), np.ones((lag.size, 1)))
+        return first_order_lag(lag, self.interval, self.hold)

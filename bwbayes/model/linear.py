@@ -1,0 +1,162 @@
+"""Linear dynamics between the drive w = d u − h and the displacement x, exact at any step.
+
+Equation (7) of the paper divided by its stiffness, (m/k) x″ + (b/k) x′ + x = w, and as the smaller
+alternative one first-order lag, τ x′ + x = w. Both become a recursion on the samples that is exact
+for a drive that is held (zero-order, what a DAC does) or goes in straight lines between samples
+(first-order, for a measured voltage). No step is too long and no pole too fast.
+
+The coefficients are divided differences of the exponential, exp[0, z₁, z₂] and exp[0, 0, z₁, z₂]
+with z = pole x interval: written so, equal and nearly equal poles are not special.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["Hold", "Recursion", "first_order_lag", "second_order"]
+
+Hold = Literal["first", "zero"]
+
+# 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
+SERIES_TERMS = 20
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """x[t] = Σ numerator[i] w[t−i] − Σ denominator[i] x[t−i], for a batch of models.
+
+    ``numerator`` and ``denominator`` are (models, taps), ``denominator[:, 0]`` is one, and the
+    static gain is one.
+    """
+
+    numerator: FloatArray
+    denominator: FloatArray
+
+    def at_rest(self) -> FloatArray:
+        """Return the state (models, taps - 1) of a filter at rest at zero."""
+        return np.zeros((self.numerator.shape[0], self.numerator.shape[1] - 1))
+
+    def run(self, drive: FloatArray, state: FloatArray) -> FloatArray:
+        """Filter ``drive`` (models, samples) in place from ``state``, which moves on with it."""
+        for row, values in enumerate(drive):
+            values[:], state[row] = lfilter(
+                self.numerator[row], self.denominator[row], values, zi=state[row]
+            )
+        return drive
+
+
+def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
+    """Return the recursion of τ x′ + x = w.
+
+    Parameters
+    ----------
+    lag
+        τ, (models,), s, not negative; zero means no lag (with ``hold="zero"``: that of the hold,
+        because a sample is taken just before the held drive changes).
+    interval
+        Sampling interval, s.
+    hold
+        What the drive does between samples.
+    """
+    with np.errstate(divide="ignore"):
+        z = -interval / lag
+    decay = np.exp(z)
+    now = -_z_phi_2(z) if hold == "first" else np.zeros_like(z)
+    numerator = np.stack([now, -np.expm1(z) - now], axis=1)
+    return Recursion(numerator, np.stack([np.ones_like(decay), -decay], axis=1))
+
+
+def second_order(
+    mass: FloatArray, damping: FloatArray, stiffness: FloatArray, interval: float, hold: Hold
+) -> Recursion:
+    """Return the recursion of (m/k) x″ + (b/k) x′ + x = w, equation (7) of the paper.
+
+    The two poles are put in a row, x₁′ = λ₁ (x₁ − w) and x₂′ = λ₂ (x₂ − x₁), whose exact transition
+    over an interval has divided differences of exp as its entries; eliminating x₁ leaves a
+    recursion for the displacement x₂ with real coefficients, whether the poles are real, equal or
+    complex.
+
+    Parameters
+    ----------
+    mass, damping, stiffness
+        (models,), kg, N s/m, N/m; mass and stiffness positive, damping not negative.
+    interval
+        Sampling interval, s.
+    hold
+        What the drive does between samples.
+    """
+    decay = damping / (2 * mass)
+    natural = np.sqrt(stiffness / mass)
+    root = np.sqrt((decay - natural) * (decay + natural) + 0j)
+    fast = -(decay + root) * interval
+    # The slow pole from the product of both: their difference would cancel.
+    slow = (natural * interval) ** 2 / fast
+    both, step, ramp = _divided_differences(slow, fast)
+
+    e_slow, coupling, product = np.exp(slow), -fast * both, slow * fast
+    if hold == "first":
+        new_1, new_2 = -_z_phi_2(slow), product * ramp
+    else:
+        new_1, new_2 = np.zeros_like(slow), np.zeros_like(slow)
+    old_1, old_2 = -np.expm1(slow) - new_1, product * step - new_2
+    numerator = [
+        new_2,
+        old_2 + coupling * new_1 - e_slow * new_2,
+        coupling * old_1 - e_slow * old_2,
+    ]
+    # Both are sums over a conjugate pair or over real numbers: the imaginary part is rounding.
+    denominator = [np.ones_like(slow), -(e_slow + np.exp(fast)), np.exp(slow + fast)]
+    return Recursion(np.stack(numerator, axis=1).real, np.stack(denominator, axis=1).real)
+
+
+def _divided_differences(
+    slow: NDArray[np.complex128], fast: NDArray[np.complex128]
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return exp[z₁, z₂], exp[0, z₁, z₂] and exp[0, 0, z₁, z₂] for |z₁| ≤ |z₂|, Re z ≤ 0."""
+    both = np.exp(slow) * _phi_1(fast - slow)
+    near = np.abs(fast) < 1
+    apart = np.where(near, 1, fast)
+    step = (both - _phi_1(slow)) / apart
+    ramp = (step - _z_phi_2(slow) / np.where(slow == 0, 1, slow)) / apart
+    series_step, series_ramp = _series(np.where(near, slow, 0), np.where(near, fast, 0))
+    return both, np.where(near, series_step, step), np.where(near, series_ramp, ramp)
+
+
+def _series(slow: NDArray[Any], fast: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Sum exp[0, z₁, z₂] = Σ h_m/(m+2)! and exp[0, 0, z₁, z₂] = Σ h_m/(m+3)!.
+
+    h_m are the complete homogeneous polynomials, h_m = (z₁ + z₂) h_{m−1} − z₁ z₂ h_{m−2}.
+    """
+    before, polynomial = np.zeros_like(slow), np.ones_like(slow)
+    step, ramp, factorial = np.zeros_like(slow), np.zeros_like(slow), 2.0
+    for term in range(SERIES_TERMS):
+        step += polynomial / factorial
+        factorial *= term + 3
+        ramp += polynomial / factorial
+        before, polynomial = polynomial, (slow + fast) * polynomial - slow * fast * before
+    return step, ramp
+
+
+def _phi_1(z: NDArray[Any]) -> NDArray[Any]:
+    """(exp(z) − 1) / z, one at zero."""
+    safe = np.where(z == 0, 1, z)
+    return np.where(z == 0, 1, np.expm1(safe) / safe)
+
+
+def _z_phi_2(z: NDArray[Any]) -> NDArray[Any]:
+    """(exp(z) − 1 − z) / z, zero at zero; −1 for z = −∞."""
+    near = np.abs(z) < 1
+    inside = np.where(near, z, 0)
+    series, term = np.zeros_like(inside), np.ones_like(inside)
+    for order in range(2, SERIES_TERMS):
+        term = term * inside / order
+        series = series + term
+    outside = np.where(near, 1, z)
+    return np.where(near, series, np.expm1(outside) / outside - 1)

@@ -1,0 +1,304 @@
+"""The flow along one stretch against an integrator, closed forms, and properties of any flow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad, solve_ivp
+from scipy.special import hyp2f1
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.exponent import ExponentFlow
+
+EXPONENTS = (1.0, 1.05, 1.5, 2.0, 2.5, 3.0, 5.0, 10.0)
+ALPHA = 0.36
+# (beta, gamma) in units of alpha: ordinary, equal, opposite, gamma > beta, only one of them.
+SHAPES = ((1.0, 0.6), (1.0, 1.0), (1.0, -1.0), (0.7, 0.9), (1.0, -0.9), (1.0, 0.0), (0.0, 1.0))
+STARTS = (0.0, 0.3, -0.3, -0.8, 0.8)
+FAR_STARTS = (1.3, 3.0, -3.0, 40.0, -40.0)
+TRAVEL = np.array([0.0, 1e-3, 0.1, 0.4, 1.0, 1.9, 3.0, 5.0, 9.0, 30.0, 100.0])
+
+
+def flow(alpha: float, beta: float, gamma: float, exponent: float) -> ExponentFlow:
+    return ExponentFlow(*(np.array([value]) for value in (alpha, beta, gamma, exponent)))
+
+
+def advance(
+    parameters: tuple[float, float, float, float], start: float, travel: FloatArray
+) -> FloatArray:
+    displacement: FloatArray = flow(*parameters).advance(np.array([start]), travel)[0]
+    return displacement
+
+
+def integrate(
+    parameters: tuple[float, float, float, float], start: float, travel: FloatArray
+) -> FloatArray:
+    """Integrate the equation step by step, with a fresh start at the kink in g = 0."""
+    alpha, beta, gamma, n = parameters
+
+    def slope(_: float, g: FloatArray) -> FloatArray:
+        return np.asarray(alpha - (beta * np.sign(g) + gamma) * np.abs(g) ** n)
+
+    def solve(start: float, until: FloatArray) -> FloatArray:
+        if until.size == 0 or until[-1] == 0:
+            return np.full(until.size, start)
+        span = (0.0, float(until[-1]))
+        solution = solve_ivp(
+            slope, span, [start], "DOP853", until, rtol=1e-12, atol=1e-13 * max(1.0, abs(start))
+        )
+        return np.asarray(solution.y[0])
+
+    if start >= 0:
+        return solve(start, travel)
+    # Substituting p = t^2 takes the kink at p = 0 out of the quadrature.
+    zero, _ = quad(
+        lambda t: 2 * t / (alpha + (beta - gamma) * t ** (2 * n)),
+        0.0,
+        np.sqrt(-start),
+        epsabs=1e-14,
+        epsrel=1e-13,
+        limit=200,
+    )
+    before = travel[travel < zero]
+    after = travel[travel >= zero] - zero
+    return np.concatenate((solve(start, before), solve(0.0, after)))
+
+
+def scale(parameters: tuple[float, float, float, float], start: float) -> float:
+    """Largest |h| of a record: of the ceiling or the start, or the travel's reach without one."""
+    alpha, beta, gamma, n = parameters
+    reach = alpha * TRAVEL[-1]
+    ceiling = (alpha / (beta + gamma)) ** (1 / n) if beta + gamma > 0 else reach
+    return float(max(min(ceiling, reach), abs(start)))
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize(("beta", "gamma"), SHAPES)
+def test_agrees_with_an_integrator_inside_the_ceiling(
+    exponent: float, beta: float, gamma: float
+) -> None:
+    parameters = (ALPHA, beta * ALPHA, gamma * ALPHA, exponent)
+    ceiling = (1 / (beta + gamma)) ** (1 / exponent) if beta + gamma > 0 else 3.0
+    for part in STARTS:
+        start = part * ceiling
+        expected = integrate(parameters, start, TRAVEL)
+        got = advance(parameters, start, TRAVEL)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale(parameters, start))
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize(("beta", "gamma"), [pair for pair in SHAPES if pair[0] >= pair[1]])
+def test_agrees_with_an_integrator_from_far_outside(
+    exponent: float, beta: float, gamma: float
+) -> None:
+    parameters = (ALPHA, beta * ALPHA, gamma * ALPHA, exponent)
+    travel = TRAVEL[:-1]
+    for start in FAR_STARTS if exponent < 5 else FAR_STARTS[:3]:
+        expected = integrate(parameters, start, travel)
+        got = advance(parameters, start, travel)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale(parameters, start))
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_chained_stretches_stay_with_the_integrator(exponent: float) -> None:
+    parameters = (ALPHA, 0.6 * ALPHA, 0.4 * ALPHA, exponent)
+    lengths = np.random.default_rng(1).exponential(1.0, 40)
+    expected = got = 0.2
+    for length in lengths:
+        expected = -integrate(parameters, expected, np.array([length]))[0]
+        got = -advance(parameters, got, np.array([length]))[0]
+        assert expected == pytest.approx(got, abs=1e-10)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.05, 1.3, 2.0, 2.7, 10.0, 50.0])
+def test_many_stretches_equal_the_same_path_cut_into_more(exponent: float) -> None:
+    """Four hundred reversals, each stretch in one piece or in three: the errors do not pile up."""
+    one = flow(ALPHA, 0.7 * ALPHA, 0.6 * ALPHA, exponent)
+    lengths = np.random.default_rng(2).exponential(1.0, 400)
+    whole = cut = np.zeros(1)
+    for length in lengths:
+        whole = -one.advance(whole, np.array([length]))[:, -1]
+        for part in (0.2, 0.5, 0.3):
+            cut = one.advance(cut, np.array([part * length]))[:, -1]
+        cut = -cut
+        assert whole[0] == pytest.approx(cut[0], abs=1e-11)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1 + 1e-9, 1.05, 1.7, 3.3, 10.0, 50.0])
+def test_inverts_the_hypergeometric_travel_inside_the_ceiling(exponent: float) -> None:
+    """v(g) = (g/alpha) 2F1(1, 1/n; 1 + 1/n; (lambda/alpha) g^n), here with G = 1."""
+    height = np.concatenate((np.geomspace(1e-8, 0.5, 40), np.linspace(0.51, 0.98, 48)))
+    travel = height * hyp2f1(1.0, 1 / exponent, 1 + 1 / exponent, height**exponent) / ALPHA
+    got = advance((ALPHA, 0.6 * ALPHA, 0.4 * ALPHA, exponent), 0.0, travel)
+    np.testing.assert_allclose(got, height, rtol=1e-11)
+
+
+@pytest.mark.parametrize("exponent", [1.05, 1.7, 3.3, 10.0, 50.0])
+@pytest.mark.parametrize("ratio", [1 + 1e-9, 1.1, 2.0, 1e3, 1e5])
+def test_falls_from_any_height_by_the_hypergeometric_travel(exponent: float, ratio: float) -> None:
+    """For z > 1: tau = T(z) - T(z0), T(z) = z^(1-n)/(n-1) 2F1(1, 1-1/n; 2-1/n; z^-n).
+
+    The height after it is the test's choice, so the travel never loses the digits that count.
+    """
+    order = exponent - 1
+
+    def time_from_infinity(z: FloatArray) -> FloatArray:
+        power = order / exponent
+        return np.asarray(z**-order / order * hyp2f1(1.0, power, 1 + power, z**-exponent))
+
+    height = np.geomspace(ratio, 1.0 + 1e-3 * (ratio - 1), 30)[1:]
+    travel = time_from_infinity(height) - time_from_infinity(np.array(ratio))
+    # Where z0 and z are both far up, their difference holds the travel to this much only.
+    spread = 1e-13 * time_from_infinity(height) * (height**exponent - 1) / height
+    got = advance((1.0, 0.5, 0.5, exponent), ratio, travel)
+    assert np.all(np.abs(got / height - 1) < 1e-11 + spread)
+
+
+def test_exponent_two_is_tanh_above_zero_and_tan_below() -> None:
+    alpha, beta, gamma = 0.36, 0.03, 0.01
+    up, down = np.sqrt(alpha / (beta + gamma)), np.sqrt(alpha / (beta - gamma))
+    travel = np.linspace(0.0, 60.0, 700)
+    for start in (-1e3, -5.0, -1e-3):
+        zero = down / alpha * np.arctan(-start / down)
+        left, right = np.maximum(zero - travel, 0.0), np.maximum(travel - zero, 0.0)
+        expected = up * np.tanh(right * alpha / up) - down * np.tan(left * alpha / down)
+        got = advance((alpha, beta, gamma, 2.0), start, travel)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * max(up, -start))
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.0 + 1e-9])
+@pytest.mark.parametrize(("beta", "gamma"), [(0.02, 0.01), (0.02, 0.02), (0.02, -0.02), (0.0, 0.0)])
+def test_exponent_one_is_the_exponential(exponent: float, beta: float, gamma: float) -> None:
+    alpha, travel = 0.36, np.linspace(0.0, 150.0, 500)
+    with_up, with_down = (max(c, 1e-100) for c in (beta + gamma, beta - gamma))
+    for start in (0.0, 4.0, 50.0, -4.0, -30.0, -1e6):
+        if start < 0:
+            zero = np.log1p(-start * with_down / alpha) / with_down
+            early, late = np.minimum(travel, zero), np.maximum(travel - zero, 0.0)
+            offset = start * np.exp(-with_down * early) * (travel < zero)
+            offset -= alpha * np.expm1(-with_down * early) / with_down * (travel < zero)
+        else:
+            late, offset = travel, start * np.exp(-with_up * travel)
+        expected = offset - alpha * np.expm1(-with_up * late) / with_up
+        got = advance((alpha, beta, gamma, exponent), start, travel)
+        # n = 1 + 1e-9 is another equation, by a relative 1e-9 times a logarithm.
+        tolerance = 1e-11 + 20 * (exponent - 1.0)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * max(12, abs(start)))
+
+
+def test_beta_equal_gamma_and_its_opposite_are_limits_not_exceptions() -> None:
+    travel = np.linspace(0.0, 100.0, 300)
+    for sign in (1.0, -1.0):
+        for exponent in (1.0, 1.4, 3.0, 50.0):
+            for start in (-0.9, 0.4):
+                exact = advance((0.3, 0.2, sign * 0.2, exponent), start, travel)
+                for gamma in (0.2 * (1 - 1e-13), 0.2 * (1 + 1e-13) if sign > 0 else 0.2 - 1e-14):
+                    near = advance((0.3, 0.2, sign * gamma, exponent), start, travel)
+                    # Without a ceiling, n = 50 feels even this much where g^n is large.
+                    inside = np.abs(exact) < 1.1
+                    np.testing.assert_allclose(
+                        near[inside], exact[inside], rtol=0, atol=1e-11, err_msg=str(exponent)
+                    )
+
+
+def test_without_a_ceiling_the_rise_is_a_straight_line() -> None:
+    travel = np.linspace(0.0, 150.0, 200)
+    for exponent in (1.0, 1.2, 2.0, 10.0, 50.0):
+        got = advance((0.36, 0.02, -0.02, exponent), 3.0, travel)
+        np.testing.assert_allclose(got, 3.0 + 0.36 * travel, rtol=1e-12)
+
+
+def test_zero_travel_returns_the_start_itself() -> None:
+    start = np.array([-1e9, -1.7, -0.2, 0.0, 0.1, 0.999, 5.0, 1e9])
+    models = ExponentFlow(
+        np.full(8, 0.3), np.full(8, 0.2), np.full(8, 0.1), np.linspace(1.0, 10.0, 8)
+    )
+    got = models.advance(start, np.array([0.0, 0.0, 1e-300]))
+    np.testing.assert_array_equal(got[:, 0], start)
+    np.testing.assert_array_equal(got[:, 1], start)
+    np.testing.assert_allclose(got[:, 2], start, rtol=1e-11, atol=1e-11)
+
+
+def test_no_travel_at_all_gives_no_points() -> None:
+    got = flow(0.3, 0.2, 0.1, 2.0).advance(np.zeros(1), np.zeros(0))
+    np.testing.assert_array_equal(got, np.zeros((1, 0)))
+
+
+def test_result_is_the_same_bits_every_time() -> None:
+    travel = np.linspace(0.0, 90.0, 400)
+    first, second = (advance((0.36, 0.03, 0.02, 1.6), -2.0, travel) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+Model = tuple[float, float, float, float, float]
+
+
+@st.composite
+def models(draw: st.DrawFn, largest: float = 1e2, smallest: float = 1e-4) -> Model:
+    """(alpha, beta, gamma, exponent, start) in the domain; the start anywhere if beta >= gamma."""
+    size = st.floats(smallest, largest)
+    alpha, beta = draw(size), draw(size | st.just(0.0))
+    gamma = draw(size | st.floats(-1.0, 1.0).map(lambda part: part * beta))
+    exponent = draw(st.sampled_from((1.0, 1 + 1e-9, 2.0)) | st.floats(1.0, 10.0))
+    start = draw(st.floats(-20.0, 20.0))
+    if gamma > beta:
+        start *= 0.98 / 20.0 * (alpha / (beta + gamma)) ** (1 / exponent)
+    return alpha, beta, gamma, exponent, start
+
+
+@settings(deadline=None, max_examples=150)
+@given(models(), st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+def test_two_travels_in_turn_are_their_sum(model: Model, first: float, second: float) -> None:
+    *shape, start = model
+    one = flow(*shape)
+    points = one.advance(np.array([start]), np.array([first, first + second]))
+    in_turn = one.advance(points[:, 0], np.array([second]))
+    largest = max(abs(start), np.abs(points).max())
+    np.testing.assert_allclose(in_turn[:, 0], points[:, 1], rtol=0, atol=1e-10 * largest)
+
+
+@settings(deadline=None, max_examples=150)
+@given(models())
+def test_moves_towards_the_ceiling_and_never_past_it(model: Model) -> None:
+    alpha, beta, gamma, exponent, start = model
+    ceiling = (alpha / (beta + gamma)) ** (1 / exponent) if beta + gamma > 0 else np.inf
+    path = advance(model[:4], start, np.linspace(0.0, 100.0, 500))
+    slack = 1e-11 * max(abs(start), np.abs(path).max())
+    if start <= ceiling:
+        assert np.all(np.diff(path) >= -slack)
+        assert path.max() <= ceiling + slack
+    else:
+        assert np.all(np.diff(path) <= slack)
+        assert path.min() >= ceiling - slack
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(models(), min_size=2, max_size=6), st.integers(1, 400))
+def test_a_model_does_not_depend_on_its_company(batch: list[Model], points: int) -> None:
+    alpha, beta, gamma, exponent, start = np.array(batch).T
+    travel = np.linspace(0.0, 120.0, points)
+    together = ExponentFlow(alpha, beta, gamma, exponent).advance(start, travel)
+    for model, row in zip(batch, together, strict=True):
+        alone = advance(model[:4], model[4], travel)
+        np.testing.assert_allclose(row, alone, rtol=0, atol=1e-12 * np.abs(alone).max())
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    models(largest=1e6, smallest=1e-12),
+    st.sampled_from((1.0, 1 + 1e-9, 50.0)) | st.floats(1.0, 50.0),
+    st.floats(-1e6, 1e6),
+    st.floats(1e-12, 1e6),
+)
+def test_extreme_parameters_give_finite_displacements(
+    model: Model, exponent: float, start: float, travel: float
+) -> None:
+    alpha, beta, gamma, *_ = model
+    assume(beta >= gamma)
+    points = np.linspace(0.0, travel, 20)
+    path = advance((alpha, beta, gamma, exponent), start, points)
+    assert np.all(np.isfinite(path))
+    reach = abs(start) + alpha * travel
+    assert np.all(np.abs(path) <= reach * (1 + 1e-11))
