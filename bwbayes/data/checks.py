@@ -308,34 +308,39 @@ def _warn_if_clipped(table: Table, voltage: FloatArray, displacement: FloatArray
     """Warn if the displacement stays at its largest or smallest value while the voltage moves on.
 
     A coarse sensor repeats its extreme value too, in two ways that are harmless. At rest the
-    voltage stands still: only runs in which it travels count, over 2 % of its range and over what
-    three steps of the sensor are worth. At a smooth peak the next level lasts as well: a parabola
-    stays at its top level up to 2.4 times as long as at the next, a clipped one far longer.
+    voltage stands still: only runs count in which its quartiles lie apart, by 1 % of its range and
+    by what three steps of the sensor are worth. At a smooth peak the next level lasts as well: a
+    parabola stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
     """
     levels = np.unique(displacement)
     if levels.size < 3:
         return
     resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
-    travel = max(0.02, 3 * resolution) * float(np.ptp(voltage))
-    padded = np.append(voltage, voltage[-1])  # so that a run may end behind the last sample
+    travel = max(0.01, 3 * resolution) * float(np.ptp(voltage))
     for side, extreme, following in (("largest", -1, -2), ("smallest", 0, 1)):
-        first, last = _runs(displacement == levels[extreme])
-        borders = np.column_stack([first, last]).ravel()
-        highest = np.maximum.reduceat(padded, borders)[::2]
-        lowest = np.minimum.reduceat(padded, borders)[::2]
-        stuck = (last - first >= 5) & (highest - lowest > travel)
-        held = int((last - first)[stuck].sum())
+        at_extreme = displacement == levels[extreme]
+        first, lengths = _runs(at_extreme)
+        stuck = (lengths >= 5) & (_quartile_distances(voltage[at_extreme], lengths) > travel)
+        held = int(lengths[stuck].sum())
         if held >= 10 and held > 3 * np.count_nonzero(displacement == levels[following]):
-            where = table.error(
-                f"clipped sensor? {held} samples stay at the {side} value {levels[extreme]:g} um"
-                " while the voltage moves; leave these times out or use a wider range",
-                "displacement",
-                int(first[stuck][0]),
-            )
-            warnings.warn(str(where), InputWarning, stacklevel=2)
+            problem = f"clipped sensor? {held} samples stay at the {side} value"
+            advice = "leave these times out or use a wider range"
+            text = f"{problem} {levels[extreme]:g} um while the voltage moves; {advice}"
+            warning = table.error(text, "displacement", int(first[stuck][0]))
+            warnings.warn(str(warning), InputWarning, stacklevel=4)
 
 
 def _runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return first index and index after the last one of every run of true values."""
+    """Return the first index and the length of every run of true values."""
     edges = np.diff(mask.astype(np.int8), prepend=0, append=0)
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    first = np.flatnonzero(edges == 1)
+    return first, np.flatnonzero(edges == -1) - first
+
+
+def _quartile_distances(values: FloatArray, lengths: IntArray) -> FloatArray:
+    """Return third less first quartile of every run, where `values` holds run after run."""
+    run = np.repeat(np.arange(lengths.size), lengths)
+    ordered = values[np.lexsort((values, run))]
+    first = np.cumsum(lengths) - lengths
+    distances: FloatArray = ordered[first + 3 * lengths // 4] - ordered[first + lengths // 4]
+    return distances

@@ -123,12 +123,11 @@ def _header_columns(path: Path, line: int, header: str) -> list[tuple[str, str, 
         raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
     columns: list[tuple[str, str, int]] = []
     for number, name in enumerate(names, start=1):
+        shown = _quoted(name)[1:-1] or f"column {number}"
         try:
             quantity, power = parse_name(name)
         except ValueError as error:
-            raise InputError(
-                f"{where} {_quoted(name)[1:-1] or f'column {number}'}: {error}"
-            ) from None
+            raise InputError(f"{where} {shown}: {error}") from None
         if quantity == "truth":
             raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
         if quantity in [known for _, known, _ in columns]:

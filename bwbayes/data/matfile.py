@@ -34,7 +34,8 @@ _USERBLOCK = 512  # bytes before the HDF5 part of a version 7.3 file
 # Codes of the version 5 format: types of elements, and classes of arrays.
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS_AND_TEXT = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
-_CONTAINERS = {1, 2, 3, 16, 17}  # cell, struct, object, function, opaque
+_COMPLEX = 0x0800
+_PLAIN_CODES = {4, *range(6, 16)}
 _PLAIN_CLASSES = {"double", "single", "char", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -93,9 +94,9 @@ def _read_5(path: Path) -> Table:
 
 
 def _check_elements(data: bytes) -> None:
-    """Raise a ValueError unless all plain arrays consist of elements of known types.
+    """Raise a ValueError unless all plain arrays consist of the elements that belong to them.
 
-    SciPy 1.18 takes the type of an element on trust and ends the whole process if it is unknown.
+    SciPy 1.18 takes the types of elements on trust, and an unknown one ends the whole process.
     """
     order = {b"IM": "<", b"MI": ">"}[data[126:128]]
     for kind, body in _elements(data[128:], order, padded=False):
@@ -104,8 +105,13 @@ def _check_elements(data: bytes) -> None:
         if kind != _MATRIX:
             raise ValueError(f"unknown element {kind}")
         inner = list(_elements(body, order))
-        nested = inner[0][1][0 if order == "<" else 3] in _CONTAINERS
-        if not nested and not {kind for kind, _ in inner} <= _NUMBERS_AND_TEXT:
+        (flags,) = struct.unpack_from(f"{order}I", inner[0][1])
+        if flags & 0xFF not in _PLAIN_CODES:
+            continue
+        # Flags, dimensions, name and real part; an imaginary part if the flags say so.
+        if len(inner) != (5 if flags & _COMPLEX else 4):
+            raise ValueError("parts of an array are missing")
+        if not {kind for kind, _ in inner} <= _NUMBERS_AND_TEXT:
             raise ValueError("unknown type of data")
 
 

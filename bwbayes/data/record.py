@@ -87,7 +87,7 @@ class Record:
         if not math.isfinite(self.start):
             raise InputError(f"start: {self.start} s is not a time; give it in s")
         object.__setattr__(self, "interval", float(self.interval))
-        object.__setattr__(self, "start", float(self.start))
+        object.__setattr__(self, "start", float(self.start) + 0.0)  # turns -0.0 into 0.0
         object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
         object.__setattr__(self, "origin", _printable(self.origin))
 

@@ -60,8 +60,8 @@ class Posterior:
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (models,) at coordinates (models, free): likelihood, prior and Jacobian.
 
-        −∞ where the prior is zero; never +∞. A density that is not a number comes out as −∞ too,
-        and :meth:`log_likelihood` shows it.
+        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
+        for a model: there the density is −∞ too.
         """
         free, log_jacobian = self.prior.constrain(coordinates)
         possible = np.isfinite(log_jacobian)
@@ -70,7 +70,7 @@ class Posterior:
         possible = np.isfinite(result)
         if possible.any():
             result[possible] += self.log_likelihood(self.prior.theta(free[possible]))
-        return result
+        return np.where(np.isfinite(result), result, -np.inf)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters), fixed parameters included."""

@@ -3,7 +3,7 @@
 Along such a stretch the Bouc-Wen equation is separable: in units of its ceiling the displacement
 follows one of a few master curves that depend on the exponent alone, and a stretch is a shift in
 time along its curve. The curves are tabulated once, by quadrature, and every stretch of every model
-is then read off by interpolation: no time stepping, and an error below 1e-11 of the ceiling.
+is then read off by interpolation: no time stepping, and an error below 1e-11 of the largest |h|.
 """
 
 from __future__ import annotations
@@ -218,7 +218,8 @@ class _Curve:
     @classmethod
     def inside(cls, exponent: FloatArray, sign: float) -> _Curve:
         """Curves through 0 <= z < 1; the time is counted from z = 0, where it equals z."""
-        logit = _graded_nodes()
+        half = _graded_half(_STEP)
+        logit = np.concatenate((-half[:0:-1], half))
         n = exponent[:, None]
         z = np.exp(-np.logaddexp(0.0, -logit) / n)
         y = np.exp(-np.logaddexp(0.0, -logit))
@@ -241,7 +242,8 @@ class _Curve:
     @classmethod
     def outside(cls, exponent: FloatArray, sign: float) -> _Curve:
         """Curves down from z^n = e^36 towards 1; the time is counted from this top."""
-        logit = _even_then_graded_nodes()
+        even = np.linspace(-_REACH, 0.0, round(_REACH / _FAR_STEP) + 1)
+        logit = np.concatenate((even, _graded_half(_FAR_STEP)[1:]))
         n = exponent[:, None]
         z = np.exp(np.logaddexp(0.0, -logit) / n)
         y_inverse = np.exp(np.logaddexp(0.0, -logit))
@@ -290,7 +292,8 @@ class _Fall:
     def duration(self, models: IntArray, height: FloatArray) -> FloatArray:
         """Voltage (V) from height z0 (rows,) down to z = 1 for these models (rows,)."""
         whole = self.curve.time[self.row[models], -1] / self.rate[models]
-        return np.asarray(whole - self._clock(models, height))
+        descent: FloatArray = whole - self._clock(models, height)
+        return descent
 
     def advance(self, models: IntArray, height: FloatArray, travel: FloatArray) -> FloatArray:
         """Height z after travel (points,) V from height (rows,): shape (rows, points)."""
@@ -309,8 +312,10 @@ class _Fall:
         power, n = self.curve.power[row], self.curve.exponent[row]
         logit = _logit_of_log(-n * np.log(height))
         excess = np.maximum(self.curve.logit[0] - logit, 0.0)
-        lead = np.exp(power * self.curve.logit[0]) * _box_cox(-excess, power) / n
-        return (self.curve.time_at_logit(logit, row) + lead) / self.rate[models]
+        power = np.maximum(power, 1e-100)  # n = 1: the limit, -excess
+        lead = np.exp(power * self.curve.logit[0]) * np.expm1(-power * excess) / (power * n)
+        clock: FloatArray = (self.curve.time_at_logit(logit, row) + lead) / self.rate[models]
+        return clock
 
     def _power_law(self, models: IntArray, height: FloatArray, travel: FloatArray) -> FloatArray:
         """Height while z^n drowns the one beside it: dz/dtau = -z^n."""
@@ -337,16 +342,6 @@ def _graded_half(step: float) -> FloatArray:
     return np.array(ends)
 
 
-def _graded_nodes() -> FloatArray:
-    half = _graded_half(_STEP)
-    return np.concatenate((-half[:0:-1], half))
-
-
-def _even_then_graded_nodes() -> FloatArray:
-    even = np.linspace(-_REACH, 0.0, round(_REACH / _FAR_STEP) + 1)
-    return np.concatenate((even, _graded_half(_FAR_STEP)[1:]))
-
-
 def _widths(time: FloatArray) -> FloatArray:
     """Lengths of the cells; none is zero, though time may stand still between the last nodes."""
     return np.maximum(np.diff(time), 1e-290)
@@ -356,12 +351,6 @@ def _logit_of_log(log_y: FloatArray) -> FloatArray:
     """Return w = log(y / (1 - y)) from log y <= 0; y = 1 counts as just below one."""
     log_y = np.minimum(log_y, -1e-17)
     return np.asarray(log_y - np.log(-np.expm1(log_y)))
-
-
-def _box_cox(x: FloatArray, power: FloatArray) -> FloatArray:
-    """(e^(power x) - 1) / power, and x for power = 0."""
-    power = np.maximum(power, 1e-100)
-    return np.asarray(np.expm1(power * x) / power)
 
 
 def _integral(
@@ -398,26 +387,11 @@ def _hermite(
     time: FloatArray, derivatives: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 ) -> FloatArray:
     """Coefficients (8, curves, cells) of the polynomials that match both ends of each cell."""
-    width = np.diff(time)
-    scaled = [
-        (width**order * d[:, :-1] / factorial, width**order * d[:, 1:] / factorial)
-        for order, (d, factorial) in enumerate(zip(derivatives, (1, 1, 2, 6), strict=True))
-    ]
-    a0, a1, a2, a3 = (left for left, _ in scaled)
-    b0, b1, b2, b3 = (right for _, right in scaled)
-    r0 = b0 - a0 - a1 - a2 - a3
-    r1 = b1 - a1 - 2 * a2 - 3 * a3
-    r2 = b2 - a2 - 3 * a3
-    r3 = b3 - a3
-    return np.stack(
-        (
-            a0,
-            a1,
-            a2,
-            a3,
-            35 * r0 - 15 * r1 + 5 * r2 - r3,
-            -84 * r0 + 39 * r1 - 14 * r2 + 3 * r3,
-            70 * r0 - 34 * r1 + 13 * r2 - 3 * r3,
-            -20 * r0 + 10 * r1 - 4 * r2 + r3,
-        )
-    )
+    powers = [np.diff(time) ** order / factorial for order, factorial in enumerate((1, 1, 2, 6))]
+    a0, a1, a2, a3 = (p * d[:, :-1] for p, d in zip(powers, derivatives, strict=True))
+    b0, b1, b2, b3 = (p * d[:, 1:] for p, d in zip(powers, derivatives, strict=True))
+    # What the cubic from the left end misses at the right end fixes the four upper coefficients.
+    missed = (b0 - a0 - a1 - a2 - a3, b1 - a1 - 2 * a2 - 3 * a3, b2 - a2 - 3 * a3, b3 - a3)
+    mend = ((35, -15, 5, -1), (-84, 39, -14, 3), (70, -34, 13, -3), (-20, 10, -4, 1))
+    upper = (sum(m * r for m, r in zip(row, missed, strict=True)) for row in mend)
+    return np.stack((a0, a1, a2, a3, *upper))

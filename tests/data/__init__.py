@@ -1,0 +1,1 @@
+"""Tests of records, signals and the virtual test stand."""

@@ -14,11 +14,12 @@ from bwbayes.model.exponent import ExponentFlow
 
 EXPONENTS = (1.0, 1.05, 1.5, 2.0, 2.5, 3.0, 5.0, 10.0)
 ALPHA = 0.36
-# (beta, gamma) in units of alpha: ordinary, equal, opposite, gamma > beta, only one of them.
-SHAPES = ((1.0, 0.6), (1.0, 1.0), (1.0, -1.0), (0.7, 0.9), (1.0, -0.9), (1.0, 0.0), (0.0, 1.0))
-STARTS = (0.0, 0.3, -0.3, -0.8, 0.8)
-FAR_STARTS = (1.3, 3.0, -3.0, 40.0, -40.0)
-TRAVEL = np.array([0.0, 1e-3, 0.1, 0.4, 1.0, 1.9, 3.0, 5.0, 9.0, 30.0, 100.0])
+# (beta, gamma) in units of alpha: ordinary, equal, opposite, gamma > beta, nearly opposite, only
+# gamma.
+SHAPES = ((1.0, 0.6), (1.0, 1.0), (1.0, -1.0), (0.7, 0.9), (1.0, -0.9), (0.0, 1.0))
+STARTS = (0.0, 0.3, -0.3, -0.8)
+FAR_STARTS = (1.3, -3.0, 40.0, -40.0)
+TRAVEL = np.array([0.0, 1e-3, 0.1, 0.4, 1.0, 1.9, 3.0, 5.0, 9.0, 30.0])
 
 
 def flow(alpha: float, beta: float, gamma: float, exponent: float) -> ExponentFlow:
@@ -94,8 +95,8 @@ def test_agrees_with_an_integrator_from_far_outside(
     exponent: float, beta: float, gamma: float
 ) -> None:
     parameters = (ALPHA, beta * ALPHA, gamma * ALPHA, exponent)
-    travel = TRAVEL[:-1]
-    for start in FAR_STARTS if exponent < 5 else FAR_STARTS[:3]:
+    travel = TRAVEL[:-2]
+    for start in FAR_STARTS if exponent < 5 else FAR_STARTS[:2]:
         expected = integrate(parameters, start, travel)
         got = advance(parameters, start, travel)
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale(parameters, start))
@@ -112,11 +113,11 @@ def test_chained_stretches_stay_with_the_integrator(exponent: float) -> None:
         assert expected == pytest.approx(got, abs=1e-10)
 
 
-@pytest.mark.parametrize("exponent", [1.0, 1.05, 1.3, 2.0, 2.7, 10.0, 50.0])
+@pytest.mark.parametrize("exponent", [1.0, 1.05, 2.7, 10.0, 50.0])
 def test_many_stretches_equal_the_same_path_cut_into_more(exponent: float) -> None:
-    """Four hundred reversals, each stretch in one piece or in three: the errors do not pile up."""
+    """Three hundred reversals, each stretch in one piece or in three: the errors do not pile up."""
     one = flow(ALPHA, 0.7 * ALPHA, 0.6 * ALPHA, exponent)
-    lengths = np.random.default_rng(2).exponential(1.0, 400)
+    lengths = np.random.default_rng(2).exponential(1.0, 300)
     whole = cut = np.zeros(1)
     for length in lengths:
         whole = -one.advance(whole, np.array([length]))[:, -1]
@@ -248,7 +249,7 @@ def models(draw: st.DrawFn, largest: float = 1e2, smallest: float = 1e-4) -> Mod
     return alpha, beta, gamma, exponent, start
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=100)
 @given(models(), st.floats(0.0, 100.0), st.floats(0.0, 100.0))
 def test_two_travels_in_turn_are_their_sum(model: Model, first: float, second: float) -> None:
     *shape, start = model
@@ -259,7 +260,7 @@ def test_two_travels_in_turn_are_their_sum(model: Model, first: float, second: f
     np.testing.assert_allclose(in_turn[:, 0], points[:, 1], rtol=0, atol=1e-10 * largest)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=100)
 @given(models())
 def test_moves_towards_the_ceiling_and_never_past_it(model: Model) -> None:
     alpha, beta, gamma, exponent, start = model
@@ -285,7 +286,7 @@ def test_a_model_does_not_depend_on_its_company(batch: list[Model], points: int)
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-12 * np.abs(alone).max())
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=150)
 @given(
     models(largest=1e6, smallest=1e-12),
     st.sampled_from((1.0, 1 + 1e-9, 50.0)) | st.floats(1.0, 50.0),

@@ -1,0 +1,72 @@
+"""The chain of a sampling: what every ensemble did, block by block.
+
+A :class:`Chain` keeps it in memory; :class:`~bwbayes.inference.chainfile.ChainFile` writes it to a
+file as well. The pilot's blocks are kept apart from those that count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.ensemble import Block, EnsembleState
+
+__all__ = ["PHASES", "Chain", "Phase"]
+
+Phase = Literal["pilot", "sampling"]
+PHASES: tuple[Phase, ...] = ("pilot", "sampling")
+
+
+class Chain:
+    """Blocks of all ensembles, in two phases.
+
+    Parameters
+    ----------
+    starts
+        The state that each ensemble starts from.
+    """
+
+    def __init__(self, starts: Sequence[EnsembleState]) -> None:
+        self.starts = tuple(starts)
+        self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
+
+    def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
+        """Add the next block of every ensemble."""
+        self._blocks[phase].append(tuple(blocks))
+
+    def blocks(self, phase: Phase) -> int:
+        """Return how many blocks each ensemble has."""
+        return len(self._blocks[phase])
+
+    def steps(self, phase: Phase) -> int:
+        """Return how many steps each ensemble has made."""
+        return sum(blocks[0].coordinates.shape[0] for blocks in self._blocks[phase])
+
+    @property
+    def ends(self) -> tuple[EnsembleState, ...]:
+        """The state that each ensemble goes on from."""
+        done = [blocks for phase in PHASES for blocks in self._blocks[phase]]
+        return tuple(block.end for block in done[-1]) if done else self.starts
+
+    def coordinates(self, phase: Phase) -> FloatArray:
+        """Return (steps, ensembles, walkers, free), unconstrained."""
+        return self._joined(phase, "coordinates")
+
+    def log_density(self, phase: Phase) -> FloatArray:
+        """Return (steps, ensembles, walkers), nats."""
+        return self._joined(phase, "log_density")
+
+    def accepted(self, phase: Phase) -> IntArray:
+        """Return the accepted moves of each block, (blocks, ensembles, walkers)."""
+        return np.array([[block.accepted for block in blocks] for blocks in self._blocks[phase]])
+
+    def _joined(self, phase: Phase, name: str) -> FloatArray:
+        return np.concatenate(
+            [
+                np.stack([getattr(block, name) for block in blocks], axis=1)
+                for blocks in self._blocks[phase]
+            ]
+        )

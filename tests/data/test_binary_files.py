@@ -1,0 +1,246 @@
+"""Records in HDF5 and MATLAB files: what is accepted, one line for what is not; round trips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from bwbayes.data import Record, read_record, write_record
+from bwbayes.errors import InputError
+from tests.data.test_csvfile import mutated, outcome
+
+SAMPLES = 24
+TIME = 0.5 + 1e-3 * np.arange(SAMPLES)
+VOLTAGE = np.sin(np.arange(SAMPLES))
+DISPLACEMENT = 20 * np.cos(1.3 * np.arange(SAMPLES))
+GOOD: dict[str, Any] = {"time_s": TIME, "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT}
+
+Kind = Literal["h5", "mat", "compressed", "7.3"]
+KINDS: list[Kind] = ["h5", "mat", "compressed", "7.3"]
+
+
+def store(folder: Path, kind: Kind, arrays: dict[str, Any]) -> Path:
+    """Store arrays as another program would, without anything of bwbayes."""
+    path = folder / ("record.h5" if kind == "h5" else "record.mat")
+    if kind in ("mat", "compressed"):
+        scipy.io.savemat(path, arrays, do_compression=kind == "compressed")
+        return path
+    with h5py.File(path, "w", userblock_size=512 if kind == "7.3" else 0) as file:
+        for name, values in arrays.items():
+            file[name] = values
+    return path
+
+
+def fault(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_record(path)
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1
+    return text.removeprefix(f"{path}")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", [(SAMPLES,), (SAMPLES, 1), (1, SAMPLES)])
+def test_vectors_rows_and_columns_are_read(tmp_path: Path, kind: Kind, shape: Any) -> None:
+    arrays = {name: values.reshape(shape) for name, values in GOOD.items()}
+    record = read_record(store(tmp_path, kind, arrays | {"comment": "passed over"}))
+    np.testing.assert_array_equal(VOLTAGE, record.voltage)
+    np.testing.assert_array_equal(DISPLACEMENT, record.displacement)
+    assert (0.5, "output") == (record.start, record.voltage_is)
+    assert record.interval == pytest.approx(1e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_prefixes_integers_and_single_precision_are_converted(tmp_path: Path, kind: Kind) -> None:
+    arrays = {
+        "time_ms": (1e3 + np.arange(SAMPLES)).astype(np.float32),
+        "voltage_mV": np.arange(SAMPLES, dtype=np.int16),
+        "displacement_nm": DISPLACEMENT.astype(np.float32),
+    }
+    record = read_record(store(tmp_path, kind, arrays))
+    np.testing.assert_array_equal(np.arange(SAMPLES) / 1000, record.voltage)
+    assert record.displacement is not None
+    np.testing.assert_allclose(DISPLACEMENT / 1000, record.displacement, rtol=1e-7)
+    assert (1e-3, 1.0) == (record.interval, record.start)
+
+
+def test_single_precision_times_are_uniform_as_far_as_they_can_be(tmp_path: Path) -> None:
+    samples = 200_000
+    arrays = {
+        "time_s": (1e-3 * np.arange(samples)).astype(np.float32),
+        "voltage_V": np.arange(samples),
+        "displacement_um": np.arange(samples),
+    }
+    assert read_record(store(tmp_path, "h5", arrays)).interval == pytest.approx(1e-3, rel=1e-7)
+
+
+numbers = arrays(np.float64, 12, elements=st.floats(-1e9, 1e9), unique=True)
+records = st.builds(
+    Record,
+    voltage=numbers,
+    displacement=numbers,
+    interval=st.floats(1e-6, 1e3),
+    start=st.floats(-1e3, 1e3),
+    voltage_is=st.sampled_from(["command", "output"]),
+    origin=st.text(min_size=1).filter(lambda text: text.isprintable() and bool(text.strip())),
+    truth=st.none() | numbers,
+)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt", "h5", "hdf5", "mat", "mat 7.3"])
+@settings(deadline=None, max_examples=25)
+@given(record=records)
+def test_writing_and_reading_gives_the_same_record(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, record: Record
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"same.{suffix.split(maxsplit=1)[0]}"
+    write_record(record, path, mat_version="7.3" if suffix.endswith("7.3") else "5")
+    back = read_record(path)
+    assert record.sha256 == back.sha256
+    assert (record.origin, record.voltage_is) == (back.origin, back.voltage_is)
+    assert (record.truth is None) == (back.truth is None)
+    if record.truth is not None and back.truth is not None:
+        np.testing.assert_array_equal(record.truth, back.truth)
+
+
+@pytest.mark.parametrize("name", ["none/record.csv", "none/record.h5", "none/record.mat", "a.xls"])
+def test_a_place_that_cannot_be_written_to_is_an_input_error(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=name):
+        write_record(Record(np.arange(20.0), None, 1.0), tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["h5", "mat", "mat 7.3"])
+def test_a_record_without_origin_gets_the_name_of_its_file(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"record.{suffix.split(maxsplit=1)[0]}"
+    version: Literal["5", "7.3"] = "7.3" if suffix.endswith("7.3") else "5"
+    write_record(Record(VOLTAGE, None, 1.0), path, mat_version=version)
+    back = read_record(path, need_displacement=False)
+    assert (path.name, None, None) == (back.origin, back.displacement, back.truth)
+
+
+def test_a_version_7_3_file_bears_the_header_that_matlab_looks_for(tmp_path: Path) -> None:
+    path = tmp_path / "record.mat"
+    write_record(Record(VOLTAGE, DISPLACEMENT, 1.0), path, mat_version="7.3")
+    assert (2, 0) == scipy.io.matlab.matfile_version(path)
+    with h5py.File(path) as file:
+        assert 512 == file.userblock_size
+        assert b"double" == file["voltage_V"].attrs["MATLAB_class"]
+        assert b"char" == file["voltage_is"].attrs["MATLAB_class"]
+        assert (1, SAMPLES) == file["voltage_V"].shape
+
+
+def test_a_group_may_hold_the_datasets_and_attributes(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "record.h5", "w") as file:
+        group = file.create_group("run 7")
+        file.create_group("empty")
+        for name, values in GOOD.items():
+            group[name] = values
+        group.attrs["voltage_is"] = "command"
+    record = read_record(tmp_path / "record.h5")
+    np.testing.assert_array_equal(VOLTAGE, record.voltage)
+    assert "command" == record.voltage_is
+
+
+def test_several_groups_with_records_are_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "record.h5", "w") as file:
+        for group in ("a", "b"):
+            file[f"{group}/time_s"] = TIME
+    assert ": several groups hold records ('/a', '/b')" in fault(tmp_path / "record.h5")
+
+
+def replaced(values: np.ndarray, sample: int, value: float) -> np.ndarray:
+    changed = values.copy()
+    changed[sample] = value
+    return changed
+
+
+FAULTS: list[tuple[str, dict[str, Any], str]] = [
+    ("nan", {"voltage_V": replaced(VOLTAGE, 17, np.nan)}, ":sample 17: voltage_V: nan is not"),
+    ("inf", {"displacement_um": replaced(DISPLACEMENT, 0, -np.inf)}, ":sample 0: displacement_um"),
+    ("absurd", {"voltage_V": replaced(VOLTAGE, 5, 1e12)}, ":sample 5: voltage_V: 1e+12 is absurd"),
+    ("back", {"time_s": replaced(TIME, 9, 0.501)}, ":sample 9: time_s: time goes back"),
+    ("repeated", {"time_s": replaced(TIME, 9, TIME[8])}, ":sample 9: time_s: 0.508 s is repeated"),
+    (
+        "gap",
+        {"time_s": TIME + 0.01 * (np.arange(SAMPLES) > 8)},
+        ":sample 9: time_s: gap of 0.011 s after 0.508 s, about 10 missing",
+    ),
+    ("irregular", {"time_s": replaced(TIME, 9, 0.50931)}, ":sample 9: time_s: irregular"),
+    ("lengths", {"voltage_V": VOLTAGE[1:]}, ": voltage_V: 23 values where time has 24"),
+    ("complex", {"voltage_V": VOLTAGE + 1j}, ": voltage_V: holds complex numbers"),
+    ("matrix", {"voltage_V": VOLTAGE.reshape(6, 4)}, ": voltage_V: shape (6, 4) is no vector"),
+    ("empty", dict.fromkeys(GOOD, np.zeros(0)), ": too short, samples: 0"),
+    ("constant", {"displacement_um": np.ones(SAMPLES)}, ": displacement_um: constant at 1"),
+    ("twice", {"voltage_mV": VOLTAGE}, ": voltage_"),
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("changes", "expected"), [case[1:] for case in FAULTS], ids=[case[0] for case in FAULTS]
+)
+def test_each_fault_is_one_line_with_its_place(
+    tmp_path: Path, kind: Kind, changes: dict[str, Any], expected: str
+) -> None:
+    text = fault(store(tmp_path, kind, GOOD | changes))
+    assert expected == text[: len(expected)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_text_instead_of_numbers_is_refused(tmp_path: Path, kind: Kind) -> None:
+    text = fault(store(tmp_path, kind, GOOD | {"voltage_V": "some text"}))
+    assert ": voltage_V: holds text" in text
+
+
+@pytest.mark.parametrize("value", [{"a": 1.0}, np.array([1.0, "b"], dtype=object)])
+def test_structs_and_cells_are_refused_unread(tmp_path: Path, value: Any) -> None:
+    text = fault(store(tmp_path, "mat", GOOD | {"voltage_V": value}))
+    assert ": voltage_V: is of class" in text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_array_is_named_with_the_nearest_one(tmp_path: Path, kind: Kind) -> None:
+    text = fault(store(tmp_path, kind, {"time_s": TIME, "voltag_V": VOLTAGE}))
+    assert text.startswith(": voltage_V: missing")
+    assert "did you mean 'voltag_V'?" in text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("part", [0, 1, 100, 600, -200])
+def test_a_cut_off_file_is_refused(tmp_path: Path, kind: Kind, part: int) -> None:
+    path = store(tmp_path, kind, GOOD)
+    path.write_bytes(path.read_bytes()[:part])
+    assert "; " in fault(path)
+
+
+@pytest.mark.parametrize("name", ["record.h5", "record.mat"])
+@pytest.mark.parametrize("content", [b"time_s,voltage_V\n" * 20, bytes(1000), bytes(range(256))])
+def test_a_file_of_another_kind_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert ": not a" in fault(tmp_path / name)
+
+
+def test_version_4_is_refused_by_name(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "record.mat", GOOD, format="4")
+    assert "save it with -v7" in fault(tmp_path / "record.mat")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_file_gives_finite_numbers_or_one_line(tmp_path: Path, kind: Kind) -> None:
+    rng = np.random.default_rng(2)
+    path = store(tmp_path, kind, GOOD)
+    good = path.read_bytes()
+    texts = []
+    for _ in range(200):
+        path.write_bytes(mutated(good, rng))
+        texts.append(outcome(path))
+    assert all(len(text.splitlines()) <= 1 for text in texts)
+    assert 20 < sum(text != "" for text in texts) < 200

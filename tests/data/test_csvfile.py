@@ -1,0 +1,390 @@
+"""Text records: what is accepted, and one line for everything that is not."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.data import Record, read_record, write_record
+from bwbayes.errors import InputError, InputWarning
+
+HEADER = "time_s,voltage_V,displacement_um"
+ROWS = [f"{i * 0.005:.3f},{np.sin(i):.4f},{20 * np.cos(1.3 * i):.4f}" for i in range(30)]
+LINES = [HEADER, *ROWS]
+GOOD = "\n".join(LINES) + "\n"
+
+Lines = list[str]
+
+
+def read(folder: Path, content: str | bytes) -> Record:
+    path = folder / "record.csv"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_record(path)
+
+
+def fault(folder: Path, content: str | bytes) -> str:
+    """Return the one line that reading `content` ends with, without the folder."""
+    with pytest.raises(InputError) as caught:
+        read(folder, content)
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1
+    assert "; " in text or "did you mean" in text
+    return text.removeprefix(f"{folder}/")
+
+
+def cell(line: int, column: int, text: str) -> str:
+    """Return the good file with another text in one cell (line 2 is the first sample's)."""
+    lines = list(LINES)
+    cells = lines[line - 1].split(",")
+    cells[column] = text
+    lines[line - 1] = ",".join(cells)
+    return "\n".join(lines) + "\n"
+
+
+def edited(edit: Callable[[Lines], Lines]) -> str:
+    return "\n".join(edit(list(LINES))) + "\n"
+
+
+def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None:
+    record = read(tmp_path, GOOD)
+    numbers = np.array([[float(x) for x in row.split(",")] for row in ROWS])
+    np.testing.assert_array_equal(numbers[:, 1], record.voltage)
+    np.testing.assert_array_equal(numbers[:, 2], record.displacement)
+    assert (0.005, 0.0, "output", "record.csv") == (
+        record.interval,
+        record.start,
+        record.voltage_is,
+        record.origin,
+    )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xef\xbb\xbf" + GOOD.encode(),
+        GOOD.replace("\n", "\r\n").encode(),
+        GOOD.replace("\n", "\r").encode(),
+        GOOD.rstrip("\n").encode(),
+        (GOOD + "\n  \n").encode(),
+        GOOD.replace(",", " , ").encode(),
+        GOOD.replace("_um", "_µm").encode(),
+        GOOD.replace("_um", "_\u03bcm").encode(),
+        GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
+        "\n".join(",".join(line.split(",")[::-1]) for line in LINES).encode(),
+        ("# anything\n# at all: yes\n\n" + GOOD).encode(),
+    ],
+    ids=[
+        "bom",
+        "crlf",
+        "cr",
+        "no-last-newline",
+        "blank-end",
+        "blanks",
+        "micro",
+        "mu",
+        "case",
+        "order",
+        "comments",
+    ],
+)
+def test_harmless_differences_change_nothing(tmp_path: Path, content: bytes) -> None:
+    assert read(tmp_path, GOOD).sha256 == read(tmp_path, content).sha256
+
+
+@pytest.mark.parametrize(
+    ("header", "scales"),
+    [
+        ("time_ms,voltage_mV,displacement_nm", (1e-3, 1e-3, 1e-3)),
+        ("time_us,voltage_kV,displacement_mm", (1e-6, 1e3, 1e3)),
+        ("time_µs,voltage_uV,displacement_m", (1e-6, 1e-6, 1e6)),
+    ],
+)
+def test_si_prefixes_are_converted(
+    tmp_path: Path, header: str, scales: tuple[float, float, float]
+) -> None:
+    plain, other = read(tmp_path, GOOD), read(tmp_path, GOOD.replace(HEADER, header))
+    assert other.interval == pytest.approx(plain.interval * scales[0], rel=1e-12)
+    np.testing.assert_allclose(plain.voltage * scales[1], other.voltage, rtol=1e-15)
+    assert plain.displacement is not None
+    assert other.displacement is not None
+    np.testing.assert_allclose(plain.displacement * scales[2], other.displacement, rtol=1e-15)
+
+
+def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path: Path) -> None:
+    record = read(tmp_path, "# voltage: command\n# origin: a stand: the first\n" + GOOD)
+    assert ("command", "a stand: the first") == (record.voltage_is, record.origin)
+    assert "output" == read_record(tmp_path / "record.csv", voltage_is="output").voltage_is
+
+
+def test_a_planned_voltage_is_accepted_only_when_asked_for(tmp_path: Path) -> None:
+    planned = "\n".join(line.rpartition(",")[0] for line in LINES)
+    assert "record.csv:1: displacement_um: missing" in fault(tmp_path, planned)
+    assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("abc", "'abc' is not a number"),
+        ("1.5V", "'1.5V' is not a number"),
+        ("0x10", "'0x10' is not a number"),
+        ("1_000", "'1_000' is not a number"),
+        ("1;5", "'1;5' is not a number"),
+        ("", "empty cell"),
+        ("  ", "empty cell"),
+        ("nan", "'nan' is not a finite number"),
+        ("-NaN", "'-NaN' is not a finite number"),
+        ("inf", "'inf' is not a finite number"),
+        ("-Infinity", "'-Infinity' is not a finite number"),
+        ("1e999", "'1e999' is too large"),
+        ("1e12", "1e+12 is absurdly large"),
+    ],
+)
+@pytest.mark.parametrize("line", [2, 17, 31])
+@pytest.mark.parametrize("column", [1, 2])
+def test_a_bad_cell_is_named_by_line_and_column(
+    tmp_path: Path, text: str, problem: str, line: int, column: int
+) -> None:
+    where = f"record.csv:{line}: {HEADER.split(',')[column]}: "
+    assert fault(tmp_path, cell(line, column, text)).startswith(where + problem)
+
+
+FAULTS: list[tuple[str, str | bytes, str]] = [
+    (
+        "missing field",
+        cell(9, 1, "1").replace(",1,", ","),
+        "record.csv:9: displacement_um: missing",
+    ),
+    ("extra field", cell(9, 2, "1.5,2.5"), "record.csv:9: field 4: extra field '2.5'"),
+    ("decimal comma", cell(9, 1, "1,5"), "record.csv:9: voltage_V: decimal comma or extra"),
+    (
+        "all decimal commas",
+        "\n".join([HEADER] + [row.replace(".", ",") for row in ROWS]),
+        "record.csv:2: time_s: decimal comma, 6 fields",
+    ),
+    ("semicolons", GOOD.replace(",", ";"), "record.csv:1: semicolons"),
+    ("tabs", GOOD.replace(",", "\t"), "record.csv:1: tabs"),
+    ("blanks", GOOD.replace(",", " "), "record.csv:1: blanks"),
+    (
+        "semicolons below",
+        "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]),
+        "record.csv:2: semicolons",
+    ),
+    ("empty line", edited(lambda x: [*x[:8], "", *x[8:]]), "record.csv:9: empty line"),
+    ("comment below", edited(lambda x: [*x[:8], "# x", *x[8:]]), "record.csv:9: comment"),
+    (
+        "time goes back",
+        edited(lambda x: [*x[:8], x[5], *x[9:]]),
+        "record.csv:9: time_s: time goes back from 0.03 s to 0.02 s",
+    ),
+    ("repeated", edited(lambda x: x[:8] + x[7:]), "record.csv:9: time_s: 0.03 s is repeated"),
+    (
+        "gap",
+        edited(lambda x: x[:8] + x[12:]),
+        "record.csv:9: time_s: gap of 0.025 s after 0.03 s, about 4 missing",
+    ),
+    (
+        "gap before the last sample",
+        edited(lambda x: x[:29] + x[30:]),
+        "record.csv:30: time_s: gap of 0.01 s after 0.135 s, about 1 missing",
+    ),
+    (
+        "gap after the first sample",
+        edited(lambda x: x[:2] + x[3:]),
+        "record.csv:3: time_s: gap of 0.01 s after 0 s, about 1 missing",
+    ),
+    (
+        "irregular by the last decimal",
+        cell(9, 0, "0.036"),
+        "record.csv:9: time_s: irregular sampling: 0.006 s",
+    ),
+    (
+        "irregular by more decimals",
+        cell(9, 0, "0.0352"),
+        "record.csv:9: time_s: irregular sampling: 0.0052 s",
+    ),
+    ("header missing", "\n".join(ROWS), "record.csv:1: the header is missing"),
+    (
+        "column unknown",
+        GOOD.replace("voltage_V", "volt_V"),
+        "record.csv:1: volt_V: unknown column; did you mean voltage_V?",
+    ),
+    ("column without unit", GOOD.replace("voltage_V", "voltage"), "record.csv:1: voltage: no unit"),
+    (
+        "unit unknown",
+        GOOD.replace("voltage_V", "voltage_v"),
+        "record.csv:1: voltage_v: unknown unit 'v'; write one of V, mV",
+    ),
+    ("column without name", GOOD.replace("voltage_V", ""), "record.csv:1: column 2: unknown"),
+    ("duplicate", GOOD.replace("_um", "_nm").replace("time_s", "displacement_um"), "record.csv:1"),
+    ("truth", GOOD.replace("displacement_um", "truth_um"), "record.csv:1: truth_um: unknown"),
+    (
+        "column missing",
+        "\n".join(line.partition(",")[2] for line in LINES),
+        "record.csv:1: time_s: missing",
+    ),
+    ("empty file", "", "record.csv: the file is empty"),
+    ("blank file", " \n\n", "record.csv: the file is empty"),
+    ("header alone", HEADER, "record.csv:1: no samples"),
+    ("header alone, ended", HEADER + "\n\n", "record.csv:1: no samples"),
+    ("few samples", "\n".join(LINES[:6]), "record.csv: too short, samples: 5"),
+    ("one sample", "\n".join(LINES[:2]), "record.csv: too short, samples: 1"),
+    ("cut in a field", GOOD[:-3], "record.csv:31: displacement_um: the last line is cut off"),
+    ("cut behind a sign", GOOD[:-8], "record.csv:31: displacement_um: the last line is cut off"),
+    ("cut to two fields", GOOD[:-12], "record.csv:31: displacement_um: the last line is cut off"),
+    ("cut and ended", GOOD[:-12] + "\n", "record.csv:31: displacement_um: the last line is cut"),
+    ("NUL", cell(9, 1, "\0"), "record.csv:9: NUL byte"),
+    ("UTF-16", GOOD.encode("utf-16"), "record.csv: the text is UTF-16"),
+    ("UTF-16 without BOM", GOOD.encode("utf-16-le"), "record.csv:1: NUL byte"),
+    ("Latin-1", cell(9, 1, "\xb5").encode("latin-1"), "record.csv:9: byte 0xb5 is not UTF-8"),
+    ("a picture", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "record.csv:1: byte 0x89"),
+    (
+        "constant voltage",
+        "\n".join([HEADER] + [f"{i / 100},1.5,{i}" for i in range(20)]),
+        "record.csv: voltage_V: constant at 1.5",
+    ),
+    (
+        "constant displacement",
+        "\n".join([HEADER] + [f"{i / 100},{i},1.5" for i in range(20)]),
+        "record.csv: displacement_um: constant at 1.5",
+    ),
+    ("voltage is what", "# voltage: comand\n" + GOOD, "record.csv: voltage_is: 'comand'"),
+    ("wrong interval", "# interval_s: 0.004\n" + GOOD, "record.csv: interval_s '0.004'"),
+    ("no interval", "# interval_s: x\n" + GOOD, "record.csv: interval_s 'x' contradicts"),
+    ("late header", "# a\n\n# b\n" + cell(9, 1, "x"), "record.csv:12: voltage_V: 'x'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"), [case[1:] for case in FAULTS], ids=[case[0] for case in FAULTS]
+)
+def test_each_fault_is_one_line_with_its_place(
+    tmp_path: Path, content: str | bytes, expected: str
+) -> None:
+    text = fault(tmp_path, content)
+    assert expected == text[: len(expected)]
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("none.csv", "does not exist"),
+        ("", "is a directory"),
+        ("folder.csv", "is a directory"),
+        ("record.xyz", "unknown suffix '.xyz'"),
+        ("bad\0name.csv", "does not exist"),
+    ],
+)
+def test_files_that_cannot_be_opened_say_why(tmp_path: Path, name: str, problem: str) -> None:
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "record.xyz").touch()
+    with pytest.raises(InputError, match=problem):
+        read_record(tmp_path / name)
+
+
+def test_a_file_without_permission_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read(tmp_path, GOOD)
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        read_record(tmp_path / "record.csv")
+
+
+@pytest.mark.parametrize(("rate", "decimals"), [(1024.0, 4), (3.0, 1), (300.0, 3), (44100.0, 6)])
+def test_times_rounded_in_print_are_uniform(tmp_path: Path, rate: float, decimals: int) -> None:
+    rows = [f"{12.5 + i / rate:.{decimals}f},{i},{i}" for i in range(3000)]
+    record = read(tmp_path, "\n".join([HEADER, *rows]))
+    assert record.interval == pytest.approx(1 / rate, abs=10.0**-decimals / 2999)
+
+
+def test_times_of_a_clock_that_counts_from_1970_are_uniform(tmp_path: Path) -> None:
+    rows = [f"{1.7e9 + i / 1000:.4f},{i},{i}" for i in range(1000)]
+    assert read(tmp_path, "\n".join([HEADER, *rows])).interval == pytest.approx(1e-3, rel=1e-6)
+
+
+def test_a_truth_on_other_times_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "record.truth.csv").write_text(GOOD.replace("\n0.000,", "\n-0.005,0,1\n0.000,"))
+    assert "record.truth.csv: time_s: not the times of the record" in fault(tmp_path, GOOD)
+
+
+def test_writing_a_record_without_truth_removes_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "record.csv"
+    record = read(tmp_path, GOOD)
+    write_record(Record(record.voltage, record.displacement, 0.1, truth=record.voltage), path)
+    assert read_record(path).truth is not None
+    write_record(record, path)
+    assert read_record(path).truth is None
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = read(tmp_path, GOOD)
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(InputError, match="disk full"):
+        write_record(record, tmp_path / "record.csv")
+    assert [tmp_path / "record.csv"] == list(tmp_path.iterdir())
+    assert GOOD == (tmp_path / "record.csv").read_text()
+
+
+def test_a_hundred_thousand_lines_are_read_in_a_fraction_of_a_second(tmp_path: Path) -> None:
+    rows = "".join(f"{i / 1000:.3f},{i % 977:.6f},{i % 1009:.6f}\n" for i in range(100_000))
+    started = time.process_time()
+    read(tmp_path, f"{HEADER}\n{rows}")
+    assert time.process_time() - started < 1.0  # 0.15 s where this was written
+
+
+def mutated(good: bytes, rng: np.random.Generator) -> bytes:
+    """Return `good` with a few bytes changed, removed, put in, or with its end cut off."""
+    data = bytearray(good)
+    for _ in range(rng.integers(1, 5)):
+        at = int(rng.integers(0, len(data)))
+        match rng.integers(0, 5):
+            case 0:
+                data[at] = rng.integers(0, 256)
+            case 1:
+                data[at] = rng.choice(list(b"\0,.;-+e9\n#\xff"))
+            case 2:
+                del data[at]
+            case 3:
+                data.insert(at, rng.integers(0, 256))
+            case 4 if rng.random() < 0.2:
+                data = data[: at + 1]
+    return bytes(data)
+
+
+def outcome(path: Path) -> str:
+    """Return the error's text of reading `path`, or nothing for a record of finite numbers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        try:
+            record = read_record(path)
+        except InputError as error:
+            return str(error)
+    for values in (record.time, record.voltage, record.displacement):
+        assert values is not None
+        assert np.isfinite(values).all()
+    return ""
+
+
+def test_a_damaged_file_gives_finite_numbers_or_one_line(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    texts = []
+    for _ in range(400):
+        path = tmp_path / "record.csv"
+        path.write_bytes(mutated(("# voltage: command\n" + GOOD).encode(), rng))
+        texts.append(outcome(path))
+    assert all(len(text.splitlines()) <= 1 for text in texts)
+    assert 100 < sum(text != "" for text in texts) < 400
