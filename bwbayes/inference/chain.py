@@ -13,6 +13,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.ensemble import Block, EnsembleState
+from bwbayes.inference.moves import StudentProposal
 
 __all__ = ["PHASES", "Chain", "Phase"]
 
@@ -31,7 +32,12 @@ class Chain:
 
     def __init__(self, starts: Sequence[EnsembleState]) -> None:
         self.starts = tuple(starts)
+        self.proposal: StudentProposal | None = None
         self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
+
+    def freeze(self, proposal: StudentProposal | None) -> None:
+        """Fix the proposal of the draws that count."""
+        self.proposal = proposal
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
         """Add the next block of every ensemble."""

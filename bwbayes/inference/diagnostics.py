@@ -2,7 +2,7 @@
 
 Ensembles are independent and start far apart; the walkers of one ensemble are not independent at
 the start and hardly so later. So R-hat is the nested one, with an ensemble as the superchain, and
-a split R-hat looks for drift within walkers. Effective draws are counted with walkers as chains,
+once more with the halves of each ensemble apart, which shows drift. Effective draws are counted with walkers as chains,
 capped by what the means of whole ensembles show, which also sees correlation between walkers. A
 walker that does not move blocks convergence by itself, and what is not a number never passes.
 This module alone knows arviz's statistics.
@@ -18,7 +18,7 @@ from arviz_stats.base import array_stats
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.ensemble import autocorrelation_time
 
-__all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat"]
+__all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat", "pareto_k"]
 
 LARGEST_RHAT = 1.01
 
@@ -32,7 +32,7 @@ TAIL = (0.05, 0.95)
 class Check:
     """The state of a sampling; arrays are (free,).
 
-    ``rhat`` is the larger of nested and split R-hat; ``ess_bulk`` and ``ess_tail`` are totals;
+    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk`` and ``ess_tail`` are totals;
     ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
     ``stuck`` counts the walkers without an accepted move in the last block.
     """
@@ -78,17 +78,29 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
     """
     steps, ensembles, walkers, free = draws.shape
     bulk, tail = effective_draws(draws)
-    split = array_stats.rhat(as_chains(draws), chain_axis=0, draw_axis=1, method="split")
+    half = steps // 2
+    halves = np.concatenate([draws[:half], draws[steps - half :]], axis=1)
     return Check(
         steps=steps,
         # np.maximum keeps a nan of either.
-        rhat=np.maximum(nested_rhat(draws), np.atleast_1d(split)),
+        rhat=np.maximum(nested_rhat(draws), nested_rhat(halves)),
         ess_bulk=bulk,
         ess_tail=tail,
         autocorrelation=autocorrelation_time(draws.reshape(steps, ensembles * walkers, free)),
         acceptance=float(accepted.sum() / (accepted.size * block)),
         stuck=int(np.sum(accepted[-1] == 0)),
     )
+
+
+def pareto_k(log_weights: FloatArray) -> float:
+    """Pareto k̂ of a proposal from log weights log p − log q (draws,) at draws of the posterior p.
+
+    Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
+    draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
+    k' = k / (1 − k), so k = k' / (1 + k').
+    """
+    shape = float(array_stats.psislw(-log_weights)[1])
+    return shape / (1 + shape) if shape > 0 else shape
 
 
 def as_chains(draws: FloatArray) -> FloatArray:

@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
+from scipy.special import ndtr, ndtri
 
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 
 __all__ = ["Distribution"]
@@ -59,6 +61,65 @@ class Distribution:
     def __str__(self) -> str:
         inside = ", ".join(f"{key} = {value:.6g}" for key, value in self.arguments.items())
         return f"{self.name}({inside})"
+
+    def to_normal(self, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """Return the normal scores z of values x, with the distribution cut at both bounds.
+
+        z = Φ⁻¹((F(x) − F(lower)) / (F(upper) − F(lower))), from whichever tail is nearer, so that
+        it keeps its precision in both. All arrays are (models,) or scalar.
+        """
+        below, above = self._cdf(x) - self._cdf(lower), self._sf(x) - self._sf(upper)
+        whole = below + above
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near = np.minimum(below, above) / whole
+        score: FloatArray = np.where(below <= above, 1, -1) * ndtri(np.clip(near, 0, 1))
+        return score
+
+    def from_normal(
+        self, z: FloatArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return values x of normal scores z, and the probability between the bounds.
+
+        The inverse of :meth:`to_normal`; where the bounds leave nothing, x is the lower one.
+        """
+        whole = np.maximum(self._cdf(upper) - self._cdf(lower), 0.0)
+        # Above the median the bounds' upper tails are the precise ones.
+        whole = np.where(whole < 0.5, np.maximum(whole, self._sf(lower) - self._sf(upper)), whole)
+        part = ndtr(-np.abs(z)) * whole
+        x = np.where(z < 0, self._ppf(self._cdf(lower) + part), self._isf(self._sf(upper) + part))
+        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
+
+    # Normal and lognormal distributions, the default priors, skip the frozen distribution: its
+    # checks of arguments cost more than a short record's likelihood.
+
+    def _score(self, x: FloatArray) -> FloatArray:
+        """Map x to a standard normal, for the two distributions that a formula maps."""
+        if self.name == "normal":
+            return (x - self.arguments["mean"]) / self.arguments["sd"]
+        with np.errstate(divide="ignore"):
+            logs = np.log(np.maximum(x, 0.0) / self.arguments["median"])
+        return np.asarray(logs / self.arguments["sigma"])
+
+    def _value(self, score: FloatArray) -> FloatArray:
+        if self.name == "normal":
+            return self.arguments["mean"] + self.arguments["sd"] * score
+        return np.asarray(self.arguments["median"] * np.exp(self.arguments["sigma"] * score))
+
+    def _cdf(self, x: FloatArray) -> FloatArray:
+        return np.asarray(ndtr(self._score(x)) if self._mapped else self.frozen.cdf(x))
+
+    def _sf(self, x: FloatArray) -> FloatArray:
+        return np.asarray(ndtr(-self._score(x)) if self._mapped else self.frozen.sf(x))
+
+    def _ppf(self, p: FloatArray) -> FloatArray:
+        return self._value(ndtri(p)) if self._mapped else np.asarray(self.frozen.ppf(p))
+
+    def _isf(self, p: FloatArray) -> FloatArray:
+        return self._value(-ndtri(p)) if self._mapped else np.asarray(self.frozen.isf(p))
+
+    @property
+    def _mapped(self) -> bool:
+        return self.name in ("normal", "lognormal")
 
     @cached_property
     def frozen(self) -> Any:

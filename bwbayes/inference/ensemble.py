@@ -2,19 +2,21 @@
 
 :func:`advance` is a pure function of the posterior and an :class:`EnsembleState`, random state
 included. So it does not matter where, when or in which order ensembles run: a run with two
-workers, or one that was interrupted and goes on, gives the same bits. This module alone knows emcee.
+workers, or one that was interrupted and goes on, gives the same bits. Only this module and the
+moves know emcee.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import emcee
 import numpy as np
+from emcee.moves import Move
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.moves import default_moves
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 
@@ -37,9 +39,10 @@ TIGHT = 0.2
 
 @dataclass(frozen=True)
 class EnsembleState:
-    """Where an ensemble stands: ``coordinates`` (walkers, free), ``log_density`` (walkers,),
+    """Where an ensemble stands.
 
-    ``random_state`` (628,) words of emcee's generator.
+    ``coordinates`` (walkers, free), ``log_density`` (walkers,) and ``random_state`` (628,), the
+    words of emcee's generator.
     """
 
     coordinates: FloatArray
@@ -49,9 +52,10 @@ class EnsembleState:
 
 @dataclass(frozen=True)
 class Block:
-    """What an ensemble did: ``coordinates`` (steps, walkers, free), ``log_density``
+    """What an ensemble did.
 
-    (steps, walkers), ``accepted`` (walkers,) moves, and the ``end`` it goes on from.
+    ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
+    (walkers,) moves, and the ``end`` it goes on from.
     """
 
     coordinates: FloatArray
@@ -88,11 +92,13 @@ def start(
     return EnsembleState(coordinates, log_density, _pack(random.get_state()))
 
 
-def advance(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
-    """Move an ensemble ``steps`` steps on."""
+def advance(
+    posterior: Posterior, moves: Sequence[tuple[Move, float]], state: EnsembleState, steps: int
+) -> Block:
+    """Move an ensemble ``steps`` steps on, by emcee's ``moves`` with their weights."""
     walkers, free = state.coordinates.shape
     sampler = emcee.EnsembleSampler(
-        walkers, free, posterior.log_density, vectorize=True, moves=default_moves()
+        walkers, free, posterior.log_density, vectorize=True, moves=list(moves)
     )
     begin = emcee.State(
         state.coordinates,

@@ -3,8 +3,10 @@
 Each parameter is either fixed or has a prior. The priors are independent but for the physical
 constraints, which cut the joint prior: 0 < α < d, |γ| ≤ β, an initial state inside the hysteresis
 ceiling. :class:`JointPrior` draws from the cut prior and gives its log density, up to the one
-constant that the cut leaves, and maps parameters to coordinates without bounds and back, in which
-a posterior is nearly Gaussian.
+constant that the cut leaves. It also maps parameters to coordinates without bounds and back: the
+normal scores of each prior between the bounds that hold there. In them every prior is nearly a
+standard normal, whatever its scale and bounds, and so a posterior has Gaussian tails even where it
+leans on a bound (γ near β, a discrepancy near zero).
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import expit, log_expit, logit
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
@@ -38,8 +39,8 @@ POSITIVE = (
     "discrepancy_time",
 )
 
-# A mapped coordinate beyond this is no actuator: exp(300) times anything.
-FARTHEST = 300.0
+# Normal scores beyond this have no probability that a float can hold.
+FARTHEST = 37.0
 
 # Stands for an infinite ceiling (β + γ = 0), um.
 HIGHEST_CEILING = 1e9
@@ -168,54 +169,36 @@ class JointPrior:
     def unconstrain(self, free: FloatArray) -> FloatArray:
         """Map free parameters (models, free), inside their bounds, to coordinates."""
         values = self._values(free)
-        columns = []
+        scores = []
         for parameter in self.free:
-            low, high = self._limits(parameter, values)
-            x = values[parameter.name]
-            if np.isfinite(low).all() and np.isfinite(high).all():
-                columns.append(logit((x - low) / (high - low)))
-            elif np.isfinite(low).all():
-                columns.append(np.log(x - low))
-            elif np.isfinite(high).all():
-                columns.append(-np.log(high - x))
-            else:
-                columns.append(x)
-        return np.clip(np.stack(columns, axis=1), *self._coordinate_limits)
+            assert parameter.prior is not None
+            bounds = self._limits(parameter, values)
+            scores.append(parameter.prior.to_normal(values[parameter.name], *bounds))
+        return np.clip(np.stack(scores, axis=1), -FARTHEST, FARTHEST)
 
     def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates (models, free) to free parameters and the log Jacobian (models,).
+        """Map coordinates (models, free) to free parameters and their log prior density (models,).
 
-        A parameter between two bounds comes from a logistic, with one bound from an exponential,
-        without bounds as it is. As each bound depends on earlier parameters alone, the Jacobian is
-        triangular. It is −∞ where a coordinate is beyond anything physical.
+        A parameter with prior distribution function F between bounds l and u, which depend on
+        earlier parameters alone, is x = F⁻¹(F(l) + Φ(z) (F(u) − F(l))). The Jacobian is triangular
+        and turns the joint prior into
+
+            log p(z) = Σ log φ(z) + Σ log(F(u) − F(l)) + constant,
+
+        −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
-        values: Values = self._values(None, rows=coordinates.shape[0])
-        safe = np.clip(coordinates, *self._coordinate_limits)
-        log_jacobian = np.where((safe == coordinates).all(axis=1), 0.0, -np.inf)
+        values = self._values(None, rows=coordinates.shape[0])
+        safe = np.clip(coordinates, -FARTHEST, FARTHEST)
+        room = np.ones(coordinates.shape[0])
         for parameter, z in zip(self.free, safe.T, strict=True):
-            low, high = self._limits(parameter, values)
-            if np.isfinite(low).all() and np.isfinite(high).all():
-                # Where earlier parameters leave no room, the density is zero.
-                log_jacobian = np.where(low < high, log_jacobian, -np.inf)
-                width = np.where(low < high, high - low, 1.0)
-                x = low + width * expit(z)
-                log_jacobian += np.log(width) + log_expit(z) + log_expit(-z)
-            elif np.isfinite(low).all():
-                x = low + np.exp(z)
-                log_jacobian += z
-            elif np.isfinite(high).all():
-                x = high - np.exp(-z)
-                log_jacobian -= z
-            else:
-                x = z
-            values[parameter.name] = x
-        return np.stack([values[name] for name in self.free_names], axis=1), log_jacobian
-
-    @cached_property
-    def _coordinate_limits(self) -> tuple[FloatArray, FloatArray]:
-        mapped = [np.isfinite(p.support).any() or p.name in ("gamma", "initial") for p in self.free]
-        farthest = np.where(mapped, FARTHEST, np.inf)
-        return -farthest, farthest
+            assert parameter.prior is not None
+            bounds = self._limits(parameter, values)
+            values[parameter.name], between = parameter.prior.from_normal(z, *bounds)
+            room = room * between
+        with np.errstate(divide="ignore"):
+            log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
+        log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
+        return np.stack([values[name] for name in self.free_names], axis=1), log_prior
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> Values:
         size = rows if free is None else free.shape[0]

@@ -58,15 +58,12 @@ class Posterior:
         return self.prior.free_names
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (models,) at coordinates (models, free): likelihood, prior and Jacobian.
+        """Log density (models,) at coordinates (models, free): likelihood and prior.
 
         −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
         for a model: there the density is −∞ too.
         """
-        free, log_jacobian = self.prior.constrain(coordinates)
-        possible = np.isfinite(log_jacobian)
-        result = np.full(coordinates.shape[0], -np.inf)
-        result[possible] = self.prior.log_density(free[possible]) + log_jacobian[possible]
+        free, result = self.prior.constrain(coordinates)
         possible = np.isfinite(result)
         if possible.any():
             result[possible] += self.log_likelihood(self.prior.theta(free[possible]))

@@ -17,8 +17,9 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.chain import Chain, Phase
-from bwbayes.inference.diagnostics import Check, check, nested_rhat
+from bwbayes.inference.diagnostics import Check, check, nested_rhat, pareto_k
 from bwbayes.inference.ensemble import Block, advance, start
+from bwbayes.inference.moves import StudentProposal, pilot_moves, sampling_moves
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 
@@ -27,8 +28,15 @@ __all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample
 # Nested R-hat of the pilot's second half below which its ensembles have found each other.
 PILOT_RHAT = 1.1
 
+# Above this the Student-t does not fit the pilot, and differential evolution goes on alone.
+LARGEST_PARETO_K = 0.7
+
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
+
+
+def _unwatched(phase: Phase, found: Check | None) -> None:
+    """Watch nothing."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +55,16 @@ class SamplingPlan:
         Steps between two checks.
     most_steps, most_pilot_steps
         The budget: steps of each ensemble that count, and before.
+    least_pilot_steps
+        Steps of the pilot in any case.
     """
 
     ess: float = 2000.0
     ensembles: int = 4
     walkers: int = 24
-    block: int = 100
+    block: int = 50
     most_steps: int = 20_000
+    least_pilot_steps: int = 200
     most_pilot_steps: int = 3_000
 
     def __post_init__(self) -> None:
@@ -96,7 +107,7 @@ def sample(
     plan: SamplingPlan,
     chain: Chain,
     executor: Executor,
-    watcher: Watcher = lambda phase, found: None,
+    watcher: Watcher = _unwatched,
 ) -> Outcome:
     """Extend ``chain`` until it has converged or the budget is used up.
 
@@ -106,6 +117,7 @@ def sample(
     while chain.blocks("sampling") == 0 and not _pilot_done(posterior, plan, chain):
         _extend(posterior, plan, chain, "pilot", executor, watcher)
     if chain.blocks("sampling") == 0:
+        chain.freeze(_proposal(chain))
         _extend(posterior, plan, chain, "sampling", executor, watcher)
     before = _check(posterior, plan, chain, chain.blocks("sampling") - 1)
     while True:
@@ -138,7 +150,8 @@ def _extend(
     watcher: Watcher,
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
-    futures = [executor.submit(advance, posterior, end, plan.block) for end in chain.ends]
+    moves = pilot_moves() if phase == "pilot" else sampling_moves(chain.proposal)
+    futures = [executor.submit(advance, posterior, moves, end, plan.block) for end in chain.ends]
     blocks: list[Block] = []
     for future in futures:
         blocks.append(future.result())
@@ -148,10 +161,23 @@ def _extend(
 
 def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     steps = chain.steps("pilot")
-    if steps < 2 * plan.block or steps >= plan.most_pilot_steps:
+    if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
     second_half = draws(posterior, chain, "pilot")[steps // 2 :]
     return bool((nested_rhat(second_half) < PILOT_RHAT).all())
+
+
+def _proposal(chain: Chain) -> StudentProposal | None:
+    """Fit a proposal to the pilot's second half, if one fits."""
+    steps = chain.steps("pilot")
+    kept = chain.coordinates("pilot")[steps // 2 :]
+    flat = kept.reshape(-1, kept.shape[-1])
+    density = chain.log_density("pilot")[steps // 2 :].ravel()
+    try:
+        proposal = StudentProposal.fitted(flat)
+    except np.linalg.LinAlgError:
+        return None
+    return proposal if pareto_k(density - proposal.log_density(flat)) < LARGEST_PARETO_K else None
 
 
 def _check(posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> Check | None:
