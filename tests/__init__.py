@@ -1,0 +1,1 @@
+"""Tests that state the promises of bwbayes, folder by folder as in the package."""

@@ -47,6 +47,10 @@ class Chain:
         """Return how many blocks each ensemble has."""
         return len(self._blocks[phase])
 
+    def block_of(self, phase: Phase, number: int) -> tuple[Block, ...]:
+        """Return block ``number`` of every ensemble."""
+        return self._blocks[phase][number]
+
     def steps(self, phase: Phase) -> int:
         """Return how many steps each ensemble has made."""
         return sum(blocks[0].coordinates.shape[0] for blocks in self._blocks[phase])

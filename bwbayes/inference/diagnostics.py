@@ -2,18 +2,21 @@
 
 Ensembles are independent and start far apart; the walkers of one ensemble are not independent at
 the start and hardly so later. So R-hat is the nested one, with an ensemble as the superchain, and
-once more with the halves of each ensemble apart, which shows drift. Effective draws are counted with walkers as chains,
-capped by what the means of whole ensembles show, which also sees correlation between walkers. A
-walker that does not move blocks convergence by itself, and what is not a number never passes.
-This module alone knows arviz's statistics.
+once more with the halves of each ensemble apart, which shows drift. Effective draws are counted
+with walkers as chains, capped by what the means of whole ensembles show, which also sees
+correlation between walkers. A walker that does not move blocks convergence by itself, and what is
+not a number never passes. This module alone knows arviz's statistics.
 """
+
+# mypy: allow-untyped-calls
+# arviz_stats says that it has types, but its functions have none.
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from arviz_stats.base import array_stats
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.ensemble import autocorrelation_time
@@ -32,8 +35,8 @@ TAIL = (0.05, 0.95)
 class Check:
     """The state of a sampling; arrays are (free,).
 
-    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk`` and ``ess_tail`` are totals;
-    ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
+    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk`` and ``ess_tail`` are
+    totals; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
     ``stuck`` counts the walkers without an accepted move in the last block.
     """
 
@@ -97,9 +100,13 @@ def pareto_k(log_weights: FloatArray) -> float:
 
     Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
     draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
-    k' = k / (1 − k), so k = k' / (1 + k').
+    k' = k / (1 − k), so k = k' / (1 + k'). It is infinite where the largest weights are all equal,
+    as those of a walker that stays where the proposal hardly goes.
     """
-    shape = float(array_stats.psislw(-log_weights)[1])
+    try:
+        shape = float(array_stats.psislw(-log_weights)[1])
+    except ValueError:
+        return np.inf
     return shape / (1 + shape) if shape > 0 else shape
 
 
@@ -132,16 +139,16 @@ def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     ratio of the variances.
     """
     chains = as_chains(draws)
-    cap = _ensemble_mean_ess(draws)
-    bulk = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="bulk")
-    tail = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="tail", prob=TAIL)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cap = _ensemble_mean_ess(draws)
+        bulk = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="bulk")
+        tail = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="tail", prob=TAIL)
     return np.minimum(np.atleast_1d(bulk), cap), np.minimum(np.atleast_1d(tail), cap)
 
 
 def _ensemble_mean_ess(draws: FloatArray) -> FloatArray:
     means = np.mean(draws, axis=2)
     ess = array_stats.ess(np.moveaxis(means, 0, 1), chain_axis=0, draw_axis=1, method="mean")
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.var(draws, axis=(0, 1, 2)) / np.var(means, axis=(0, 1))
+    ratio = np.var(draws, axis=(0, 1, 2)) / np.var(means, axis=(0, 1))
     worth: FloatArray = np.atleast_1d(ess) * ratio
     return worth

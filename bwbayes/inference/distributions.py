@@ -54,7 +54,8 @@ class Distribution:
                 raise InputError(f"{self.name}: {key} is {value!r}; give a number")
             if not np.isfinite(value):
                 raise InputError(f"{self.name}: {key} is {value}; give a finite number")
-        middle = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
+        with np.errstate(invalid="ignore"):
+            middle = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
         if not np.isfinite(middle).all() or not middle[0] < middle[2]:
             raise InputError(f"{self}: no proper distribution; check its arguments")
 
@@ -68,10 +69,9 @@ class Distribution:
         z = Φ⁻¹((F(x) − F(lower)) / (F(upper) − F(lower))), from whichever tail is nearer, so that
         it keeps its precision in both. All arrays are (models,) or scalar.
         """
-        below, above = self._cdf(x) - self._cdf(lower), self._sf(x) - self._sf(upper)
-        whole = below + above
+        below, above = self._between(lower, x), self._between(x, upper)
         with np.errstate(divide="ignore", invalid="ignore"):
-            near = np.minimum(below, above) / whole
+            near = np.minimum(below, above) / (below + above)
         score: FloatArray = np.where(below <= above, 1, -1) * ndtri(np.clip(near, 0, 1))
         return score
 
@@ -82,12 +82,18 @@ class Distribution:
 
         The inverse of :meth:`to_normal`; where the bounds leave nothing, x is the lower one.
         """
-        whole = np.maximum(self._cdf(upper) - self._cdf(lower), 0.0)
-        # Above the median the bounds' upper tails are the precise ones.
-        whole = np.where(whole < 0.5, np.maximum(whole, self._sf(lower) - self._sf(upper)), whole)
-        part = ndtr(-np.abs(z)) * whole
-        x = np.where(z < 0, self._ppf(self._cdf(lower) + part), self._isf(self._sf(upper) + part))
+        whole = np.maximum(self._between(lower, upper), 0.0)
+        below = self._cdf(lower) + ndtr(z) * whole
+        above = self._sf(upper) + ndtr(-z) * whole
+        # The smaller probability is the one that keeps its precision.
+        x = np.where(below < above, self._ppf(below), self._isf(above))
         return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
+
+    def _between(self, low: FloatArray, high: FloatArray) -> FloatArray:
+        """Probability between two values, from the tail in which they lie."""
+        start = self._cdf(low)
+        rising, falling = self._cdf(high) - start, self._sf(low) - self._sf(high)
+        return np.where(start < 0.5, rising, falling)
 
     # Normal and lognormal distributions, the default priors, skip the frozen distribution: its
     # checks of arguments cost more than a short record's likelihood.
@@ -146,7 +152,8 @@ class Distribution:
             case "uniform":
                 return stats.uniform(lower, upper - lower)
             case "halfnormal":
-                return stats.halfnorm(scale=given["scale"])
+                # The same as scipy's halfnorm, which loses its precision near zero.
+                return stats.chi(1, scale=given["scale"])
         return stats.beta(given["a"], given["b"], loc=lower, scale=upper - lower)
 
     def _by_scipy_name(self, given: dict[str, float]) -> Any:

@@ -51,7 +51,8 @@ class StudentProposal:
         The scale is the covariance itself, a little wider than the t of that covariance: a
         proposal that is too wide costs acceptance, one that is too narrow costs mixing.
         """
-        return cls(np.mean(draws, axis=0), np.linalg.cholesky(np.cov(draws, rowvar=False)))
+        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+        return cls(np.mean(draws, axis=0), np.linalg.cholesky(covariance))
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (count,) at coordinates (count, free), up to a constant."""

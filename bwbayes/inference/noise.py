@@ -31,13 +31,18 @@ LOG_TWO_PI = float(np.log(2 * np.pi))
 class Noise(Protocol):
     """A Gaussian model of the residual between a reading and the forward model."""
 
-    parameters: tuple[str, ...]
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of θ's columns."""
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
+
+    def at(self, interval: float) -> Noise:
+        """Return the same noise for samples ``interval`` seconds apart."""
 
 
 def noise_model(kind: NoiseKind, interval: float) -> Noise:
@@ -63,6 +68,10 @@ class WhiteNoise:
         """No discrepancy; sd of the sensor."""
         return np.zeros(theta.shape[0]), theta[:, 0]
 
+    def at(self, interval: float) -> WhiteNoise:  # noqa: ARG002  # it has no memory
+        """Return the same noise."""
+        return self
+
 
 @dataclass(frozen=True)
 class DiscrepancyNoise:
@@ -77,8 +86,8 @@ class DiscrepancyNoise:
     At the start x has its stationary variance, larger than p by δ = σ² − p. Put this surplus into
     an unknown mean ξ ~ N(0, δ) of x[0]: it shifts η[t] by −aᵗ ξ, and integrating ξ out gives
 
-        log p(r) = Σ log N(η; 0, S) − ½ log(1 + δ A) + ½ B² δ / (1 + δ A),
-        A = Σ a²ᵗ / S,   B = Σ aᵗ η[t] / S.
+        log p(r) = Σ log N(η[t] − aᵗ ξ̂; 0, S) − ½ log(1 + δ A) − ½ ξ̂² / δ,
+        ξ̂ = δ B / (1 + δ A),   A = Σ a²ᵗ / S,   B = Σ aᵗ η[t] / S.
 
     Exact, and well behaved for σ → 0, s → 0 and any τ.
 
@@ -96,15 +105,18 @@ class DiscrepancyNoise:
         samples = residual.shape[1]
         phi, variance, surplus, log_a = self._steady_state(theta)
         a = np.exp(log_a)
-        eta_squares, b = np.empty_like(a), np.empty_like(a)
+        unsure = surplus / variance
+        gain = 1 + unsure * np.expm1(2 * samples * log_a) / np.expm1(2 * log_a)
+        squares = np.empty_like(a)
         for row, values in enumerate(residual):
             eta = lfilter((1.0, -phi[row]), (1.0, -a[row]), values)
-            eta_squares[row] = np.sum(eta * eta)
             # Powers of a below exp(-40) add nothing.
             memory = int(min(samples, 1 - 40 / log_a[row]))
-            b[row] = np.sum(np.power(a[row], np.arange(memory)) * eta[:memory])
-        gain = 1 + surplus / variance * np.expm1(2 * samples * log_a) / np.expm1(2 * log_a)
-        squares = (eta_squares - b**2 * surplus / variance / gain) / variance
+            powers = np.power(a[row], np.arange(memory))
+            pull = powers @ eta[:memory] / gain[row]
+            eta[:memory] -= unsure[row] * pull * powers
+            squares[row] = eta @ eta + unsure[row] * pull**2
+        squares /= variance
         logs = samples * (np.log(variance) + LOG_TWO_PI) + np.log(gain)
         density: FloatArray = -0.5 * (squares + logs)
         return density
@@ -112,12 +124,17 @@ class DiscrepancyNoise:
     def whiten(self, theta: FloatArray, series: FloatArray) -> FloatArray:
         """Return steady-state innovations of series (rows, samples) over their sd, at one θ."""
         phi, variance, _, log_a = (float(v[0]) for v in self._steady_state(theta))
-        innovations: FloatArray = lfilter((1.0, -phi), (1.0, -np.exp(log_a)), series, axis=1)
-        return innovations / np.sqrt(variance)
+        innovations = lfilter((1.0, -phi), (1.0, -np.exp(log_a)), series, axis=1)
+        white: FloatArray = innovations / np.sqrt(variance)
+        return white
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
+
+    def at(self, interval: float) -> DiscrepancyNoise:
+        """Return the same noise for samples ``interval`` seconds apart."""
+        return DiscrepancyNoise(interval)
 
     def _steady_state(
         self, theta: FloatArray
@@ -130,6 +147,6 @@ class DiscrepancyNoise:
         root = np.sqrt(half**2 + fresh * process * sensor)
         apart = np.where(half > 0, 1, root - half)
         predicted = np.where(half > 0, half + root, fresh * process * sensor / apart)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             log_a = np.minimum(log_phi - np.log1p(predicted / sensor), -1e-300)
         return np.exp(log_phi), predicted + sensor, process - predicted, log_a

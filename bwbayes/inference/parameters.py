@@ -193,8 +193,10 @@ class JointPrior:
         for parameter, z in zip(self.free, safe.T, strict=True):
             assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            values[parameter.name], between = parameter.prior.from_normal(z, *bounds)
-            room = room * between
+            x, between = parameter.prior.from_normal(z, *bounds)
+            # Rounding may put a positive parameter on its open bound, where there is no model.
+            room = room * np.where((x > 0) | (parameter.name not in POSITIVE), between, 0)
+            values[parameter.name] = x
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
         log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
@@ -222,7 +224,9 @@ class JointPrior:
             case "gamma" if "beta" in values:
                 low, high = np.maximum(low, -values["beta"]), np.minimum(high, values["beta"])
             case "initial":
-                top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
+                # Not a number where |γ| > β, which is outside already.
+                with np.errstate(invalid="ignore"):
+                    top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
                 top = np.minimum(top, HIGHEST_CEILING)
                 low, high = np.maximum(low, -top), np.minimum(high, top)
         return low, high

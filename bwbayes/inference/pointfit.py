@@ -58,7 +58,7 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     """
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
-    centre, spread = np.median(draws, axis=0), np.cov(draws, rowvar=False)
+    centre, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
     density = posterior.log_density(draws[:DRAWS])
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
@@ -132,14 +132,19 @@ class _LeastSquares:
             slopes: FloatArray = ((plus - minus) / (2 * steps[:, np.newaxis])).T
             return slopes
 
+        def residuals(values: FloatArray) -> FloatArray:
+            row: FloatArray = self.residuals(place(values))[0]
+            return row
+
         found = optimize.least_squares(
-            lambda values: self.residuals(place(values))[0],
+            residuals,
             start[self.physical],
             jac=jacobian,
             x_scale=self.spread[self.physical],
             max_nfev=60,
         )
-        return place(found.x)[0]
+        optimum: FloatArray = place(found.x)[0]
+        return optimum
 
 
 @dataclass(frozen=True)
@@ -195,7 +200,8 @@ class _Surface:
         return place
 
     def inwards(self, place: FloatArray) -> FloatArray:
-        return linalg.solve(self.axes, place - self.centre)
+        w: FloatArray = linalg.solve(self.axes, place - self.centre)
+        return w
 
     def values(self, w: FloatArray) -> FloatArray:
         # A finite wall keeps the trust region's arithmetic alive where the density is zero.

@@ -9,8 +9,9 @@ as the columns of a matrix θ. A long record can be walked through in pieces: th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -53,12 +54,27 @@ class Actuator:
         ``"first"``: the drive goes straight from sample to sample (a measured voltage);
         ``"zero"``: it is held until the next sample (the command of a DAC).
     interval
-        Sampling interval, s.
+        Sampling interval, s, above zero.
+
+    Raises
+    ------
+    InputError
+        An unknown ``dynamics`` or ``hold``, or an ``interval`` that is not positive and finite.
     """
 
     dynamics: Dynamics = "lag"
     hold: Hold = "first"
     interval: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("dynamics", self.dynamics, get_args(Dynamics)),
+            ("hold", self.hold, get_args(Hold)),
+        ):
+            if value not in known:
+                raise InputError(f"{name}: {value!r} is unknown; write one of {', '.join(known)}")
+        if not 0 < self.interval < math.inf:
+            raise InputError(f"interval: {self.interval:.6g}; must be positive and finite, in s")
 
     @property
     def dynamics_parameters(self) -> tuple[str, ...]:
@@ -95,8 +111,9 @@ class Actuator:
         Raises
         ------
         InputError
-            θ of a wrong shape or outside the model's domain (see
-            :func:`~bwbayes.model.boucwen.hysteresis`).
+            θ of a wrong shape or outside the model's domain: not finite, mass or stiffness not
+            positive, lag or damping negative, and what
+            :func:`~bwbayes.model.boucwen.hysteresis` refuses. The text names the parameter.
         """
         return self.advance(theta, voltage)[0]
 
@@ -114,7 +131,10 @@ class Actuator:
                 f"theta: has shape {models.shape}; its columns are {', '.join(self.parameters)}"
             )
         path = np.asarray(voltage, dtype=np.float64)
+        if path.ndim != 1 or path.size == 0:
+            raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
         column = dict(zip(self.parameters, models.T, strict=True))
+        self._check_domain(column)
         recursion = self._recursion(column)
         h = self._hysteresis(column, path, state)
         drive = column["d"][:, np.newaxis] * path
@@ -136,16 +156,25 @@ class Actuator:
         joined = np.concatenate([[state.voltage], path])
         return hysteresis(joined, **shape, initial=state.hysteretic)[:, 1:]
 
-    def _recursion(self, column: dict[str, FloatArray]) -> Recursion:
-        for name in self.dynamics_parameters:
-            allowed = column[name] > 0 if name in ("mass", "stiffness") else column[name] >= 0
+    def _check_domain(self, column: dict[str, FloatArray]) -> None:
+        """Refuse what :func:`hysteresis` does not see."""
+        for name in ("d", *self.dynamics_parameters, "offset"):
+            values = column[name]
+            allowed, demand = np.isfinite(values), "must be finite"
+            if name in ("mass", "stiffness"):
+                allowed, demand = allowed & (values > 0), "must be positive and finite"
+            elif name in ("lag", "damping"):
+                allowed, demand = allowed & (values >= 0), "must be finite and not negative"
             if not allowed.all():
-                raise InputError(f"{name}: {column[name].min():.6g}; must be positive")
+                row = int(np.argmin(allowed))
+                raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
+
+    def _recursion(self, column: dict[str, FloatArray]) -> Recursion:
         if self.dynamics == "second-order":
             return second_order(
                 column["mass"], column["damping"], column["stiffness"], self.interval, self.hold
             )
-        lag = column["lag"] if self.dynamics == "lag" else np.zeros_like(column["d"])
-        if self.dynamics == "none":
-            return Recursion(np.ones((lag.size, 1)), np.ones((lag.size, 1)))
-        return first_order_lag(lag, self.interval, self.hold)
+        if self.dynamics == "lag":
+            return first_order_lag(column["lag"], self.interval, self.hold)
+        unity = np.ones((column["d"].size, 1))
+        return Recursion(unity, unity)

@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.exponent import ExponentFlow
 
@@ -28,6 +28,13 @@ PIECE = 32_768
 
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
+
+# With γ > β, h = α / (β − γ) is a state of unstable rest, and for β = 0 it is the ceiling itself.
+# A start that rounding puts on it or beyond is taken to lie this fraction of the way there.
+INSIDE = 1 - 1e-14
+
+# A state carried over from an earlier piece may exceed the ceiling by its rounding.
+CEILING_SLACK = 1 + 1e-9
 
 
 class Stretch(NamedTuple):
@@ -170,8 +177,10 @@ class _LinearFlow:
         self.alpha = alpha
         self.ahead = _away_from_zero(beta + gamma)
         self.against = _away_from_zero(beta - gamma)
+        self.lowest = np.where(self.against < 0, INSIDE * alpha / self.against, -np.inf)
 
     def advance(self, start: FloatArray, travel: FloatArray) -> FloatArray:
+        start = np.maximum(start, self.lowest)
         crossing = np.where(
             start < 0, np.log1p(-np.minimum(start, 0) * self.against / self.alpha) / self.against, 0
         )[:, np.newaxis]
@@ -216,7 +225,7 @@ def _check_domain(
     exponent: FloatArray,
     initial: FloatArray,
 ) -> None:
-    def refuse(name: str, wrong: np.ndarray, demand: str, values: FloatArray) -> None:
+    def refuse(name: str, wrong: BoolArray, demand: str, values: FloatArray) -> None:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
@@ -225,8 +234,9 @@ def _check_domain(
     for name, values in named.items():
         refuse(name, ~np.isfinite(values), "must be finite", values)
     refuse("alpha", alpha <= 0, "must be positive", alpha)
-    refuse("gamma", beta + gamma < 0, "beta + gamma must not be negative", gamma)
     refuse("beta", beta < 0, "must not be negative", beta)
+    refuse("gamma", beta + gamma < 0, "beta + gamma must not be negative", gamma)
     refuse("exponent", exponent < 1, "must be at least 1", exponent)
-    away = (gamma > beta) & (np.abs(initial) > ceiling(alpha, beta, gamma, exponent))
+    highest = CEILING_SLACK * ceiling(alpha, beta, gamma, exponent)
+    away = (gamma > beta) & (np.abs(initial) > highest)
     refuse("gamma", away, "with gamma > beta, initial must lie inside the ceiling", gamma)

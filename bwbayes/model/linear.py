@@ -24,6 +24,8 @@ __all__ = ["Hold", "Recursion", "first_order_lag", "second_order"]
 
 Hold = Literal["first", "zero"]
 
+ComplexArray = NDArray[np.complex128]
+
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
 
@@ -45,6 +47,8 @@ class Recursion:
 
     def run(self, drive: FloatArray, state: FloatArray) -> FloatArray:
         """Filter ``drive`` (models, samples) in place from ``state``, which moves on with it."""
+        if drive.shape[1] == 0:
+            return drive  # lfilter would leave the state undefined
         for row, values in enumerate(drive):
             values[:], state[row] = lfilter(
                 self.numerator[row], self.denominator[row], values, zi=state[row]
@@ -65,7 +69,7 @@ def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
     hold
         What the drive does between samples.
     """
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         z = -interval / lag
     decay = np.exp(z)
     now = -_z_phi_2(z) if hold == "first" else np.zeros_like(z)
@@ -94,7 +98,7 @@ def second_order(
     """
     decay = damping / (2 * mass)
     natural = np.sqrt(stiffness / mass)
-    root = np.sqrt((decay - natural) * (decay + natural) + 0j)
+    root: ComplexArray = np.sqrt((decay - natural) * (decay + natural) + 0j)
     fast = -(decay + root) * interval
     # The slow pole from the product of both: their difference would cancel.
     slow = (natural * interval) ** 2 / fast
@@ -117,8 +121,8 @@ def second_order(
 
 
 def _divided_differences(
-    slow: NDArray[np.complex128], fast: NDArray[np.complex128]
-) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.complex128]]:
+    slow: ComplexArray, fast: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return exp[z₁, z₂], exp[0, z₁, z₂] and exp[0, 0, z₁, z₂] for |z₁| ≤ |z₂|, Re z ≤ 0."""
     both = np.exp(slow) * _phi_1(fast - slow)
     near = np.abs(fast) < 1

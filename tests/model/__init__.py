@@ -1,0 +1,1 @@
+"""Tests of the hysteresis, the linear dynamics and the actuator made of both."""

@@ -1,0 +1,248 @@
+"""The command line: a thin layer over the package.
+
+Exit status 0: done, and converged. 2: input that cannot be used, said in one line. 4: finished
+without converging. 130: interrupted; what was computed is kept.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from bwbayes.errors import InputError
+
+__all__ = ["main"]
+
+NOT_CONVERGED = 4
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+# Options that several commands share.
+FILE = click.Path(path_type=Path)
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), help="Processes for the ensembles; default: all cores."
+)
+quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="bwbayes")
+def cli() -> None:
+    """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model."""
+
+
+@cli.command()
+@click.argument("config", type=FILE)
+@click.option("--record", type=FILE, help="Fit this record instead of the config's.")
+@click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
+@click.option("--seed", type=click.IntRange(0), help="Seed, instead of the config's.")
+@click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
+@workers_option
+@quiet_option
+def run(
+    config: Path,
+    record: Path | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
+    workers: int | None,
+    quiet: bool,
+) -> int:
+    """Sample a posterior and predict, from a CONFIG in TOML.
+
+    Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
+    """
+    from bwbayes.app.config import load  # noqa: PLC0415  # --help need not wait for scipy
+    from bwbayes.app.run import start  # noqa: PLC0415
+
+    wanted = load(config)
+    if record is not None:
+        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
+        wanted = wanted.model_copy(update={"record": source})
+    if seed is not None:
+        wanted = wanted.model_copy(update={"seed": seed})
+    if wanted.name is None:
+        wanted = wanted.model_copy(update={"name": config.stem})
+    folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+    return _finish(folder.path, workers, quiet)
+
+
+@cli.command()
+@click.argument("folder", type=FILE)
+@click.option("--ess", type=click.FloatRange(1), help="A new target of effective draws.")
+@click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
+@workers_option
+@quiet_option
+def resume(
+    folder: Path, ess: float | None, steps: int | None, workers: int | None, quiet: bool
+) -> int:
+    """Go on with the run in FOLDER, interrupted or short of its target.
+
+    Example: bwbayes resume results/ring_bender --steps 40000
+    """
+    return _finish(folder, workers, quiet, ess=ess, steps=steps)
+
+
+@cli.command()
+@click.argument("config", type=FILE)
+@click.option("--record", type=FILE, help="Check this record instead of the config's.")
+def check(config: Path, record: Path | None) -> int:
+    """Check a CONFIG and its record, and fit a point, without sampling.
+
+    Example: bwbayes check runs/measured_stack.toml --record my_record.csv
+    """
+    from bwbayes.app.config import load  # noqa: PLC0415
+    from bwbayes.app.screen import show_check  # noqa: PLC0415
+
+    wanted = load(config)
+    if record is not None:
+        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
+        wanted = wanted.model_copy(update={"record": source})
+    show_check(wanted, config.parent, Console())
+    return 0
+
+
+@cli.command()
+@click.argument("out", type=FILE)
+@click.option(
+    "--signal",
+    "wanted",
+    default="identification",
+    show_default=True,
+    help="identification, verification, step10, step50, step100, or sine (see the next options).",
+)
+@click.option("--amplitude", type=float, default=100.0, show_default=True, help="Of the sine, V.")
+@click.option("--frequency", type=float, default=1.0, show_default=True, help="Of the sine, Hz.")
+@click.option("--duration", type=float, default=16.0, show_default=True, help="Of the sine, s.")
+@click.option(
+    "--discrepancy",
+    type=click.Choice(["none", "process", "structural"]),
+    default="process",
+    show_default=True,
+    help="How the stand's actuator departs from the model.",
+)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
+def simulate(
+    out: Path,
+    wanted: str,
+    amplitude: float,
+    frequency: float,
+    duration: float,
+    discrepancy: str,
+    seed: int,
+    rate: float,
+) -> int:
+    """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
+
+    Example: bwbayes simulate ring.csv --signal verification --seed 7
+    """
+    from bwbayes.app.simulate import simulate as write  # noqa: PLC0415
+
+    sine = (amplitude, frequency, duration)
+    for path in write(out, wanted, sine, discrepancy, seed, rate):
+        click.echo(f"wrote {path}")
+    return 0
+
+
+@cli.command()
+@click.argument("folder", type=FILE)
+@click.option("--record", type=FILE, help="A record to predict; measured or a voltage alone.")
+@click.option("--signal", "wanted", help="A signal to predict instead, by its name.")
+@click.option("--from-rest", is_flag=True, help="The record starts from a demagnetised actuator.")
+@click.option(
+    "--lead-in", type=float, default=1.0, show_default=True, help="Estimates the offset, s."
+)
+@click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
+@click.option("--out", type=FILE, help="Default: FOLDER/predictions/NAME.csv.")
+def predict(
+    folder: Path,
+    record: Path | None,
+    wanted: str | None,
+    from_rest: bool,
+    lead_in: float,
+    same_offset: bool,
+    out: Path | None,
+) -> int:
+    """Write displacement bands for another record or voltage, from the run in FOLDER.
+
+    Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
+    """
+    from bwbayes.app.predict import predict as write  # noqa: PLC0415
+    from bwbayes.results.prediction import Start  # noqa: PLC0415
+
+    if (record is None) == (wanted is None):
+        raise InputError("predict: give either --record or --signal")
+    begin = Start(from_rest, not same_offset, lead_in)
+    return write(folder, record, wanted, begin, out, Console())
+
+
+@cli.command()
+@click.argument("folder", type=FILE)
+def report(folder: Path) -> int:
+    """Draw the pictures and the page of the run in FOLDER again.
+
+    Example: bwbayes report results/ring_bender
+    """
+    from bwbayes.app.folder import RunFolder  # noqa: PLC0415
+    from bwbayes.app.run import redraw  # noqa: PLC0415
+
+    run_folder = RunFolder.open(folder)
+    redraw(run_folder)
+    click.echo(f"wrote {run_folder.path / 'report.html'}")
+    return 0
+
+
+def _finish(
+    path: Path,
+    workers: int | None,
+    quiet: bool,
+    *,
+    ess: float | None = None,
+    steps: int | None = None,
+) -> int:
+    from bwbayes.app.folder import RunFolder  # noqa: PLC0415
+    from bwbayes.app.run import carry_on  # noqa: PLC0415
+    from bwbayes.app.screen import show_result  # noqa: PLC0415
+
+    folder = RunFolder.open(path)
+    console = Console(stderr=True, quiet=quiet)
+    try:
+        result = carry_on(folder, console, workers=workers, ess=ess, steps=steps)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
+        return INTERRUPTED
+    if not quiet:
+        show_result(result, folder, Console())
+    if result.outcome.converged:
+        return 0
+    click.echo(
+        f"NOT CONVERGED: {result.outcome.stop_reason}; no interval is given. Go on with "
+        f"`bwbayes resume {path} --steps N`, and look at the traces in {path}/report.html",
+        err=True,
+    )
+    return NOT_CONVERGED
+
+
+def _terminate(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Run the command line; every mendable error becomes one line and exit status 2."""
+    # A polite request to stop ends a run as Ctrl-C does.
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        status = cli.main(standalone_mode=False)
+    except (InputError, click.ClickException) as error:
+        message = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
+        status = BAD_INPUT
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("bwbayes: interrupted", err=True)
+        status = INTERRUPTED
+    sys.exit(status if isinstance(status, int) else 0)

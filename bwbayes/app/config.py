@@ -1,0 +1,227 @@
+"""Configs: what to run, in TOML, checked before anything starts.
+
+Only ``[record]`` is needed; everything else has a default. A key that does not exist is an error
+that names its place and the nearest key that does. :func:`load` reads a config, :func:`dump` writes
+one back, with every default made explicit.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tomlkit
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
+
+from bwbayes.errors import InputError
+
+__all__ = [
+    "Config",
+    "ModelConfig",
+    "ParameterConfig",
+    "RecordConfig",
+    "SignalConfig",
+    "ValidationConfig",
+    "dump",
+    "load",
+    "parse",
+]
+
+# Names go into file names.
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
+Positive = Annotated[float, Field(gt=0)]
+Window = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class SignalConfig(_Table):
+    """A voltage to be drawn up: V, Hz, s. ``decay`` is the part of the amplitude lost a second."""
+
+    shape: Literal["sine", "triangle"] = "sine"
+    amplitude: Positive
+    frequency: Positive
+    duration: Positive
+    start: Annotated[float, Field(ge=0)] = 0.0
+    decay: Annotated[float, Field(ge=0)] = 0.0
+    decay_from: Annotated[float, Field(ge=0)] = 0.0
+
+
+class StandConfig(_Table):
+    """The virtual test stand that signals are run on."""
+
+    discrepancy: Literal["none", "process", "structural"] = "process"
+    sample_rate: Positive = 1000.0
+
+
+class _Source(_Table):
+    """Where samples come from: a file, or a signal on the virtual test stand."""
+
+    file: str | None = None
+    signal: str | SignalConfig | None = None
+    voltage_is: Literal["command", "output"] | None = None
+
+
+class RecordConfig(_Source):
+    """The training record: its source, the part to use, and the windows to fit (default: all)."""
+
+    start: float | None = None
+    stop: float | None = None
+    decimate: Annotated[int, Field(ge=1)] = 1
+    train: Annotated[list[Window], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RecordConfig:
+        if (self.file is None) == (self.signal is None):
+            raise ValueError("give either file or signal")
+        return self
+
+
+class ModelConfig(_Table):
+    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output."""
+
+    dynamics: Literal["none", "lag", "second-order"] = "lag"
+    hold: Literal["auto", "first", "zero"] = "auto"
+    noise: Literal["discrepancy", "white"] = "discrepancy"
+
+
+class ParameterConfig(_Table):
+    """A parameter's prior or fixed value, bounds, and names for people."""
+
+    prior: dict[str, str | float] | None = None
+    fixed: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    unit: str | None = None
+    label: str | None = None
+    description: str | None = None
+
+    @model_validator(mode="after")
+    def _prior_or_value(self) -> ParameterConfig:
+        if self.prior is not None and self.fixed is not None:
+            raise ValueError("give prior or fixed, not both")
+        if self.prior is not None and not isinstance(self.prior.get("distribution"), str):
+            raise ValueError('prior needs a name: distribution = "normal", for instance')
+        return self
+
+
+class SamplingConfig(_Table):
+    """When to stop and how to sample; see :class:`bwbayes.inference.sampling.SamplingPlan`."""
+
+    ess: Positive = 2000.0
+    ensembles: Annotated[int, Field(ge=4)] = 4
+    walkers: Annotated[int, Field(ge=4, multiple_of=2)] | None = None
+    block: Annotated[int, Field(ge=10)] = 50
+    steps: Annotated[int, Field(ge=1)] = 20_000
+    pilot_steps: Annotated[int, Field(ge=1)] = 3_000
+
+
+class ValidationConfig(_Source):
+    """Held-out data: a window of the training record, or another record."""
+
+    window: Window | None = None
+    from_rest: bool = False
+    own_offset: bool = True
+    lead_in: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ValidationConfig:
+        if sum(source is not None for source in (self.window, self.file, self.signal)) != 1:
+            raise ValueError("give one of window, file and signal")
+        return self
+
+
+class Config(_Table):
+    """A whole run. ``truth`` holds the true parameters of a simulated record, to be shown."""
+
+    name: Annotated[str, Field(min_length=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 1
+    record: RecordConfig
+    stand: StandConfig = StandConfig()
+    model: ModelConfig = ModelConfig()
+    parameters: dict[str, ParameterConfig] = Field(default_factory=dict)
+    sampling: SamplingConfig = SamplingConfig()
+    validation: dict[Name, ValidationConfig] = Field(default_factory=dict)
+    truth: dict[str, float] = Field(default_factory=dict)
+
+
+def load(path: Path) -> Config:
+    """Read a config from a TOML file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is no TOML, or says something that no config can say.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "is not UTF-8 text"
+        raise InputError(f"{path}: {reason}; check the config's path") from None
+    return parse(text, str(path))
+
+
+def parse(text: str, where: str) -> Config:
+    """Read a config from TOML text; ``where`` names it in errors, which are as in :func:`load`."""
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{where}: is no TOML: {error}; mend the config") from None
+    try:
+        return Config.model_validate(table)
+    except ValidationError as error:
+        raise InputError(_one_line(where, error)) from None
+
+
+def dump(config: Config) -> str:
+    """Write a config as TOML."""
+    return tomlkit.dumps(config.model_dump(exclude_none=True))
+
+
+def _one_line(where: str, error: ValidationError) -> str:
+    """Say the first thing that is wrong: where, what, what to do."""
+    found = error.errors()
+    # Unknown keys first: a misspelt key is often why another one seems to be missing. Then the
+    # deepest place: the branch of a union that the user meant.
+    first = min(found, key=lambda e: (e["type"] != "extra_forbidden", -len(e["loc"])))
+    place = [str(part) for part in first["loc"] if not _is_branch(str(part))]
+    path = ".".join(place) or "config"
+    if first["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(place[-1], _keys_at(place[:-1]), n=1, cutoff=0.0)
+        return f"{where}: {path}: unknown key; did you mean {near[0]}?"
+    message = first["msg"].removeprefix("Value error, ")
+    got = "" if isinstance(first["input"], dict) else f", got {first['input']!r:.60}"
+    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; mend the config"
+
+
+def _is_branch(part: str) -> bool:
+    """Tell the names that pydantic gives to the branches of a union from keys."""
+    return part in ("str", "float", "SignalConfig")
+
+
+def _keys_at(place: list[str]) -> list[str]:
+    """Return the keys that exist at a place of a config."""
+    table: type[BaseModel] = Config
+    tables: dict[str, type[BaseModel]] = {
+        "record": RecordConfig,
+        "stand": StandConfig,
+        "model": ModelConfig,
+        "parameters": ParameterConfig,
+        "sampling": SamplingConfig,
+        "validation": ValidationConfig,
+        "signal": SignalConfig,
+    }
+    for part in place:
+        table = tables.get(part, table)
+    return list(table.model_fields)

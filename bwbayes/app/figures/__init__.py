@@ -1,0 +1,62 @@
+"""Pictures of a finished run: bands along loops and time, parameters, chains and coverage.
+
+:func:`draw_all` draws what there is to see of a :class:`~bwbayes.results.result.Result`, and
+:func:`save` writes it as PNG. A run that has not converged shows its chains and nothing else. This
+package alone knows matplotlib and corner; it opens no window and touches no global figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from urllib.parse import quote
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
+from bwbayes.app.figures.coverage import draw_coverage
+from bwbayes.app.figures.loop import draw_loop
+from bwbayes.app.figures.series import draw_bands
+from bwbayes.app.figures.style import STYLE
+from bwbayes.results.result import Result
+
+__all__ = ["draw_all", "save"]
+
+
+def draw_all(result: Result) -> dict[str, Figure]:
+    """Draw a run's figures, by name, in the order in which one looks at them.
+
+    ``loop``, ``bands_NAME`` for each of the result's bands, ``coverage``, ``corner``, ``trace`` and
+    ``ranks``. Without convergence only the last two; without bands or a measurement to hold them
+    against, what needs them is left out.
+    """
+    figures: dict[str, Figure] = {}
+    with mpl.rc_context(STYLE):
+        if result.outcome.converged:
+            if result.bands:
+                figures["loop"] = draw_loop(result.bands)
+            figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
+            if result.scores:
+                figures["coverage"] = draw_coverage(result.bands, result.scores)
+            figures["corner"] = draw_corner(result)
+        figures["trace"] = draw_trace(result)
+        figures["ranks"] = draw_ranks(result)
+    return figures
+
+
+def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
+    """Write each figure to ``folder/NAME.png`` and return the files' bytes by name.
+
+    The folder is made if need be; what a file name may not hold is percent-encoded.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures: dict[str, bytes] = {}
+    with mpl.rc_context(STYLE):
+        for name, figure in figures.items():
+            buffer = BytesIO()
+            figure.savefig(buffer, format="png")
+            pictures[name] = buffer.getvalue()
+            (folder / f"{quote(name, safe=' ,;()+')}.png").write_bytes(pictures[name])
+    return pictures

@@ -1,0 +1,188 @@
+"""Pictures of the draws: corner, traces and ranks."""
+
+from __future__ import annotations
+
+import itertools
+
+import corner
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import rankdata
+
+from bwbayes.app.figures.style import COLOURS, TRUTH_COLOUR, axis_label, hide_unused, starts
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.results.result import Result
+
+__all__ = ["draw_corner", "draw_ranks", "draw_trace"]
+
+CORNER_DRAWS = 5_000
+TRACE_STEPS = 400
+TRACE_STRETCHES = 50
+RANKED_DRAWS = 100_000
+RANK_BINS = 20
+
+# Inches of one panel of the corner picture, and of its margin for labels.
+CORNER_PANEL = 1.25
+CORNER_MARGIN = 1.0
+
+
+def draw_corner(result: Result) -> Figure:
+    """Draw every pair of free parameters, with contours that hold 50 and 90 % of the draws.
+
+    The true values, where they are known, are lines.
+    """
+    flat = result.flat_draws
+    flat = flat[starts(flat.shape[0], CORNER_DRAWS)]
+    free = len(result.free)
+    side = CORNER_PANEL * free + CORNER_MARGIN + 0.2
+    figure = Figure(figsize=(side, side))
+    truths = [result.truth.get(p.name) for p in result.free]
+    corner.corner(
+        flat,
+        fig=figure,
+        labels=[axis_label(p) for p in result.free],
+        labelpad=0.35,
+        range=[_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)],
+        levels=(0.5, 0.9),
+        color=COLOURS[0],
+        smooth=0.8,
+        plot_density=False,
+        fill_contours=True,
+        data_kwargs={"alpha": 0.3, "ms": 1.2},
+        label_kwargs={"fontsize": 12},
+        max_n_ticks=3,
+        quiet=True,
+    )
+    for panel in figure.axes[::free]:
+        panel.tick_params(axis="y", labelrotation=0)
+    margin = CORNER_MARGIN / side
+    far = 1 - 0.2 / side
+    figure.subplots_adjust(left=margin, bottom=margin, right=far, top=far)
+    _mark_truths(figure.axes, truths)
+    return figure
+
+
+def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
+    """Return the range of a parameter's axis: nearly all draws, and the truth."""
+    low, high = np.quantile(draws, [0.001, 0.999])
+    if truth is not None:
+        low, high = min(low, truth), max(high, truth)
+    margin = 0.05 * (high - low)
+    return float(low - margin), float(high + margin)
+
+
+def _mark_truths(panels: list[Axes], truths: list[float | None]) -> None:
+    """Draw the known true values; corner does so only for two parameters or more."""
+    for i, panel in enumerate(panels):
+        row, column = divmod(i, len(truths))
+        across, upright = truths[column], truths[row]
+        if column <= row and across is not None:
+            panel.axvline(across, color=TRUTH_COLOUR)
+        if column < row and upright is not None:
+            panel.axhline(upright, color=TRUTH_COLOUR)
+
+
+def draw_trace(result: Result) -> Figure:
+    """Draw, step by step, each ensemble's mean over its walkers and where 90 % of them are.
+
+    All parameters, and the log density. Ensembles that stay apart or drift have not converged.
+    """
+    names = [*(axis_label(p) for p in result.free), "log density (nats)"]
+    rows = -(-len(names) // 2)
+    figure = Figure(figsize=(11, 1.5 * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    steps = starts(result.draws.shape[0], TRACE_STEPS)
+    series = np.concatenate([result.draws[steps], result.log_density[steps][..., None]], axis=-1)
+    series = np.where(np.isfinite(series), series, np.nan)
+    middle = np.mean(series, axis=2)
+    cuts, low, high = _spread(series)
+    ends = np.append(steps, result.draws.shape[0])[cuts]
+    for i, panel in enumerate(hide_unused(grid, len(names), "step")):
+        panel.tick_params(labelbottom=bool(panel.get_xlabel()))
+        panel.set_ylabel(names[i])
+        for ensemble in range(series.shape[1]):
+            colour = COLOURS[ensemble % len(COLOURS)]
+            edges = (low[:, ensemble, i], high[:, ensemble, i])
+            panel.fill_between(ends + 1, *edges, color=colour, alpha=0.15, lw=0, step="post")
+            panel.plot(
+                steps + 1, middle[:, ensemble, i], color=colour, label=f"ensemble {ensemble + 1}"
+            )
+    _share_legend(figure)
+    return figure
+
+
+def _spread(series: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return where 90 % of the walkers are in each of some stretches of steps.
+
+    ``series`` is (steps, ensembles, walkers, any). Returns where the stretches begin and the last
+    one ends, (stretches + 1,), and from there on the 5 % and 95 % quantiles, (stretches + 1,
+    ensembles, any), the last stretch's twice.
+    """
+    cuts = np.append(starts(series.shape[0], TRACE_STRETCHES), series.shape[0])
+    edges = [
+        np.quantile(series[a:b], [0.05, 0.95], axis=(0, 2)) for a, b in itertools.pairwise(cuts)
+    ]
+    low, high = np.stack([*edges, edges[-1]], axis=1)
+    return cuts, low, high
+
+
+def draw_ranks(result: Result) -> Figure:
+    """Draw, for each parameter, how the ranks of each ensemble's draws among all are spread.
+
+    Ensembles that draw from the same distribution have ranks that are spread evenly: each line
+    stays near one, 19 times out of 20 inside the grey band. The band is what independent draws
+    show, one for each autocorrelation time τ of each walker: with n draws of E ensembles in B bins
+    its half width is 1.96 √((B − 1)(E − 1) τ/n).
+    """
+    steps, ensembles, walkers, free = result.draws.shape
+    columns = min(3, free)
+    rows = -(-free // columns)
+    figure = Figure(figsize=(11, 1.8 * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    kept = result.draws[starts(steps, max(RANKED_DRAWS // (ensembles * walkers), 1))]
+    for i, panel in enumerate(hide_unused(grid, free, "rank among all draws (%)")):
+        panel.tick_params(labelbottom=bool(panel.get_xlabel()))
+        panel.set_title(axis_label(result.free[i]))
+        panel.margins(y=0.12)
+        if i % columns == 0:
+            panel.set_ylabel("draws per bin\n(expected: 1)")
+        time = float(np.maximum(result.outcome.check.autocorrelation[i], 1.0))
+        _draw_even(panel, steps * ensembles * walkers / time, ensembles)
+        for ensemble, heights in enumerate(_rank_heights(kept[..., i])):
+            panel.stairs(
+                heights,
+                np.linspace(0, 100, RANK_BINS + 1),
+                baseline=None,
+                color=COLOURS[ensemble % len(COLOURS)],
+                lw=1.2,
+                label=f"ensemble {ensemble + 1}",
+            )
+    _share_legend(figure)
+    return figure
+
+
+def _rank_heights(draws: FloatArray) -> FloatArray:
+    """Return (ensembles, bins) counts of ranks, over what they are expected to be.
+
+    ``draws`` is (steps, ensembles, walkers); what is not a number has no rank.
+    """
+    ranks = (rankdata(draws) - 0.5).reshape(draws.shape) / draws.size
+    edges = np.linspace(0, 1, RANK_BINS + 1)
+    counts = [np.histogram(ranks[:, e], edges)[0] for e in range(draws.shape[1])]
+    heights: FloatArray = np.asarray(counts) * (RANK_BINS * draws.shape[1] / draws.size)
+    return heights
+
+
+def _draw_even(panel: Axes, independent: float, ensembles: int) -> None:
+    """Draw what evenly spread ranks look like."""
+    panel.axhline(1.0, color="#777777", lw=0.8)
+    if np.isfinite(independent):
+        reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
+        band = (max(1 - reach, 0.0), 1 + reach)
+        panel.axhspan(*band, color="#dddddd", lw=0, label="what independent draws show")
+
+
+def _share_legend(figure: Figure) -> None:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=8)

@@ -1,0 +1,115 @@
+"""The hysteresis loop: displacement against voltage, with its bands, whole and at its tip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures.style import (
+    BAND_COLOURS,
+    BAND_NAMES,
+    MEAN_COLOUR,
+    MEASURED_COLOUR,
+    ZOOM_COLOUR,
+    plain,
+    title,
+)
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.results.bands import Bands, Kind
+
+__all__ = ["draw_loop"]
+
+SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
+
+# Drawn points per unit of length, the ranges of voltage and displacement being one each.
+RESOLUTION = 300
+
+# The tip's panel is as high as this many sensor bands; a tenth of it lies beyond the tip.
+TIP_HEIGHT = 4.0
+BEYOND = 0.1
+
+
+def draw_loop(every: Sequence[Bands]) -> Figure:
+    """Draw displacement against voltage, one column for each of the bands.
+
+    Above the whole loop, below its tip at the largest voltage, where a band that is thin on the
+    loop's scale can be seen.
+    """
+    columns = len(every)
+    size = (max(3.6 * columns, 6.0), 7.2)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(2, columns, squeeze=False)
+    for (whole, tip), bands in zip(axes.T, every, strict=True):
+        for panel, dot in ((whole, ","), (tip, ".")):
+            _draw(panel, bands, dot)
+            panel.set_xlabel("voltage (V)")
+        _zoom(whole, tip, bands)
+        whole.set_title(plain(title(bands)))
+        tip.set_title("tip at the largest voltage")
+    for panel in axes[:, 0]:
+        panel.set_ylabel("displacement (µm)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    return figure
+
+
+def _draw(panel: Axes, bands: Bands, dot: str) -> None:
+    kept = _along(bands.voltage, bands.mean)
+    voltage = bands.voltage[kept]
+    for kind in SHOWN:
+        lower, upper = bands.lower[kind, 95][kept], bands.upper[kind, 95][kept]
+        panel.add_collection(_ribbon(voltage, lower, upper, kind))
+    panel.plot(voltage, bands.mean[kept], color=MEAN_COLOUR, lw=0.7, label="mean")
+    if bands.measured is not None:
+        panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
+        dots = panel.plot(bands.voltage, bands.measured, dot, color=MEASURED_COLOUR, alpha=0.25)
+        dots[0].set(markersize=2.0, markeredgewidth=0.0, zorder=1.5)
+    panel.autoscale_view()
+
+
+def _along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
+    """Return the samples to draw: one for each small step along the loop.
+
+    A fast signal keeps its samples, a slow one loses those that fall on the same spot.
+    """
+    steps = [np.diff(x) / max(float(np.ptp(x)), 1e-300) for x in (voltage, displacement)]
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*steps))])
+    kept: IntArray = np.unique(np.floor(RESOLUTION * length), return_index=True)[1]
+    return np.union1d(kept, [voltage.size - 1])
+
+
+def _ribbon(x: FloatArray, lower: FloatArray, upper: FloatArray, kind: Kind) -> PolyCollection:
+    """Return a band along a path that may turn back: one quadrilateral from sample to sample.
+
+    Opaque, because what overlaps where the path turns must not look like a denser band.
+    """
+    corners = ((x[:-1], lower[:-1]), (x[1:], lower[1:]), (x[1:], upper[1:]), (x[:-1], upper[:-1]))
+    # One array goes faster than the sequence of arrays that the type asks for.
+    vertices: Any = np.moveaxis(np.asarray(corners), 2, 0)
+    colour = BAND_COLOURS[kind]
+    return PolyCollection(
+        vertices, facecolor=colour, edgecolor=colour, linewidth=0.4, label=BAND_NAMES[kind]
+    )
+
+
+def _zoom(whole: Axes, tip: Axes, bands: Bands) -> None:
+    """Cut the tip's panel to the tip and mark it on the whole loop."""
+    at = int(np.argmax(bands.voltage))
+    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+    upright = TIP_HEIGHT * width
+    across = (float(np.ptp(bands.voltage)) or 1.0) * upright / max(np.ptp(bands.mean), upright)
+    left = float(bands.voltage[at]) - (1 - BEYOND) * across
+    top = float(np.max(bands.upper["sensor", 95][at])) + BEYOND * upright
+    tip.set_xlim(left, left + across)
+    tip.set_ylim(top - upright, top)
+    whole.indicate_inset(
+        (left, top - upright, across, upright),
+        edgecolor=ZOOM_COLOUR,
+        alpha=1.0,
+        linewidth=1.5,
+    )

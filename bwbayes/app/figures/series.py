@@ -1,0 +1,134 @@
+"""Bands along time: voltage, displacement and residuals, whole and where the error is largest."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from bwbayes.app.figures.style import (
+    BAND_COLOURS,
+    BAND_NAMES,
+    LEAD_IN_COLOUR,
+    MEAN_COLOUR,
+    MEASURED_COLOUR,
+    TRUTH_COLOUR,
+    ZOOM_COLOUR,
+    envelope,
+    plain,
+    title,
+    zigzag,
+)
+from bwbayes.arrays import FloatArray
+from bwbayes.results.bands import Bands
+
+__all__ = ["draw_bands"]
+
+# The zoom shows at most this many sensor bands of displacement, and this part of the samples.
+ZOOM_HEIGHT = 8.0
+ZOOM_PART = 0.1
+LEAST_ZOOM = 40
+
+# A stretch with fewer samples than this shows dots and the truth, a longer one only pixels.
+DOTS = 2000
+
+
+def draw_bands(bands: Bands) -> Figure:
+    """Draw voltage, displacement with its bands, and residuals with the bands around zero.
+
+    The left column shows all samples, the right one a short stretch around the largest error (or
+    the largest displacement, if nothing was measured), where the bands can be told apart.
+    """
+    figure = Figure(figsize=(11, 7.4), layout="constrained")
+    axes = figure.subplots(3, 2, sharex="col", width_ratios=(2, 1), height_ratios=(1, 2, 2))
+    short = _around_largest_error(bands)
+    for column, part in zip(axes.T, (slice(None), short), strict=True):
+        _draw_voltage(column[0], bands, part)
+        _draw_displacement(column[1], bands, part)
+        _draw_residual(column[2], bands, part)
+        column[2].set_xlabel("time (s)")
+    axes[2, 1].xaxis.set_major_locator(MaxNLocator(5))
+    for panel in axes[:, 0]:
+        _mark(panel, bands, short)
+    axes[0, 0].set_ylabel("voltage (V)")
+    axes[1, 0].set_ylabel("displacement (µm)")
+    what = "band − mean" if bands.measured is None else "measured − mean"
+    axes[2, 0].set_ylabel(f"{what} (µm)")
+    axes[0, 0].set_title(plain(title(bands)))
+    where = "largest displacement" if bands.measured is None else "largest error"
+    axes[0, 1].set_title(f"at the {where}")
+    named: dict[str, Artist] = {}
+    for panel in axes[2]:
+        handles, labels = panel.get_legend_handles_labels()
+        named |= zip(labels, handles, strict=True)
+    figure.legend(list(named.values()), list(named), loc="outside upper center", ncols=4)
+    return figure
+
+
+def _around_largest_error(bands: Bands) -> slice:
+    """Return the judged samples around the largest error that fit into the zoom's height."""
+    size = bands.time.size
+    first = min(bands.scored_from, size - 1)
+    error = bands.mean if bands.measured is None else bands.measured - bands.mean
+    at = first + int(np.argmax(np.abs(error[first:])))
+    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+    reach = max(int(ZOOM_PART * size / 2), LEAST_ZOOM)
+    near = bands.mean[max(at - reach, 0) : at + reach + 1]
+    here = min(at, reach)
+    far = np.abs(near - near[here]) > ZOOM_HEIGHT * width / 2
+    away = np.abs(np.flatnonzero(far) - here)
+    reach = max(int(away.min()), LEAST_ZOOM) if away.size else reach
+    return slice(max(at - reach, 0), min(at + reach + 1, size))
+
+
+def _draw_voltage(panel: Axes, bands: Bands, part: slice) -> None:
+    panel.plot(*zigzag(bands.time[part], bands.voltage[part]), color=MEASURED_COLOUR, lw=0.8)
+
+
+def _draw_displacement(panel: Axes, bands: Bands, part: slice) -> None:
+    _draw_ribbons(panel, bands, part, np.zeros_like(bands.mean))
+    panel.plot(*zigzag(bands.time[part], bands.mean[part]), color=MEAN_COLOUR, lw=0.8)
+    if bands.measured is not None:
+        _draw_readings(panel, bands.time[part], bands.measured[part])
+
+
+def _draw_residual(panel: Axes, bands: Bands, part: slice) -> None:
+    _draw_ribbons(panel, bands, part, bands.mean)
+    panel.axhline(0.0, color=MEAN_COLOUR, lw=1.0, label="mean")
+    if bands.measured is not None:
+        _draw_readings(panel, bands.time[part], (bands.measured - bands.mean)[part])
+        panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
+    if bands.truth is not None and bands.time[part].size < DOTS:
+        drawn = zigzag(bands.time[part], (bands.truth - bands.mean)[part])
+        panel.plot(*drawn, color=TRUTH_COLOUR, lw=1.0, label="true displacement, without noise")
+
+
+def _draw_ribbons(panel: Axes, bands: Bands, part: slice, about: FloatArray) -> None:
+    """Draw the three 95 % bands, the widest first."""
+    for kind, colour in BAND_COLOURS.items():
+        lower = (bands.lower[kind, 95] - about)[part]
+        upper = (bands.upper[kind, 95] - about)[part]
+        drawn = envelope(bands.time[part], lower, upper)
+        panel.fill_between(*drawn, color=colour, lw=0, label=BAND_NAMES[kind])
+
+
+def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
+    """Draw every reading: an envelope of noise would hide how few lie outside the band."""
+    if time.size < DOTS:
+        panel.plot(time, readings, ".", color=MEASURED_COLOUR, ms=2.5, mew=0, alpha=0.7)
+    else:
+        panel.plot(time, readings, ",", color=MEASURED_COLOUR, alpha=min(1.0, 15_000 / time.size))
+
+
+def _mark(panel: Axes, bands: Bands, short: slice) -> None:
+    """Show where the zoom is, and which samples are not judged."""
+    span = bands.time[short]
+    label = "shown on the right"
+    panel.axvspan(span[0], span[-1], color=ZOOM_COLOUR, alpha=0.5, lw=1, zorder=0.5, label=label)
+    if bands.scored_from:
+        last = bands.time[min(bands.scored_from, bands.time.size - 1)]
+        panel.axvspan(
+            bands.time[0], last, fc=LEAD_IN_COLOUR, alpha=0.35, lw=0, label="lead-in, not judged"
+        )

@@ -1,0 +1,140 @@
+"""What all pictures share: their look, the words on their axes, and how long series are thinned.
+
+The colours are Okabe and Ito's, which colour-blind readers can tell apart; bands differ by
+lightness besides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.mathtext import MathTextParser
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.parameters import Parameter
+from bwbayes.results.bands import Bands, Kind
+
+__all__ = [
+    "BAND_COLOURS",
+    "BAND_NAMES",
+    "COLOURS",
+    "LEAD_IN_COLOUR",
+    "MEAN_COLOUR",
+    "MEASURED_COLOUR",
+    "STYLE",
+    "TRUTH_COLOUR",
+    "ZOOM_COLOUR",
+    "axis_label",
+    "envelope",
+    "hide_unused",
+    "plain",
+    "starts",
+    "title",
+    "unit_text",
+    "zigzag",
+]
+
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "mathtext.fontset": "dejavusans",
+    "text.usetex": False,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 6),
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e8e8e8",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+    "path.simplify": True,
+}
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+MEAN_COLOUR = "#D55E00"
+MEASURED_COLOUR = "#222222"
+TRUTH_COLOUR = "#E69F00"
+LEAD_IN_COLOUR = "#999999"
+ZOOM_COLOUR = "#CC79A7"
+
+# From the widest band, drawn first, to the narrowest.
+BAND_COLOURS: Mapping[Kind, str] = {
+    "sensor": "#C6DFF0",
+    "displacement": "#73B1DA",
+    "parameter": "#00507F",
+}
+BAND_NAMES: Mapping[Kind, str] = {
+    "sensor": "95 % sensor reading",
+    "displacement": "95 % displacement",
+    "parameter": "95 % parameters alone",
+}
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit for people: um as µm, nothing for a pure number."""
+    return "" if unit == "-" else re.sub(r"\bum\b", "µm", unit)
+
+
+def plain(text: str) -> str:
+    """Return a text that matplotlib will not read as mathematics."""
+    return text.replace("$", r"\$")
+
+
+def axis_label(parameter: Parameter) -> str:
+    """Return a parameter's symbol and unit for an axis; its name if the symbol is no mathtext."""
+    symbol = f"${parameter.label}$"
+    try:
+        MathTextParser("path").parse(symbol)
+    except (ValueError, RuntimeError):
+        symbol = plain(parameter.name)
+    unit = plain(unit_text(parameter.unit))
+    return f"{symbol} ({unit})" if unit else symbol
+
+
+def title(bands: Bands) -> str:
+    """Return the bands' name, and whether their samples were fitted to."""
+    return f"{bands.name} ({'fitted' if bands.training else 'not fitted'})"
+
+
+def starts(samples: int, most: int) -> IntArray:
+    """Return the first samples of at most ``most`` stretches of nearly equal length."""
+    return np.linspace(0, samples, min(samples, most), endpoint=False).astype(np.int64)
+
+
+def envelope(
+    time: FloatArray, lower: FloatArray, upper: FloatArray, most: int = 1500
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Thin a band to ``most`` stretches, each with its least and largest edge.
+
+    Every excursion stays visible, which it would not if samples were left out.
+    """
+    first = starts(time.size, most)
+    return time[first], np.minimum.reduceat(lower, first), np.maximum.reduceat(upper, first)
+
+
+def zigzag(time: FloatArray, values: FloatArray, most: int = 1500) -> tuple[FloatArray, FloatArray]:
+    """Thin a line to the least and the largest value of ``most`` stretches."""
+    if time.size <= 2 * most:
+        return time, values
+    at, low, high = envelope(time, values, values, most)
+    return np.repeat(at, 2), np.stack([low, high], axis=1).ravel()
+
+
+def hide_unused(axes: np.ndarray[Any, Any], used: int, xlabel: str) -> list[Axes]:
+    """Return the first ``used`` panels of a grid, the lowest of each column with the x label."""
+    panels: list[Axes] = list(axes.flat)
+    for i, panel in enumerate(panels):
+        panel.set_visible(i < used)
+        if i < used <= i + axes.shape[1]:
+            panel.set_xlabel(xlabel)
+    return panels[:used]

@@ -1,0 +1,309 @@
+"""From a config to a problem: records read, windows cut, every prior a number.
+
+:func:`resolve` does once what must not happen twice: it runs the virtual stand, draws up default
+priors, and takes ``hold = "auto"`` from the record. What comes out is a config that says all this
+in explicit numbers and refers to the records as files beside it, so that a run's folder can be
+moved, continued and run again by itself.
+"""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.app.config import (
+    Config,
+    ModelConfig,
+    ParameterConfig,
+    RecordConfig,
+    SignalConfig,
+    ValidationConfig,
+)
+from bwbayes.data import Record, Split, read_record
+from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.noise import noise_model
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.sampling import SamplingPlan
+from bwbayes.model.actuator import Actuator
+from bwbayes.results.prediction import Start
+
+__all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out data: a window (slice) of the training record, or another record and its start."""
+
+    window: slice | None = None
+    record: Record | None = None
+    start: Start = field(default_factory=Start)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that a run needs, and the config that says the same in explicit numbers."""
+
+    config: Config
+    record: Record
+    posterior: Posterior
+    plan: SamplingPlan
+    validations: Mapping[str, Validation]
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All parameters of the model and the noise."""
+        return self.posterior.prior.parameters
+
+
+def generator(seed: int, purpose: str) -> np.random.Generator:
+    """Return the generator of one purpose of a run: each has a stream of its own."""
+    return np.random.default_rng([seed, *purpose.encode()])
+
+
+def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
+    """Return the waveform of that name, or the one a config draws up."""
+    if isinstance(wanted, str):
+        return signal(wanted)
+    shape = Sine if wanted.shape == "sine" else Triangle
+    return Waveform(
+        shape(wanted.amplitude, wanted.frequency),
+        wanted.duration,
+        wanted.start,
+        Decay(wanted.decay_from, wanted.decay),
+    )
+
+
+def resolve(config: Config, folder: Path) -> Problem:
+    """Make a problem of a config whose files are relative to ``folder``.
+
+    Raises
+    ------
+    InputError
+        Anything in the config or the records that cannot be used.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        record, truth = _training_record(config, folder)
+        split = _split(config, record)
+        others = {
+            name: _other_record(config, name, folder)
+            for name, validation in config.validation.items()
+            if validation.window is None
+        }
+    remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    hold = config.model.hold
+    if hold == "auto":
+        hold = "zero" if record.voltage_is == "command" else "first"
+    actuator = Actuator(config.model.dynamics, hold, record.interval)
+    noise = noise_model(config.model.noise, record.interval)
+    names = (*actuator.parameters, *noise.parameters)
+    prior = JointPrior(_parameters(config, names, record, split.training))
+    assert record.displacement is not None
+    posterior = Posterior(
+        record.voltage, record.displacement, split.training, actuator, noise, prior
+    )
+    windows = iter(split.held_out)
+    validations = {
+        name: Validation(window=next(windows))
+        if v.window is not None
+        else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
+        for name, v in config.validation.items()
+    }
+    explicit = _explicit(config, prior, hold, truth)
+    plan = _plan(config, prior)
+    return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
+
+
+def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, float]]:
+    source = config.record
+    truth = dict(config.truth)
+    if source.file is not None:
+        record = read_record(folder / source.file, voltage_is=source.voltage_is)
+    else:
+        assert source.signal is not None
+        stand = _stand(config)
+        waveform = sampled_waveform(source.signal)
+        record = _named(stand.run(waveform, generator(config.seed, "record")), source.signal)
+        truth = stand.parameters() | truth
+    if source.start is not None or source.stop is not None:
+        end = record.start + record.duration
+        start = record.start if source.start is None else source.start
+        record = record.window(start, end if source.stop is None else source.stop)
+    if source.decimate > 1:
+        record = record.decimate(source.decimate)
+    return record, truth
+
+
+def _other_record(config: Config, name: str, folder: Path) -> Record:
+    source = config.validation[name]
+    if source.file is not None:
+        return read_record(folder / source.file, voltage_is=source.voltage_is)
+    assert source.signal is not None
+    made = _stand(config).run(
+        sampled_waveform(source.signal), generator(config.seed, f"record {name}")
+    )
+    return _named(made, source.signal)
+
+
+def _stand(config: Config) -> VirtualTestStand:
+    return VirtualTestStand(config.stand.discrepancy, config.stand.sample_rate)
+
+
+def _named(record: Record, wanted: str | SignalConfig) -> Record:
+    name = wanted if isinstance(wanted, str) else wanted.shape
+    return replace(record, origin=f"{record.origin}, {name} signal")
+
+
+def _split(config: Config, record: Record) -> Split:
+    held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
+    train = config.record.train or [[record.start, record.start + record.duration]]
+    pairs = [(window[0], window[1]) for window in train]
+    return record.split(pairs, [(window[0], window[1]) for window in held_out.values()])
+
+
+def _parameters(
+    config: Config, names: tuple[str, ...], record: Record, training: tuple[slice, ...]
+) -> list[Parameter]:
+    unknown = [name for name in config.parameters if name not in names]
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], names, n=1, cutoff=0.0)
+        raise InputError(
+            f"parameters.{unknown[0]}: the model has no such parameter; did you mean {near[0]}?"
+        )
+    rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
+    assert record.displacement is not None
+    voltage, displacement = record.voltage[rows], record.displacement[rows]
+    if np.ptp(voltage) == 0 or np.ptp(displacement) == 0:
+        raise InputError("record.train: voltage or displacement is constant there; widen it")
+    ranges = Ranges.of(voltage, displacement, record.interval)
+    exponent = _fixed(config, "exponent", 1.0)
+    stiffness = _fixed(config, "stiffness", None)
+    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
+    return [_parameter(name, given[name], ranges, exponent, stiffness) for name in names]
+
+
+def _fixed(config: Config, name: str, default: float | None) -> float | None:
+    given = config.parameters.get(name)
+    return default if given is None or given.fixed is None else given.fixed
+
+
+def _parameter(
+    name: str,
+    given: ParameterConfig,
+    ranges: Ranges,
+    exponent: float | None,
+    stiffness: float | None,
+) -> Parameter:
+    """Put what the config says of a parameter before what the defaults say."""
+    meaning = CATALOGUE[name]
+    prior, fixed = None, given.fixed
+    if given.prior is not None:
+        prior = _distribution(name, given.prior)
+    elif fixed is None:
+        prior, fixed = _default(name, ranges, exponent or 1.0, stiffness)
+    unit = meaning.unit
+    if name in ("beta", "gamma") and exponent != 1.0:
+        unit = "um^(1-n)/V"
+    return Parameter(
+        name,
+        given.unit or unit,
+        given.label or meaning.label,
+        given.description or meaning.description,
+        prior,
+        fixed,
+        -np.inf if given.lower is None else given.lower,
+        np.inf if given.upper is None else given.upper,
+    )
+
+
+def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
+    arguments = {key: value for key, value in prior.items() if key != "distribution"}
+    try:
+        # The distribution itself refuses arguments that are no numbers.
+        return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"parameters.{name}.prior: {error}") from None
+
+
+def _default(
+    name: str, ranges: Ranges, exponent: float, stiffness: float | None
+) -> tuple[Distribution | None, float | None]:
+    try:
+        found = default_prior(name, ranges, exponent, stiffness)
+    except KeyError:
+        raise InputError(
+            f"parameters.{name}: has no default prior; give prior or fixed (a record shows mass "
+            "and stiffness only through the damping)"
+        ) from None
+    return (found, None) if isinstance(found, Distribution) else (None, found)
+
+
+def _plan(config: Config, prior: JointPrior) -> SamplingPlan:
+    given = config.sampling
+    # Six more than the least: complementary halves must span all directions.
+    walkers = given.walkers or max(2 * prior.dimensions + 6, 16)
+    return SamplingPlan(
+        ess=given.ess,
+        ensembles=given.ensembles,
+        walkers=walkers,
+        block=given.block,
+        most_steps=given.steps,
+        most_pilot_steps=given.pilot_steps,
+    )
+
+
+def _explicit(config: Config, prior: JointPrior, hold: str, truth: Mapping[str, float]) -> Config:
+    """Return the config with every choice made, its records as files beside it."""
+    validation = {
+        name: v
+        if v.window is not None
+        else ValidationConfig(
+            file=f"records/{name}.h5",
+            from_rest=v.from_rest,
+            own_offset=v.own_offset,
+            lead_in=v.lead_in,
+        )
+        for name, v in config.validation.items()
+    }
+    return config.model_copy(
+        update={
+            "record": RecordConfig(file="records/record.h5", train=config.record.train),
+            "model": ModelConfig(
+                dynamics=config.model.dynamics,
+                hold="zero" if hold == "zero" else "first",
+                noise=config.model.noise,
+            ),
+            "parameters": {p.name: _as_config(p) for p in prior.parameters},
+            "sampling": config.sampling.model_copy(
+                update={"walkers": _plan(config, prior).walkers}
+            ),
+            "validation": validation,
+            "truth": {n: v for n, v in truth.items() if n in prior.names},
+        }
+    )
+
+
+def _as_config(parameter: Parameter) -> ParameterConfig:
+    prior: dict[str, str | float] | None = None
+    if parameter.prior is not None:
+        prior = {"distribution": parameter.prior.name, **parameter.prior.arguments}
+    return ParameterConfig(
+        prior=prior,
+        fixed=parameter.fixed,
+        lower=parameter.lower if np.isfinite(parameter.lower) else None,
+        upper=parameter.upper if np.isfinite(parameter.upper) else None,
+        unit=parameter.unit,
+        label=parameter.label,
+        description=parameter.description,
+    )

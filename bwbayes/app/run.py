@@ -1,0 +1,299 @@
+"""A run, from a config or from where it was interrupted, to its last file.
+
+:func:`start` makes the run's folder; :func:`carry_on` does whatever is left to do in one: point
+fit, sampling, prediction, files. Each stage draws from a random stream of its own and stores what
+the next one needs, so it does not matter in how many pieces a run is done.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import platform
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Console
+
+from bwbayes.app.config import Config, dump, load
+from bwbayes.app.figures import draw_all, save
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import Problem, generator, resolve
+from bwbayes.app.progress import Progress
+from bwbayes.app.report import render
+from bwbayes.errors import InputError
+from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference.chainfile import ChainFile
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from bwbayes.results.bands import Bands
+from bwbayes.results.files import write_bands, write_posterior, write_summary
+from bwbayes.results.prediction import predict_record, predict_windows, thinned
+from bwbayes.results.result import Result, summary
+from bwbayes.results.scores import Scores, score
+
+__all__ = [
+    "assemble",
+    "carry_on",
+    "executor",
+    "finished",
+    "load_run",
+    "predictions",
+    "redraw",
+    "start",
+    "versions",
+]
+
+PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
+
+
+def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
+    """Make the folder of a new run; the config's files are relative to the folder ``where``.
+
+    Raises
+    ------
+    InputError
+        The config, its records or the folder cannot be used.
+    """
+    return RunFolder.create(out, resolve(config, where), overwrite)
+
+
+def load_run(folder: RunFolder) -> Problem:
+    """Return the problem of a run's folder."""
+    return resolve(load(folder.config), folder.path)
+
+
+def carry_on(
+    folder: RunFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    ess: float | None = None,
+    steps: int | None = None,
+) -> Result:
+    """Do what is left of a run and write its files.
+
+    Parameters
+    ----------
+    folder
+        The run's folder.
+    console
+        Where progress goes.
+    workers
+        Processes for the ensembles; by default one a core. The result does not depend on it.
+    ess, steps
+        A new target and budget, if given.
+
+    Raises
+    ------
+    InputError
+        The folder's files do not fit together, or another process is writing them.
+    """
+    begun = time.monotonic()
+    with folder.locked():
+        if ess is not None or steps is not None:
+            _retarget(folder, ess, steps)
+        problem = load_run(folder)
+        with (
+            _chain(folder, problem, console) as chain,
+            executor(workers) as pool,
+            Progress(console, chain, problem.plan) as progress,
+        ):
+            outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
+        console.print("predicting and drawing ...", highlight=False)
+        result = assemble(problem, chain, outcome)
+        _write(folder, problem, result, time.monotonic() - begun)
+    return result
+
+
+def redraw(folder: RunFolder) -> Result:
+    """Write the files of a finished run again, from its chain.
+
+    Raises
+    ------
+    InputError
+        The run has no draws yet, or another process is writing it.
+    """
+    with folder.locked():
+        if not folder.summary.is_file():
+            raise InputError(
+                f"{folder.path}: the run is not finished; go on with `bwbayes resume {folder.path}`"
+            )
+        seconds = json.loads(folder.summary.read_text(encoding="utf-8"))["wall_s"]
+        problem, chain, outcome = finished(folder)
+        result = assemble(problem, chain, outcome)
+        _write(folder, problem, result, seconds)
+    return result
+
+
+def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
+    """Read a run's problem and chain, and judge the chain as it stands.
+
+    Raises
+    ------
+    InputError
+        The chain is missing, damaged or still in its pilot.
+    """
+    problem = load_run(folder)
+    chain = ChainFile.read(folder.chain)
+    if chain.blocks("sampling") == 0:
+        raise InputError(f"{folder.path}: no draws yet; go on with `bwbayes resume {folder.path}`")
+    as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
+    with executor(1) as pool:
+        return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
+
+
+@contextmanager
+def executor(workers: int | None) -> Iterator[Executor]:
+    """Give an executor with that many workers: processes, or this process alone for one."""
+    count = workers or os.cpu_count() or 1
+    pool: Executor = ThreadPoolExecutor(1)
+    if count > 1:
+        # A worker must not die of the Ctrl-C that asks the whole run to stop in order.
+        pool = ProcessPoolExecutor(
+            count,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=signal.signal,
+            initargs=(signal.SIGINT, signal.SIG_IGN),
+        )
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computed a result."""
+    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+
+
+def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
+    """Predict the training windows and everything held out."""
+    posterior, seed = problem.posterior, problem.config.seed
+    chosen = thinned(result.flat_draws, generator(seed, "draws"))
+    training = posterior.training
+    windows = {
+        "training" if len(training) == 1 else f"training-{i + 1}": window
+        for i, window in enumerate(training)
+    }
+    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
+    bands = predict_windows(posterior, chosen, problem.record, windows)
+    for name, validation in problem.validations.items():
+        if validation.record is not None:
+            source = generator(seed, f"predict {name}")
+            bands.append(
+                predict_record(posterior, chosen, validation.record, validation.start, source, name)
+            )
+    return tuple(bands)
+
+
+def _chain(folder: RunFolder, problem: Problem, console: Console) -> ChainFile:
+    """Open the run's chain where it stands, or start it with a point fit."""
+    posterior, config = problem.posterior, problem.config
+    if folder.chain.exists():
+        chain = ChainFile.resume(folder.chain)
+        if chain.attributes()["data_sha256"] != problem.record.sha256:
+            chain.close()
+            raise InputError(f"{folder.chain}: belongs to another record; run again")
+        return chain
+    console.print("point fit ...", highlight=False)
+    point = pointfit.fit(posterior, generator(config.seed, "point fit"))
+    attributes: dict[str, str | int] = {
+        "config": dump(config),
+        "data_sha256": problem.record.sha256,
+        "versions": json.dumps(versions()),
+        "platform": platform.platform(),
+        "seed": config.seed,
+        "parameters": json.dumps(posterior.names),
+    }
+    first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
+    return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+
+
+def _retarget(folder: RunFolder, ess: float | None, steps: int | None) -> None:
+    config = load(folder.config)
+    wanted = {"ess": ess, "steps": steps}
+    sampling = config.sampling.model_copy(
+        update={name: value for name, value in wanted.items() if value is not None}
+    )
+    draft = folder.config.with_suffix(".partial")
+    draft.write_text(dump(config.model_copy(update={"sampling": sampling})), encoding="utf-8")
+    draft.replace(folder.config)
+
+
+def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
+    """Put a result together: draws, remarks and, if the chain has converged, predictions."""
+    posterior = problem.posterior
+    left_open = identifiability.undetermined(posterior, chain.point)
+    remarks = [
+        *problem.remarks,
+        *(f"the record does not determine {c}: the prior decides there" for c in left_open),
+    ]
+    result = Result(
+        name=problem.config.name or "run",
+        outcome=outcome,
+        parameters=problem.parameters,
+        draws=draws(posterior, chain),
+        log_density=chain.log_density("sampling"),
+        facts=_facts(problem, posterior, chain),
+        remarks=tuple(remarks),
+        truth=problem.config.truth,
+    )
+    if not outcome.converged:
+        return result
+    bands = predictions(problem, result)
+    return replace(result, bands=bands, scores=_scores(problem, bands))
+
+
+def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
+    record, config = problem.record, problem.config
+    windows = ", ".join(
+        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
+    )
+    return {
+        "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
+        "data_sha256": record.sha256,
+        "fitted": windows,
+        "model": f"Bouc-Wen, dynamics {config.model.dynamics}, {config.model.hold}-order hold",
+        "noise": config.model.noise,
+        "sampling": (
+            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers, "
+            f"{chain.steps('pilot')} pilot steps, {chain.steps('sampling')} steps that count, "
+            + ("Student-t proposal" if chain.proposal else "differential evolution alone")
+        ),
+        "seed": str(config.seed),
+    } | {f"version of {name}": text for name, text in versions().items()}
+
+
+def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
+    seed = problem.config.seed
+    return {
+        one.name: score(one, generator(seed, f"score {one.name}"))
+        for one in bands
+        if one.measured is not None
+    }
+
+
+def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    numbers = summary(result) | {
+        "seed": problem.config.seed,
+        "wall_s": seconds,
+        "versions": versions(),
+        "data_sha256": problem.record.sha256,
+    }
+    record = problem.record
+    assert record.displacement is not None
+    write_posterior(folder.path / "posterior.nc", result, record.voltage, record.displacement)
+    write_bands(folder.path / "bands.csv", result.bands)
+    pictures = save(draw_all(result), folder.path / "figures")
+    page = render(result, numbers, pictures)
+    (folder.path / "report.html").write_text(page, encoding="utf-8")
+    write_summary(folder.summary, numbers)

@@ -1,0 +1,105 @@
+"""Tables on the screen: parameters, priors, scores, and what to know about a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bwbayes.app.config import Config
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import generator, resolve
+from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference.parameters import Parameter
+from bwbayes.results.result import Result, summary
+from bwbayes.results.scores import Scores
+
+__all__ = ["show_check", "show_result", "show_scores"]
+
+
+def show_result(result: Result, folder: RunFolder, console: Console) -> None:
+    """Show a finished run; without intervals, if it has not converged."""
+    numbers = summary(result)["parameters"]
+    if isinstance(numbers, Mapping):
+        table = Table("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
+        for name, row in numbers.items():
+            ess = min(row["ess_bulk"], row["ess_tail"])
+            table.add_row(
+                name,
+                f"{row['mean']:.5g}",
+                f"{row['sd']:.2g}",
+                f"{row['lower_95']:.5g} to {row['upper_95']:.5g}",
+                row["unit"],
+                f"{ess:.0f}",
+                f"{row['rhat']:.3f}",
+            )
+        console.print(table)
+        show_scores(result.scores, console)
+    for remark in result.remarks:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
+    """Show how predictions turned out."""
+    table = Table("prediction", "NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
+    for name, one in scores.items():
+        covered = one.coverage["sensor"] or {}
+        error = one.coverage_error["sensor"] or {}
+        table.add_row(
+            name,
+            f"{one.nrmse:.2%}",
+            f"{one.max_error_um:.2f} um",
+            f"{one.crps_um:.3f} um",
+            f"{one.width_um[95]:.2f} um",
+            ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
+        )
+    console.print(table)
+
+
+def show_check(config: Config, folder: Path, console: Console) -> None:
+    """Show a record, the resolved priors, the point fit, and what the record cannot tell.
+
+    Raises
+    ------
+    InputError
+        The config or its record cannot be used.
+    """
+    problem = resolve(config, folder)
+    record, posterior = problem.record, problem.posterior
+    low, high = record.range_voltage
+    console.print(
+        f"record: {escape(record.origin)}, {record.samples} samples every {record.interval:g} s, "
+        f"{low:.4g} to {high:.4g} V ({record.voltage_is})",
+        highlight=False,
+        soft_wrap=True,
+    )
+    point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
+    free, _ = posterior.prior.constrain(point.mode[None])
+    mode = dict(zip(posterior.names, free[0], strict=True))
+    table = Table("parameter", "prior", "point fit", "unit")
+    for parameter in problem.parameters:
+        fitted = mode.get(parameter.name)
+        table.add_row(
+            parameter.name,
+            _known_before(parameter),
+            "" if fitted is None else f"{fitted:.5g}",
+            parameter.unit,
+        )
+    console.print(table)
+    left_open = identifiability.undetermined(posterior, point)
+    for remark in problem.remarks:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    for combination in left_open:
+        console.print(
+            f"warning: the record does not determine {combination}: the prior decides there",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _known_before(parameter: Parameter) -> str:
+    return str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"

@@ -1,0 +1,59 @@
+"""``bwbayes simulate``: a record of the virtual test stand, with its truth beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, cast
+
+from bwbayes.app.config import SignalConfig
+from bwbayes.app.problem import generator, sampled_waveform
+from bwbayes.data import write_record
+from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.errors import InputError
+
+__all__ = ["simulate"]
+
+
+def simulate(
+    out: Path,
+    signal: str,
+    sine: tuple[float, float, float],
+    discrepancy: str,
+    seed: int,
+    rate: float,
+) -> list[Path]:
+    """Write a record, and beside it its true parameters; return what was written.
+
+    Parameters
+    ----------
+    out
+        The record's file. The noise-free displacement goes into ``NAME.truth.csv`` for a CSV and
+        into the file itself for HDF5 and MATLAB; the true parameters into ``NAME.truth.json``.
+    signal
+        A signal's name, or ``"sine"``: constant amplitude (V), frequency (Hz), duration (s).
+    discrepancy, seed, rate
+        Of the stand; the rate in samples a second.
+
+    Raises
+    ------
+    InputError
+        An unknown signal, impossible values, or a file that cannot be written.
+    """
+    wanted: str | SignalConfig = signal
+    if signal == "sine":
+        amplitude, frequency, duration = sine
+        wanted = SignalConfig(amplitude=amplitude, frequency=frequency, duration=duration)
+    kind = cast("Literal['none', 'process', 'structural']", discrepancy)
+    stand = VirtualTestStand(kind, rate)
+    record = stand.run(sampled_waveform(wanted), generator(seed, "record"))
+    record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
+    write_record(record, out)
+    parameters = out.with_name(f"{out.stem}.truth.json")
+    try:
+        parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
+    beside = out.with_name(f"{out.stem}.truth.csv")
+    return [out, *([beside] if beside.exists() and out.suffix == ".csv" else []), parameters]

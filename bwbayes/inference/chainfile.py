@@ -1,0 +1,250 @@
+"""The chain on disk: appended block by block, whole at every moment.
+
+An HDF5 file in single-writer mode, whose datasets all exist from the start: a block is written and
+flushed, then the number of blocks that count, and only what is counted is ever read. A process
+killed in between loses the block in hand and nothing else. Going on from such a file first copies
+what counts into a fresh one, which also checks every checksum. This module alone knows the layout:
+
+    /start, /pilot, /sampling     coordinates, log_density, accepted, random_state
+    /proposal                     centre, factor, freedom of the frozen proposal
+    /point                        the point fit
+    /blocks                       pilot blocks, sampling blocks, proposal frozen (0 or 1)
+
+and what was run (config, versions, seed, hash of the data) as the file's attributes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.chain import PHASES, Chain, Phase
+from bwbayes.inference.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
+from bwbayes.inference.moves import StudentProposal
+from bwbayes.inference.pointfit import PointFit
+
+__all__ = ["ChainFile"]
+
+FORMAT = 1
+
+
+class ChainFile(Chain):
+    """A chain that is written to a file as it grows. Use it as a context manager.
+
+    Open one with :meth:`create` or :meth:`resume`. One process may write a file; that is for the
+    caller to see to (a run locks its folder). Readers need no permission: see :meth:`read`.
+    """
+
+    def __init__(
+        self, path: Path, point: PointFit, starts: Sequence[EnsembleState], block: int
+    ) -> None:
+        super().__init__(starts)
+        self.path, self.point, self.block = path, point, block
+        self._file: Any = None
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        chain: Chain,
+        point: PointFit,
+        block: int,
+        attributes: Mapping[str, str | int],
+    ) -> ChainFile:
+        """Write a chain, blocks of ``block`` steps or none yet, as a new file and open it."""
+        made = cls(path, point, chain.starts, block)
+        temporary = path.with_suffix(".partial")
+        with h5py.File(temporary, "w", libver="latest") as file:
+            _lay_out(file, point, chain.starts, block)
+            file.attrs["format"] = FORMAT
+            for name, value in attributes.items():
+                file.attrs[name] = value
+        _replace(temporary, path)
+        made._open()
+        for phase in PHASES:
+            if phase == "sampling" and chain.blocks("sampling"):
+                made.freeze(chain.proposal)
+            for number in range(chain.blocks(phase)):
+                made.append(phase, chain.block_of(phase, number))
+        return made
+
+    @classmethod
+    def read(cls, path: Path) -> ChainFile:
+        """Read a chain, finished, interrupted or being written; it cannot be extended.
+
+        Raises
+        ------
+        InputError
+            The file is missing, not a chain, or damaged before the last block that counts.
+        """
+        try:
+            with h5py.File(path, "r", libver="latest", swmr=True) as file:
+                return cls._load(path, file)
+        except (OSError, KeyError, ValueError, RuntimeError) as error:
+            why = "does not exist" if not path.exists() else f"cannot be read ({error})"
+            raise InputError(f"{path}: the chain {why}; run again") from None
+
+    @classmethod
+    def resume(cls, path: Path) -> ChainFile:
+        """Read a chain and open it to go on, from the last block that counts.
+
+        Raises
+        ------
+        InputError
+            As :meth:`read`.
+        """
+        old = cls.read(path)
+        fresh = path.with_suffix(".fresh")
+        made = cls.create(fresh, old, old.point, old.block, old.attributes())
+        # The name changes under the open file: it is the same file all along.
+        _replace(fresh, path)
+        made.path = path
+        return made
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return what was run: config, versions, platform, seed, hash of the data."""
+        with h5py.File(self.path, "r", libver="latest", swmr=True) as file:
+            return {
+                name: value if isinstance(value, str) else int(value)
+                for name, value in file.attrs.items()
+                if name != "format"
+            }
+
+    def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
+        """Add the next block of every ensemble; when this returns it is in the file."""
+        number = self.blocks(phase)
+        group = self._file[phase]
+        steps = slice(number * self.block, (number + 1) * self.block)
+        _put(group["coordinates"], steps, np.stack([b.coordinates for b in blocks], axis=1))
+        _put(group["log_density"], steps, np.stack([b.log_density for b in blocks], axis=1))
+        one = slice(number, number + 1)
+        _put(group["accepted"], one, np.stack([b.accepted for b in blocks])[np.newaxis])
+        states = np.stack([b.end.random_state for b in blocks])
+        _put(group["random_state"], one, states[np.newaxis])
+        self._commit(PHASES.index(phase), number + 1)
+        super().append(phase, blocks)
+
+    def freeze(self, proposal: StudentProposal | None) -> None:
+        """Fix the proposal of the draws that count, in the file too."""
+        if proposal is not None:
+            group = self._file["proposal"]
+            group["centre"][:] = proposal.centre
+            group["factor"][:] = proposal.factor
+            group["freedom"][()] = proposal.freedom
+            self._commit(len(PHASES), 1)
+        super().freeze(proposal)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> ChainFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> None:
+        # Readers need no lock, and the writer's is its folder's.
+        self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
+        self._file.swmr_mode = True
+
+    def _commit(self, place: int, count: int) -> None:
+        """Let ``count`` count, once everything before has reached the file."""
+        self._file.flush()
+        self._file["blocks"][place] = count
+        self._file.flush()
+
+    @classmethod
+    def _load(cls, path: Path, file: Any) -> ChainFile:
+        if file.attrs["format"] != FORMAT:
+            raise ValueError(f"its format is {file.attrs['format']}, this version reads {FORMAT}")
+        point = PointFit(
+            **{name: file["point"][name][()] for name in _POINT[:-1]},
+            log_density=float(file["point"]["log_density"][()]),
+        )
+        start = file["start"]
+        states = zip(start["coordinates"], start["log_density"], start["random_state"], strict=True)
+        block = int(file["pilot"]["coordinates"].chunks[0])
+        loaded = cls(path, point, [EnsembleState(*state) for state in states], block)
+        *counts, frozen = (int(count) for count in file["blocks"][:])
+        if frozen:
+            group = file["proposal"]
+            loaded.proposal = StudentProposal(
+                group["centre"][:], group["factor"][:], float(group["freedom"][()])
+            )
+        for phase, count in zip(PHASES, counts, strict=True):
+            for number in range(count):
+                Chain.append(loaded, phase, _blocks(file[phase], number, block))
+        return loaded
+
+
+_POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
+
+
+def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block: int) -> None:
+    """Create every dataset, so that none has to be later."""
+    ensembles = len(starts)
+    walkers, free = starts[0].coordinates.shape
+    for name in _POINT:
+        file[f"point/{name}"] = getattr(point, name)
+    file["start/coordinates"] = np.stack([s.coordinates for s in starts])
+    file["start/log_density"] = np.stack([s.log_density for s in starts])
+    file["start/random_state"] = np.stack([s.random_state for s in starts])
+    file["proposal/centre"] = np.zeros(free)
+    file["proposal/factor"] = np.zeros((free, free))
+    file["proposal/freedom"] = 0.0
+    file["blocks"] = np.zeros(len(PHASES) + 1, dtype=np.int64)
+    shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+        "coordinates": ((block, ensembles, walkers, free), np.float64),
+        "log_density": ((block, ensembles, walkers), np.float64),
+        "accepted": ((1, ensembles, walkers), np.int64),
+        "random_state": ((1, ensembles, RANDOM_STATE_WORDS), np.uint32),
+    }
+    for phase in PHASES:
+        for name, (shape, dtype) in shapes.items():
+            file.create_dataset(
+                f"{phase}/{name}",
+                shape=(0, *shape[1:]),
+                maxshape=(None, *shape[1:]),
+                chunks=shape,
+                dtype=dtype,
+                fletcher32=True,
+            )
+
+
+def _put(dataset: Any, rows: slice, values: FloatArray) -> None:
+    dataset.resize(rows.stop, axis=0)
+    dataset[rows] = values
+
+
+def _blocks(group: Any, number: int, block: int) -> list[Block]:
+    """Read one block of every ensemble."""
+    steps = slice(number * block, (number + 1) * block)
+    coordinates, log_density = group["coordinates"][steps], group["log_density"][steps]
+    accepted, states = group["accepted"][number], group["random_state"][number]
+    return [
+        Block(
+            coordinates[:, e],
+            log_density[:, e],
+            accepted[e],
+            EnsembleState(coordinates[-1, e], log_density[-1, e], states[e]),
+        )
+        for e in range(len(states))
+    ]
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Give a finished file its name, in one step, after it has reached the disk."""
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    temporary.replace(path)

@@ -1,0 +1,63 @@
+"""Displacement bands: where the displacement will be, in three senses that must not be confused.
+
+``parameter``: where the model's displacement may lie because the parameters are uncertain.
+``displacement``: where the actuator's displacement may lie, model discrepancy included.
+``sensor``: where a new sensor reading may lie, sensor noise included; the only one that a
+measurement can check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["KINDS", "LEVELS", "Bands", "Kind"]
+
+Kind = Literal["parameter", "displacement", "sensor"]
+KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
+
+# Probabilities of the bands, percent.
+LEVELS = (50, 90, 95)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Pointwise bands along one stretch of samples.
+
+    All arrays are (samples,): ``time`` in s, ``voltage`` in V, the others in um; ``measured`` and
+    ``truth`` (the noise-free displacement) are None where there is none. ``lower`` and ``upper``
+    hold a band's edges by kind and level. ``pit`` is the probability integral transform of each
+    reading under the sensor's distribution, ``crps`` its continuous ranked probability score in
+    um; both None without a measurement. Samples before ``scored_from`` served to estimate the
+    record's offset and are not judged. ``interval`` is the sampling interval
+    in s; ``training`` says that the samples were fitted to.
+    """
+
+    name: str
+    time: FloatArray
+    voltage: FloatArray
+    measured: FloatArray | None
+    truth: FloatArray | None
+    mean: FloatArray
+    lower: dict[tuple[Kind, int], FloatArray]
+    upper: dict[tuple[Kind, int], FloatArray]
+    pit: FloatArray | None
+    crps: FloatArray | None
+    interval: float
+    scored_from: int = 0
+    training: bool = False
+
+    def columns(self) -> Iterator[tuple[str, FloatArray]]:
+        """Yield the names and values of the columns of ``bands.csv``."""
+        yield "time_s", self.time
+        yield "voltage_V", self.voltage
+        if self.measured is not None:
+            yield "displacement_um", self.measured
+        yield "mean_um", self.mean
+        for kind in KINDS:
+            for level in LEVELS:
+                yield f"{kind}_lower_{level}_um", self.lower[kind, level]
+                yield f"{kind}_upper_{level}_um", self.upper[kind, level]

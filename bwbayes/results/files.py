@@ -1,0 +1,82 @@
+"""The files of a finished run: posterior, bands, summary.
+
+Each is written under another name and renamed when it is whole, so a reader never sees half a
+file. This module alone knows arviz's labelled posterior.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import arviz_base
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.results.bands import Bands
+from bwbayes.results.result import Result
+
+__all__ = ["write_bands", "write_posterior", "write_summary"]
+
+
+def write_posterior(path: Path, result: Result, voltage: FloatArray, reading: FloatArray) -> None:
+    """Write the draws as arviz groups: posterior, sample_stats, observed_data, constant_data.
+
+    A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say which.
+    ``voltage`` and ``reading`` are the training record, (samples,), V and um.
+    """
+    _, ensembles, walkers, _ = result.draws.shape
+    chains = np.moveaxis(result.draws, 0, 2).reshape(ensembles * walkers, -1, len(result.free))
+    density = np.moveaxis(result.log_density, 0, 2).reshape(ensembles * walkers, -1)
+    tree = arviz_base.from_dict(
+        {
+            "posterior": {p.name: chains[..., i] for i, p in enumerate(result.free)},
+            "sample_stats": {"lp": density},
+            "observed_data": {"displacement": reading},
+            "constant_data": {"voltage": voltage},
+        },
+        dims={"displacement": ["sample"], "voltage": ["sample"]},
+    )
+    along = {
+        "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
+        "walker": ("chain", np.tile(np.arange(walkers), ensembles)),
+    }
+    for group in ("posterior", "sample_stats"):
+        tree[group] = tree[group].to_dataset().assign_coords(along)
+    for parameter in result.free:
+        tree["posterior"][parameter.name].attrs["units"] = parameter.unit
+    temporary = path.with_suffix(".partial")
+    tree.to_netcdf(temporary, engine="h5netcdf")
+    temporary.replace(path)
+
+
+def write_bands(path: Path, bands: Sequence[Bands]) -> None:
+    """Write bands as CSV; of several sets, a first column ``set`` names each."""
+    temporary = path.with_suffix(".partial")
+    with temporary.open("w", encoding="utf-8") as file:
+        for number, one in enumerate(bands):
+            names, columns = zip(*one.columns(), strict=True)
+            if number == 0:
+                file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
+            prefix = f"{one.name}," if len(bands) > 1 else ""
+            row = prefix + ",".join("%.9g" if n == "time_s" else "%.7g" for n in names) + "\n"
+            file.writelines(row % values for values in zip(*columns, strict=True))
+    temporary.replace(path)
+
+
+def write_summary(path: Path, summary: Mapping[str, object]) -> None:
+    """Write a summary as JSON; numbers that are not finite become null."""
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n")
+    temporary.replace(path)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

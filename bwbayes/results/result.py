@@ -1,0 +1,116 @@
+"""A finished run in one object, and its summary in numbers.
+
+Everything that is written or drawn after sampling comes from a :class:`Result`. If the sampling
+has not converged, the result keeps the draws but speaks of no interval: no parameter table, no
+bands, no scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.diagnostics import Check
+from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.sampling import Outcome
+from bwbayes.results.bands import Bands
+from bwbayes.results.scores import Scores, as_summary
+
+__all__ = ["Result", "summary"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run.
+
+    Parameters
+    ----------
+    name
+        The run's name.
+    outcome
+        How the sampling ended.
+    parameters
+        All parameters, fixed ones included.
+    draws
+        (steps, ensembles, walkers, free), parameters in their own units.
+    log_density
+        (steps, ensembles, walkers), nats.
+    bands, scores
+        Of every window and record that was predicted; ``scores`` by the bands' name, for those
+        with a measurement. Both empty unless converged.
+    facts
+        What was run, for people: one line each, by subject.
+    remarks
+        What a user should know: warnings of the record, undetermined combinations.
+    truth
+        The true parameters, of a simulated record.
+    """
+
+    name: str
+    outcome: Outcome
+    parameters: tuple[Parameter, ...]
+    draws: FloatArray
+    log_density: FloatArray
+    bands: tuple[Bands, ...] = ()
+    scores: Mapping[str, Scores] = field(default_factory=dict)
+    facts: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    truth: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """The sampled parameters, in the order of the draws."""
+        return tuple(p for p in self.parameters if p.fixed is None)
+
+    @property
+    def flat_draws(self) -> FloatArray:
+        """All draws, (draws, free)."""
+        return self.draws.reshape(-1, self.draws.shape[-1])
+
+
+def summary(result: Result) -> dict[str, object]:
+    """Return a run's numbers as ``summary.json`` holds them.
+
+    ``parameters`` and ``validation`` are None unless the sampling has converged.
+    """
+    outcome = result.outcome
+    known: dict[str, object] = {
+        "converged": outcome.converged,
+        "stop_reason": outcome.stop_reason,
+        "steps": outcome.check.steps,
+        "acceptance": outcome.check.acceptance,
+        "remarks": list(result.remarks),
+        "parameters": None,
+        "validation": None,
+    }
+    if outcome.converged:
+        known["parameters"] = _parameters(result)
+        known["validation"] = {name: as_summary(s) for name, s in result.scores.items()}
+    return known
+
+
+def _parameters(result: Result) -> dict[str, dict[str, object]]:
+    flat = result.flat_draws
+    lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
+    sd = np.std(flat, axis=0, ddof=1)
+    check: Check = result.outcome.check
+    table: dict[str, dict[str, object]] = {}
+    for i, parameter in enumerate(result.free):
+        table[parameter.name] = {
+            "mean": float(np.mean(flat[:, i])),
+            "sd": float(sd[i]),
+            "median": float(median[i]),
+            "lower_95": float(lower[i]),
+            "upper_95": float(upper[i]),
+            "ess_bulk": float(check.ess_bulk[i]),
+            "ess_tail": float(check.ess_tail[i]),
+            "rhat": float(check.rhat[i]),
+            "mcse_mean": float(sd[i] / np.sqrt(check.ess_bulk[i])),
+            "unit": parameter.unit,
+        }
+        if parameter.name in result.truth:
+            table[parameter.name]["truth"] = result.truth[parameter.name]
+    return table

@@ -1,0 +1,256 @@
+"""How good a prediction was: error of the mean, width and coverage of the bands, proper scores.
+
+Coverage alone proves little. A wide band covers too, so width, CRPS and interval score stand
+beside it; and the residuals of one record are correlated, so that a window holds few independent
+chances to miss. A block bootstrap says how far the coverage may lie from nominal by luck.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.ensemble import autocorrelation_time
+from bwbayes.results.bands import LEVELS, Bands, Kind
+
+__all__ = ["Scores", "as_summary", "block_bootstrap_error", "block_length", "score"]
+
+# Kinds of bands that something exists to check against: a reading, and a simulated truth.
+CHECKED: tuple[Kind, ...] = ("sensor", "displacement")
+
+# Length of a block in integrated autocorrelation times of the residuals.
+BLOCK_TIMES = 3
+
+# A bootstrap from fewer blocks than this says little.
+FEWEST_BLOCKS = 4
+
+# More blocks than this only cost time: the error is then known to some 3 %.
+MOST_BLOCKS = 500
+
+REPLICATES = 2000
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one stretch, over its samples from ``scored_from`` on.
+
+    Attributes
+    ----------
+    nrmse
+        Root mean square of measured - mean over the range (largest - smallest) of the measured;
+        nan if the measured does not vary.
+    max_error_um
+        Largest absolute measured - mean.
+    crps_um
+        Mean continuous ranked probability score of the sensor's distribution.
+    width_um
+        Mean width of the sensor band by level.
+    interval_score_um
+        Mean interval score of the sensor band by level: width + 2/a times the distance of a
+        reading outside of the band to it, a = 1 - level (Gneiting and Raftery 2007, eq. (43)).
+    coverage
+        Fraction of readings inside the sensor band, and of the noise-free displacement inside
+        the displacement band, by level; None without a truth.
+    coverage_error
+        Standard errors of ``coverage`` by block bootstrap, not taken as smaller where a band is
+        hardly missed than as many independent hits would have it as the window is worth. The
+        distribution of coverage is skewed: on a window of some twenty correlation times
+        coverage is more than two errors off in one of seven perfect predictions.
+    worst_second
+        Lowest coverage of the sensor band over any second, by level.
+    """
+
+    nrmse: float
+    max_error_um: float
+    crps_um: float
+    width_um: dict[int, float]
+    interval_score_um: dict[int, float]
+    coverage: dict[str, dict[int, float] | None]
+    coverage_error: dict[str, dict[int, float] | None]
+    worst_second: dict[int, float]
+
+
+def score(bands: Bands, generator: np.random.Generator) -> Scores:
+    """Judge bands against what was measured, and against the truth where it is known.
+
+    Raises
+    ------
+    InputError
+        If there is no measurement to judge by, or no sample from ``scored_from`` on.
+    """
+    if bands.measured is None or bands.crps is None:
+        raise InputError(
+            f"{bands.name}: nothing was measured, so the bands cannot be scored; "
+            "give a record with a displacement"
+        )
+    if bands.scored_from >= bands.measured.size:
+        raise InputError(
+            f"{bands.name}: no sample is left after the lead-in of "
+            f"{bands.scored_from * bands.interval:g} s; shorten the lead-in or give a longer record"
+        )
+    judged = slice(bands.scored_from, None)
+    measured = bands.measured[judged]
+    residual = measured - bands.mean[judged]
+    extent = float(np.ptp(measured))
+    against = {"sensor": bands.measured, "displacement": bands.truth}
+    coverage: dict[str, dict[int, float] | None] = {}
+    error: dict[str, dict[int, float] | None] = {}
+    for kind in CHECKED:
+        values = against[kind]
+        if values is None:
+            coverage[kind] = error[kind] = None
+            continue
+        hits = _hits(bands, kind, values)
+        coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
+        block = block_length((values - bands.mean)[judged])
+        error[kind] = _coverage_errors(hits, block, generator)
+    seconds = {
+        level: _worst(hit, round(1 / bands.interval))
+        for level, hit in _hits(bands, "sensor", bands.measured).items()
+    }
+    return Scores(
+        nrmse=float(np.sqrt(np.mean(residual**2))) / extent if extent > 0 else np.nan,
+        max_error_um=float(np.abs(residual).max()),
+        crps_um=float(bands.crps[judged].mean()),
+        width_um={level: _width(bands, level) for level in LEVELS},
+        interval_score_um={level: _interval_score(bands, level, measured) for level in LEVELS},
+        coverage=coverage,
+        coverage_error=error,
+        worst_second=seconds,
+    )
+
+
+def as_summary(scores: Scores) -> dict[str, object]:
+    """Scores in the shape of ``validation.NAME`` in summary.json; null for what is not a number."""
+
+    def by_level(values: dict[int, float]) -> dict[str, float]:
+        return {str(level): value for level, value in values.items()}
+
+    def by_kind(values: dict[str, dict[int, float] | None]) -> dict[str, dict[str, float] | None]:
+        return {kind: None if some is None else by_level(some) for kind, some in values.items()}
+
+    return {
+        "nrmse": scores.nrmse if np.isfinite(scores.nrmse) else None,
+        "max_error_um": scores.max_error_um,
+        "crps_um": scores.crps_um,
+        **{f"width_{level}_um": width for level, width in scores.width_um.items()},
+        **{f"interval_score_{level}_um": s for level, s in scores.interval_score_um.items()},
+        "coverage": by_kind(scores.coverage),
+        "coverage_error": by_kind(scores.coverage_error),
+        "worst_second": by_level(scores.worst_second),
+    }
+
+
+def block_bootstrap_error(
+    hits: BoolArray, block: int, generator: np.random.Generator, replicates: int = REPLICATES
+) -> float:
+    """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
+
+    The series is closed to a ring, whole blocks are drawn from it with replacement until they
+    make up its length, and the standard deviation of their means is taken over replicates. Means
+    of blocks scatter around the mean of the series, not around the unknown one, which loses the
+    share block / samples of the variance; it is given back.
+
+    Parameters
+    ----------
+    hits
+        (samples,) whether the band holds the value.
+    block
+        Samples in a block, see `block_length`; kept between 1/500 and a quarter of all samples.
+    generator
+        Draws the blocks.
+    replicates
+        Series drawn; 2000 leave 2 % of chance in the error.
+
+    Returns
+    -------
+    float
+        Standard error; 0 if all hits are equal, since then the series shows no variance.
+
+    Notes
+    -----
+    D. N. Politis and J. P. Romano, A circular block-resampling procedure for stationary data,
+    in Exploring the Limits of Bootstrap, Wiley 1992, 263-270.
+    """
+    samples = hits.size
+    if hits.all() or not hits.any():
+        return 0.0
+    block = max(1, samples // MOST_BLOCKS, min(block, samples // FEWEST_BLOCKS))
+    total = np.concatenate([[0.0], np.cumsum(np.concatenate([hits, hits[: block - 1]]))])
+    means = (total[block:] - total[:-block]) / block
+    blocks = samples / block
+    starts = generator.integers(samples, size=(replicates, round(blocks)))
+    variance = means[starts].mean(axis=1).var() * round(blocks) / blocks
+    return float(np.sqrt(variance / (1 - block / samples)))
+
+
+def block_length(residual: FloatArray) -> int:
+    """Choose the samples in a block of the bootstrap: three integrated autocorrelation times.
+
+    The time is the residual's, estimated with Sokal's window. A hit depends on the residual's
+    size, not on its sign, and the square of a Gaussian series forgets twice as fast as the
+    series, so that a block is at least six times as long as the hits' own time. 1 for a residual
+    that does not vary.
+
+    Parameters
+    ----------
+    residual
+        (samples,) value minus the mean of its band.
+    """
+    time = float(autocorrelation_time(residual[:, None, None])[0])
+    return max(1, round(BLOCK_TIMES * time)) if np.isfinite(time) else 1
+
+
+def _coverage_errors(
+    hits: dict[int, BoolArray], block: int, generator: np.random.Generator
+) -> dict[int, float]:
+    """Estimate the errors of coverage by level, also where a band is hardly ever missed.
+
+    With few misses, or none, the bootstrap takes the luck of the window for certainty. The level
+    nearest a half shows best how many independent hits m the window is worth, p (1 - p) / m being
+    the squared error; another level's error is at least that of m hits at Jeffreys' estimate
+    (m p + 1/2) / (m + 1) of its coverage.
+    """
+    errors = {level: block_bootstrap_error(hit, block, generator) for level, hit in hits.items()}
+    covered = {level: float(hit.mean()) for level, hit in hits.items()}
+    middle = min(covered, key=lambda level: abs(covered[level] - 0.5))
+    p = covered[middle]
+    worth = hits[middle].size / block
+    if errors[middle] > 0:
+        worth = p * (1 - p) / errors[middle] ** 2
+    for level, p in covered.items():
+        estimate = (worth * p + 0.5) / (worth + 1)
+        errors[level] = max(errors[level], float(np.sqrt(estimate * (1 - estimate) / worth)))
+    return errors
+
+
+def _hits(bands: Bands, kind: Kind, values: FloatArray) -> dict[int, BoolArray]:
+    """Whether each judged value lies in the band, by level; its edges belong to the band."""
+    inside = {
+        level: (bands.lower[kind, level] <= values) & (values <= bands.upper[kind, level])
+        for level in LEVELS
+    }
+    return {level: hit[bands.scored_from :] for level, hit in inside.items()}
+
+
+def _width(bands: Bands, level: int) -> float:
+    width = bands.upper["sensor", level] - bands.lower["sensor", level]
+    return float(width[bands.scored_from :].mean())
+
+
+def _interval_score(bands: Bands, level: int, measured: FloatArray) -> float:
+    """Mean of width + 2/a (distance to the band) of the judged readings, a = 1 - level."""
+    lower = bands.lower["sensor", level][bands.scored_from :]
+    upper = bands.upper["sensor", level][bands.scored_from :]
+    outside = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
+    return float((upper - lower + 2 / (1 - level / 100) * outside).mean())
+
+
+def _worst(hits: BoolArray, block: int) -> float:
+    """Lowest mean of ``block`` samples in a row, of all samples if there are fewer."""
+    block = max(1, min(block, hits.size))
+    total = np.concatenate([[0], np.cumsum(hits)])
+    return float((total[block:] - total[:-block]).min() / block)

@@ -1,0 +1,128 @@
+"""A small finished run to draw and to report, made up without any sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.diagnostics import Check
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.sampling import Outcome
+from bwbayes.results.bands import KINDS, LEVELS, Bands
+from bwbayes.results.result import Result
+from bwbayes.results.scores import Scores
+
+PARAMETERS = (
+    Parameter("d", "um/V", "d", "coefficient", Distribution("normal", {"mean": 0.7, "sd": 0.1})),
+    Parameter("alpha", "um/V", r"\alpha", "part", Distribution("normal", {"mean": 0.3, "sd": 0.1})),
+    Parameter("exponent", "-", "n", "smoothness", fixed=1.0),
+    Parameter("lag", "s", r"\tau_\mathrm{lag}", "lag", Distribution("halfnormal", {"scale": 1e-3})),
+    Parameter(
+        "stiffness", "N/m", "k", "stiff", Distribution("uniform", {"lower": 0, "upper": 1e6})
+    ),
+)
+MEANS = np.array([0.7, 0.36, 2e-3, 4.1e5])
+SDS = np.array([6e-3, 8e-3, 1.5e-5, 1.2e3])
+
+
+def bands(
+    name: str = "held-out",
+    samples: int = 3000,
+    lead_in: int = 300,
+    measured: bool = True,
+    training: bool = False,
+) -> Bands:
+    """Make up bands of a sine at 1000 Hz, with sds of 0.3, 0.8 and 1 um."""
+    generator = np.random.default_rng(samples)
+    time = np.arange(samples) / 1000
+    voltage = 100 * np.sin(2 * np.pi * time)
+    mean = 0.7 * voltage - 10 * np.cos(2 * np.pi * time)
+    truth = mean + 0.8 * np.sin(7 * time)
+    reading = truth + 0.6 * generator.standard_normal(samples)
+    sds = dict(zip(KINDS, (0.3, 0.8, 1.0), strict=True))
+    reach = {(k, level): sds[k] * norm.ppf(0.5 + level / 200) for k in KINDS for level in LEVELS}
+    return Bands(
+        name=name,
+        time=time,
+        voltage=voltage,
+        measured=reading if measured else None,
+        truth=truth if measured else None,
+        mean=mean,
+        lower={key: mean - r for key, r in reach.items()},
+        upper={key: mean + r for key, r in reach.items()},
+        pit=norm.cdf(reading - mean) if measured else None,
+        crps=np.abs(reading - mean) if measured else None,
+        interval=1e-3,
+        scored_from=lead_in,
+        training=training,
+    )
+
+
+def scores(truth: bool = True) -> Scores:
+    """Make up scores, no two alike."""
+    return Scores(
+        nrmse=0.0123,
+        max_error_um=5.52,
+        crps_um=0.817,
+        width_um={50: 2.11, 90: 5.12, 95: 6.13},
+        interval_score_um={50: 5.21, 90: 8.22, 95: 9.23},
+        coverage={
+            "sensor": {50: 0.481, 90: 0.892, 95: 0.943},
+            "displacement": {50: 0.514, 90: 0.915, 95: 0.966} if truth else None,
+        },
+        coverage_error={
+            "sensor": {50: 0.041, 90: 0.022, 95: 0.013},
+            "displacement": {50: 0.054, 90: 0.025, 95: 0.016} if truth else None,
+        },
+        worst_second={50: 0.121, 90: 0.552, 95: 0.703},
+    )
+
+
+def draws(steps: int = 120, walkers: int = 10) -> FloatArray:
+    """Draw independently: (steps, 4, walkers, 4)."""
+    return MEANS + SDS * np.random.default_rng(1).standard_normal((steps, 4, walkers, 4))
+
+
+def check(steps: int) -> Check:
+    """Return a check that is content, its numbers told apart by parameter."""
+    each = np.arange(4.0)
+    return Check(
+        steps=steps,
+        rhat=1.001 + 0.001 * each,
+        ess_bulk=2100 + each,
+        ess_tail=2200 + each,
+        autocorrelation=np.ones(4),
+        acceptance=0.28,
+        stuck=0,
+    )
+
+
+def run(
+    converged: bool = True,
+    values: FloatArray | None = None,
+    parameters: tuple[Parameter, ...] = PARAMETERS,
+    every: tuple[Bands, ...] | None = None,
+) -> Result:
+    """Make up a run: a training stretch and one that was held out, unless told otherwise."""
+    values = draws() if values is None else values
+    if every is None:
+        every = (bands("training", 2500, 0, training=True), bands())
+    every = every if converged else ()
+    return Result(
+        name="bender",
+        outcome=Outcome(
+            converged,
+            "two good checks" if converged else "budget of 120 steps used up: R-hat 1.2",
+            check(values.shape[0]),
+        ),
+        parameters=parameters,
+        draws=values,
+        log_density=np.zeros(values.shape[:3]),
+        bands=every,
+        scores={b.name: scores() for b in every if b.measured is not None},
+        facts={"record": "made up"},
+        remarks=("the sensor was clipped",),
+        truth={"d": 0.7, "lag": 2e-3},
+    )

@@ -1,0 +1,244 @@
+"""The report says what the summary says, needs nothing but itself, and keeps quiet if it must."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from base64 import b64encode
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from bwbayes.app.report import digits, render, symbol
+from bwbayes.inference.parameters import Parameter
+from bwbayes.results.result import Result, summary
+from tests.app import example
+
+PICTURES = {
+    name: f"\x89PNG {name}".encode("latin-1")
+    for name in ("loop", "bands_training", "bands_held-out", "coverage", "corner", "trace", "ranks")
+}
+
+
+def page(run: Result) -> str:
+    return render(run, summary(run), PICTURES)
+
+
+def rows(text: str, table: str) -> dict[str, list[str]]:
+    """Return a table's cells by their row's first cell, without tags."""
+    body = re.findall(rf'<table id="{table}">.*?<tbody>(.*?)</tbody>', text, re.DOTALL)[0]
+    found = {}
+    for row in re.findall(r"<tr.*?</tr>", body, re.DOTALL):
+        cells = re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL)
+        first, *rest = (re.sub(r"<.*?>", "", cell) for cell in cells)
+        found[first] = rest
+    return found
+
+
+def test_numbers_of_the_parameters_are_the_summarys() -> None:
+    """Estimates to a twentieth of the standard deviation, which is two digits of it."""
+    run = example.run()
+    numbers: Any = summary(run)["parameters"]
+    table = rows(page(run), "parameters")
+    for parameter in run.free:
+        expected = numbers[parameter.name]
+        _, mean, sd, median, interval, unit, _, bulk, tail, rhat, mcse = table[
+            parameter.description
+        ]
+        lower, upper = interval.split(" to ")
+        estimates = [expected[key] for key in ("mean", "sd", "median", "lower_95", "upper_95")]
+        shown = [float(text) for text in (mean, sd, median, lower, upper)]
+        assert estimates == pytest.approx(shown, abs=0.0503 * expected["sd"], rel=0)
+        assert [round(expected["ess_bulk"]), round(expected["ess_tail"])] == [int(bulk), int(tail)]
+        assert expected["rhat"] == pytest.approx(float(rhat), abs=5e-5)
+        assert expected["mcse_mean"] == pytest.approx(float(mcse), rel=0.05)
+        assert parameter.unit.replace("um", "µm") == unit
+
+
+def test_summary_alone_decides_the_estimates() -> None:
+    """A page made anew from a stored summary says what was stored."""
+    run = example.run()
+    stored: Any = summary(run)
+    stored["parameters"]["d"] |= {"mean": 0.12345, "sd": 0.001}
+    assert "0.1235" in rows(render(run, stored, {}), "parameters")["coefficient"]
+
+
+def test_truth_is_shown_where_it_is_known() -> None:
+    table = rows(page(example.run()), "parameters")
+    assert ("0.7", "–") == (table["coefficient"][6], table["part"][6])
+    unknown = dataclasses.replace(example.run(), truth={})
+    assert "Truth" not in page(unknown)
+
+
+def test_priors_and_fixed_values_are_listed() -> None:
+    bounded = dataclasses.replace(example.PARAMETERS[0], lower=0.1, upper=2.0)
+    table = rows(page(example.run(parameters=(bounded, *example.PARAMETERS[1:]))), "priors")
+    assert "normal(mean = 0.7, sd = 0.1), at least 0.1, at most 2" == table["coefficient"][1]
+    assert "fixed at 1" == table["smoothness"][1]
+    assert len(example.PARAMETERS) == len(table)
+
+
+def test_scores_are_shown_for_each_of_the_bands() -> None:
+    run = example.run()
+    run = dataclasses.replace(run, scores={**run.scores, "held-out": example.scores(truth=False)})
+    text = page(run)
+    table = rows(text, "validation")
+    assert "<th>training (fitted)</th><th>held-out (not fitted)</th>" in text
+    assert ["1.23 %"] * 2 == table["NRMSE of the mean"]
+    assert ["5.52 µm"] * 2 == table["Largest error of the mean"]
+    assert ["0.817 µm"] * 2 == table["CRPS"]
+    assert ["94.3 ± 1.3 %"] * 2 == table["95 % sensor band covers readings"]
+    assert ["91.5 ± 2.5 %", "–"] == table["90 % displacement band covers displacement"]
+    assert ["12.1 %"] * 2 == table["50 % sensor band: worst second"]
+    assert ["6.13 µm"] * 2 == table["95 % sensor band: mean width"]
+    assert ["8.22 µm"] * 2 == table["90 % sensor band: interval score"]
+
+
+def test_bands_without_a_measurement_have_no_validation() -> None:
+    text = page(example.run(every=(example.bands(measured=False),)))
+    assert "Validation" not in text
+
+
+def test_verdict_of_a_converged_run() -> None:
+    text = page(example.run())
+    assert "<strong>Converged</strong>" in text
+    assert "NOT CONVERGED" not in text
+    assert "two good checks" in text
+
+
+def test_verdict_without_convergence_says_why_and_what_to_do() -> None:
+    text = page(example.run(converged=False))
+    assert "<strong>NOT CONVERGED</strong>" in text
+    assert "budget of 120 steps used up: R-hat 1.2" in text
+    assert "<code>bwbayes resume DIR</code>" in text
+    for place in ("trace", "ranks"):
+        assert f'href="#{place}"' in text
+        assert f'id="{place}"' in text
+
+
+@pytest.mark.parametrize(
+    "word", ["95", "interval", "band", "median</th>", "coverage", "validation", "MCSE", "truth"]
+)
+def test_page_without_convergence_is_silent_on_parameters_and_displacement(word: str) -> None:
+    """Even if pictures of another time are handed in."""
+    text = re.sub(r'src="data:[^"]*"', "", page(example.run(converged=False)))
+    assert word.lower() not in text.lower()
+
+
+def test_page_without_convergence_has_no_picture_but_of_the_chains() -> None:
+    text = page(example.run(converged=False))
+    assert ["trace", "ranks"] == re.findall(r'<figure id="(.*?)">', text)
+
+
+def test_page_without_convergence_shows_which_parameter_lags() -> None:
+    table = rows(page(example.run(converged=False)), "sampling")
+    assert ["k", "2103", "2203", "1.0040"] == table["stiff"]
+
+
+@pytest.mark.parametrize("value", [1.0, np.nan])
+def test_chains_without_a_spread_can_be_reported(value: float) -> None:
+    run = example.run(converged=False, values=np.full((60, 4, 10, 4), value))
+    unknown = dataclasses.replace(run.outcome.check, rhat=np.full(4, np.nan))
+    run = dataclasses.replace(run, outcome=dataclasses.replace(run.outcome, check=unknown))
+    assert "nan" == rows(page(run), "sampling")["stiff"][3]
+
+
+def test_pictures_are_inside_the_page_in_their_order() -> None:
+    sources = re.findall(r'src="(.*?)"', page(example.run()))
+    expected = [b64encode(png).decode() for png in PICTURES.values()]
+    assert [f"data:image/png;base64,{text}" for text in expected] == sources
+
+
+@pytest.mark.parametrize("converged", [True, False])
+def test_page_needs_nothing_from_elsewhere(converged: bool) -> None:
+    text = page(example.run(converged=converged))
+    assert text.startswith("<!DOCTYPE html>")
+    for outside in ("http:", "https:", "//", "<script", "<link", "@import", "url(", "srcset"):
+        assert outside not in text.replace("base64,//", "")
+    assert all(s.startswith("data:") for s in re.findall(r'src\s*=\s*"(.*?)"', text))
+    assert all(s.startswith("#") for s in re.findall(r'href\s*=\s*"(.*?)"', text))
+
+
+@pytest.mark.parametrize("converged", [True, False])
+def test_texts_come_out_escaped(converged: bool) -> None:
+    evil = '<b onload="x">&'
+    odd = Parameter("d", evil, evil, evil, example.PARAMETERS[0].prior)
+    run = example.run(converged, parameters=(odd, *example.PARAMETERS[1:]))
+    renamed = tuple(dataclasses.replace(b, name=evil) for b in run.bands[:1])
+    run = dataclasses.replace(
+        run,
+        name=evil,
+        remarks=(evil,),
+        facts={evil: evil},
+        bands=renamed,
+        scores={evil: example.scores()} if renamed else {},
+        outcome=dataclasses.replace(run.outcome, stop_reason=evil),
+    )
+    text = render(run, summary(run), {f"bands_{evil}": b"", "trace": b""})
+    assert "<b onload" not in text
+    assert "&lt;b onload=&#34;x&#34;&gt;&amp;" in text
+
+
+def test_remarks_facts_and_circumstances_are_shown() -> None:
+    run = example.run()
+    more = {"seed": 7, "wall_s": 61.4, "data_sha256": "abc", "versions": {"numpy": "2.5"}}
+    text = render(run, {**summary(run), **more}, {})
+    assert "<li>the sensor was clipped</li>" in text
+    facts = {"record": ["made up"], "seed": ["7"], "wall time": ["61 s"]}
+    facts |= {"data, SHA-256": ["abc"], "versions": ["numpy 2.5"]}
+    assert facts == rows(text, "facts")
+
+
+@pytest.mark.parametrize(
+    ("label", "expected"),
+    [
+        ("d", ("d", "")),
+        (r"\alpha", ("α", "")),
+        (r"\Omega", ("Ω", "")),
+        ("h_0", ("h", "0")),
+        (r"\tau_\mathrm{lag}", ("τ", "lag")),
+        (r"\sigma_{\mathrm{lag}}", ("σ", "lag")),
+        (r"k_{12}", ("k", "12")),
+        (r"\frac{a}{b}", ("some_name", "")),
+        (r"x^2", ("some_name", "")),
+        ("", ("some_name", "")),
+    ],
+)
+def test_labels_become_readable_symbols(label: str, expected: tuple[str, str]) -> None:
+    parameter = dataclasses.replace(example.PARAMETERS[0], name="some_name", label=label)
+    assert expected == symbol(parameter)
+
+
+def test_greek_symbol_has_its_subscript_in_the_page() -> None:
+    assert "<i>τ</i><sub>lag</sub>" in page(example.run())
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "expected"),
+    [
+        (0.69712, 0.0061234, "0.6971"),
+        (0.69712, 0.00996, "0.697"),
+        (410123.0, 1234.0, "410100"),
+        (1.0, 0.5, "1.00"),
+        (-0.0004, 0.12, "0.00"),
+        (1.23456e-9, 1.2e-11, "1.235e-09"),
+        (3.2e9, 1.2e7, "3.200e+09"),
+        (0.0, 1e-12, "0e+00"),
+        (1.5, 0.0, "1.5"),
+        (1.5, np.nan, "1.5"),
+        (np.nan, 1.0, "nan"),
+    ],
+)
+def test_digits_follow_the_standard_deviation(value: float, sd: float, expected: str) -> None:
+    assert expected == digits(value, sd)
+
+
+@settings(deadline=None)
+@given(st.floats(-1e6, 1e6), st.floats(1e-15, 1e9))
+def test_rounding_costs_at_most_a_twentieth_of_a_standard_deviation(
+    value: float, sd: float
+) -> None:
+    assert abs(float(digits(value, sd)) - value) <= 0.0503 * sd + 1e-15 * abs(value)

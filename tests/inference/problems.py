@@ -1,0 +1,195 @@
+"""Small posteriors to test with: short records of the ring bender, and Gaussian toy targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
+from bwbayes.data.teststand import RingBender
+from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.noise import NoiseKind, noise_model
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.linear import Hold
+
+__all__ = [
+    "INTERVAL",
+    "TRUE_NOISE",
+    "Target",
+    "decaying_sine",
+    "gaussian",
+    "joint_prior",
+    "posterior_of",
+    "posterior_of_record",
+    "ring_bender",
+    "short_posterior",
+    "single",
+    "target",
+    "truth",
+]
+
+INTERVAL = 0.01
+
+TRUE_NOISE = {"sensor_sd": 0.3, "discrepancy_sd": 0.8, "discrepancy_time": 0.2}
+TRUE_LAG = 0.02
+
+
+def decaying_sine(samples: int, periods: float = 4.0, amplitude: float = 100.0) -> FloatArray:
+    """Return a voltage (samples,) from rest whose amplitude decays to a tenth."""
+    part = np.arange(samples) / samples
+    voltage: FloatArray = -amplitude * np.sin(2 * np.pi * periods * part) * (1 - 0.9 * part)
+    return voltage
+
+
+def truth(posterior: Posterior) -> FloatArray:
+    """Return the θ (1, parameters) that the simulated records come from."""
+    table = RingBender()
+    known = {**{n: getattr(table, n, 0.0) for n in CATALOGUE}, **TRUE_NOISE, "lag": TRUE_LAG}
+    return np.array([[known[name] for name in posterior.prior.names]])
+
+
+def ring_bender(actuator: Actuator, noise: NoiseKind, voltage: FloatArray, seed: int) -> FloatArray:
+    """Simulate the displacement (samples,) of the paper's ring bender, um."""
+    generator = np.random.default_rng(seed)
+    table = RingBender()
+    theta = [TRUE_LAG if n == "lag" else getattr(table, n) for n in actuator.parameters]
+    clean = actuator.displacement(np.array([theta]), voltage)[0]
+    reading: FloatArray = clean + TRUE_NOISE["sensor_sd"] * generator.standard_normal(voltage.size)
+    if noise == "white":
+        return reading
+    kept = np.exp(-actuator.interval / TRUE_NOISE["discrepancy_time"])
+    state = TRUE_NOISE["discrepancy_sd"] * generator.standard_normal()
+    for sample in range(voltage.size):
+        reading[sample] += state
+        fresh = TRUE_NOISE["discrepancy_sd"] * np.sqrt(1 - kept**2) * generator.standard_normal()
+        state = kept * state + fresh
+    return reading
+
+
+def joint_prior(
+    names: tuple[str, ...],
+    ranges: Ranges,
+    fixed: Mapping[str, float],
+    priors: Mapping[str, Distribution] | None = None,
+) -> JointPrior:
+    """Return the default joint prior, but for ``fixed`` values and other ``priors``."""
+    parameters = []
+    for name in names:
+        known: Distribution | float
+        if name in fixed:
+            known = fixed[name]
+        elif priors and name in priors:
+            known = priors[name]
+        else:
+            known = default_prior(name, ranges, fixed.get("exponent", 1.0), 4.1e5)
+        if isinstance(known, Distribution):
+            parameters.append(Parameter(name, *CATALOGUE[name], prior=known))
+        else:
+            parameters.append(Parameter(name, *CATALOGUE[name], fixed=known))
+    return JointPrior(parameters)
+
+
+def posterior_of(
+    voltage: FloatArray,
+    displacement: FloatArray,
+    actuator: Actuator,
+    noise: NoiseKind,
+    fixed: Mapping[str, float] | None = None,
+    *,
+    training: tuple[slice, ...] | None = None,
+    priors: Mapping[str, Distribution] | None = None,
+) -> Posterior:
+    """Return the posterior with default priors."""
+    model = noise_model(noise, actuator.interval)
+    names = (*actuator.parameters, *model.parameters)
+    ranges = Ranges.of(voltage, displacement, actuator.interval)
+    prior = joint_prior(names, ranges, {"initial": 0.0} if fixed is None else fixed, priors)
+    windows = training or (slice(0, voltage.size),)
+    return Posterior(voltage, displacement, windows, actuator, model, prior)
+
+
+def short_posterior(
+    noise: NoiseKind = "discrepancy",
+    samples: int = 400,
+    dynamics: Dynamics = "none",
+    fixed: Mapping[str, float] | None = None,
+    *,
+    seed: int = 1,
+    training: tuple[slice, ...] | None = None,
+    priors: Mapping[str, Distribution] | None = None,
+) -> Posterior:
+    """Return the posterior of a short simulated record of the ring bender."""
+    actuator = Actuator(dynamics, "first", INTERVAL)
+    voltage = decaying_sine(samples)
+    displacement = ring_bender(actuator, noise, voltage, seed)
+    return posterior_of(
+        voltage, displacement, actuator, noise, fixed, training=training, priors=priors
+    )
+
+
+def posterior_of_record(record: Record, fixed: Mapping[str, float]) -> Posterior:
+    """Return the posterior of a record from the virtual test stand, with default priors."""
+    assert record.displacement is not None
+    hold: Hold = "zero" if record.voltage_is == "command" else "first"
+    actuator = Actuator("second-order", hold, record.interval)
+    return posterior_of(record.voltage, record.displacement, actuator, "discrepancy", fixed)
+
+
+def single(
+    name: str, prior: Distribution, lower: float = -np.inf, upper: float = np.inf
+) -> JointPrior:
+    """Return the joint prior of one parameter alone."""
+    only = Parameter(name, *CATALOGUE[name], prior=prior, lower=lower, upper=upper)
+    return JointPrior([only])
+
+
+@dataclass(frozen=True)
+class Unchanged:
+    """A prior whose coordinates are the parameters."""
+
+    dimensions: int
+
+    def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the coordinates (models, free), and no density."""
+        return coordinates, np.zeros(coordinates.shape[0])
+
+
+@dataclass(frozen=True)
+class Target:
+    """A density with the interface that the sampler needs of a posterior."""
+
+    log_density: Callable[[FloatArray], FloatArray]
+    prior: Unchanged
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """log N(x; 0, C) up to a constant, given the precision C⁻¹ (free, free)."""
+
+    precision: FloatArray = field(repr=False)
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return (models,) at x (models, free)."""
+        density: FloatArray = -0.5 * np.sum((x @ self.precision) * x, axis=1)
+        return density
+
+
+def target(log_density: Callable[[FloatArray], FloatArray], free: int) -> Posterior:
+    """Return a target that the sampler takes for a posterior."""
+    return cast(Posterior, Target(log_density, Unchanged(free)))
+
+
+def gaussian(free: int, correlation: float = 0.5) -> tuple[Posterior, PointFit]:
+    """Return a Gaussian target of unit variances and equal correlations, and its point fit."""
+    covariance = np.full((free, free), correlation) + (1 - correlation) * np.eye(free)
+    posterior = target(Gaussian(np.linalg.inv(covariance)), free)
+    mode = np.zeros(free)
+    return posterior, PointFit(mode, covariance, 0.0, mode[np.newaxis], 25 * np.eye(free))

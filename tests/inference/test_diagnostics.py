@@ -1,0 +1,287 @@
+"""The statistics against what they stand for, and everything that must not count as converged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from emcee.moves import DEMove
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.diagnostics import (
+    Check,
+    as_chains,
+    check,
+    effective_draws,
+    nested_rhat,
+    pareto_k,
+)
+from bwbayes.inference.ensemble import advance, start
+from bwbayes.inference.moves import StudentProposal
+from tests.inference.problems import gaussian
+
+STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 16, 2
+BLOCK = 50
+
+
+def autoregressive(
+    kept: float, steps: int, shape: tuple[int, ...], generator: np.random.Generator
+) -> FloatArray:
+    """Draw stationary AR(1) series (steps, *shape) of unit variance."""
+    draws = np.empty((steps, *shape))
+    draws[0] = generator.standard_normal(shape)
+    for step in range(1, steps):
+        shocks = generator.standard_normal(shape)
+        draws[step] = kept * draws[step - 1] + np.sqrt(1 - kept**2) * shocks
+    return draws
+
+
+def good_draws(seed: int = 1, kept: float = 0.5) -> FloatArray:
+    generator = np.random.default_rng(seed)
+    return autoregressive(kept, STEPS, (ENSEMBLES, WALKERS, FREE), generator)
+
+
+def moving(walkers: int = WALKERS) -> IntArray:
+    return np.full((STEPS // BLOCK, ENSEMBLES, walkers), 20, dtype=np.int64)
+
+
+def shortcomings(draws: FloatArray, accepted: IntArray | None = None) -> list[str]:
+    return check(draws, moving() if accepted is None else accepted, BLOCK).shortcomings(1000)
+
+
+def folded_ess(draws: FloatArray) -> FloatArray:
+    """Count effective draws in the wrong way: walkers folded into draws step by step."""
+    steps, ensembles, walkers, free = draws.shape
+    folded = draws.transpose(0, 2, 1, 3).reshape(steps * walkers, ensembles, 1, free)
+    return effective_draws(folded)[0]
+
+
+def test_good_draws_have_converged() -> None:
+    assert [] == shortcomings(good_draws())
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.9, 0.98])
+def test_effective_draws_of_a_known_process(kept: float) -> None:
+    """An AR(1) series of N draws is worth N (1 − φ)/(1 + φ); within a third.
+
+    The smaller of two estimates is taken, so it leans to the safe side.
+    """
+    draws = autoregressive(kept, 5000, (4, 16, 2), np.random.default_rng(2))
+    expected = draws[..., 0].size * (1 - kept) / (1 + kept)
+    bulk, _ = effective_draws(draws)
+    np.testing.assert_allclose(expected, bulk, rtol=0.33)
+
+
+def test_effective_draws_predict_the_variance_of_ensemble_means() -> None:
+    """Over 300 independent repetitions the variance of the mean is one over the ESS, within 30 %.
+
+    A variance from 300 numbers has a standard error of 8 %, and the ESS leans to the safe side by
+    as much, being the smaller of two estimates (false alarms: 1 %).
+    """
+    series = autoregressive(0.9, 1000, (300, 4, 8, 1), np.random.default_rng(3))
+    truth = 1 / np.var(np.mean(series, axis=(0, 2, 3)))
+    bulk = np.mean([effective_draws(series[:, i])[0] for i in range(20)])
+    assert truth == pytest.approx(bulk, rel=0.3)
+
+
+@pytest.fixture(scope="module")
+def emcee_runs() -> FloatArray:
+    """Twenty-four stationary ensembles on a Gaussian, by differential evolution."""
+    posterior, point = gaussian(3)
+    factor = np.linalg.cholesky(point.covariance)
+    chains = []
+    for seed in np.random.SeedSequence(4).spawn(24):
+        generator = np.random.default_rng(seed)
+        state = start(posterior, point, 0, 16, generator)
+        exact = generator.standard_normal((16, 3)) @ factor.T
+        state = replace(state, coordinates=exact, log_density=posterior.log_density(exact))
+        chains.append(advance(posterior, [(DEMove(), 1.0)], state, 500).coordinates)
+    return np.stack(chains, axis=1)
+
+
+def test_effective_draws_of_real_runs_predict_the_variance_of_their_means(
+    emcee_runs: FloatArray,
+) -> None:
+    """Within a factor of two: 24 means give their variance within 29 % (one standard error)."""
+    means = np.mean(emcee_runs, axis=(0, 2))
+    truth = 24 / np.var(means, axis=0, ddof=1)
+    bulk, _ = effective_draws(emcee_runs)
+    ratio = np.mean(bulk / truth)
+    assert 0.5 < ratio < 2, ratio
+
+
+def test_twin_folding_walkers_step_by_step_overstates_many_times(emcee_runs: FloatArray) -> None:
+    bulk, _ = effective_draws(emcee_runs)
+    assert (folded_ess(emcee_runs) > 5 * bulk).all()
+    draws = autoregressive(0.98, 500, (4, 16, 1), np.random.default_rng(5))
+    assert (folded_ess(draws) > 20 * effective_draws(draws)[0]).all()
+
+
+def test_walkers_that_move_together_are_not_counted_as_many() -> None:
+    """The cap by ensemble means: sixteen walkers on one path are worth one."""
+    path = autoregressive(0.5, 2000, (4, 1, 1), np.random.default_rng(6))
+    together = path + 0.01 * np.random.default_rng(7).standard_normal((2000, 4, 16, 1))
+    alone = effective_draws(path)[0]
+    np.testing.assert_allclose(alone, effective_draws(together)[0], rtol=0.1)
+
+
+def test_every_walker_is_a_chain() -> None:
+    draws = np.arange(5 * 2 * 3 * 2, dtype=float).reshape(5, 2, 3, 2)
+    chains = as_chains(draws)
+    assert (6, 5, 2) == chains.shape
+    for ensemble in range(2):
+        for walker in range(3):
+            np.testing.assert_array_equal(draws[:, ensemble, walker], chains[3 * ensemble + walker])
+
+
+def test_nested_rhat_of_agreeing_ensembles_is_one() -> None:
+    np.testing.assert_allclose(1.0, nested_rhat(good_draws()), atol=0.005)
+
+
+@pytest.mark.parametrize("shift", [0.5, 3.0])
+def test_ensembles_that_disagree_have_not_converged(shift: float) -> None:
+    draws = good_draws()
+    draws[:, 2, :, 1] += shift
+    rhat = nested_rhat(draws)
+    assert rhat[0] < 1.01 < rhat[1]
+    assert shortcomings(draws)[0].startswith("R-hat")
+
+
+def test_an_ensemble_of_another_width_has_not_converged() -> None:
+    """Ranks are folded as well, so that a scale shows as a place does."""
+    draws = good_draws()
+    draws[:, 2, :, 1] *= 4
+    rhat = check(draws, moving(), BLOCK).rhat
+    assert rhat[0] < 1.01 < rhat[1]
+
+
+def test_ensembles_that_never_move_have_not_converged() -> None:
+    """Tight clusters, far apart, as they start."""
+    generator = np.random.default_rng(8)
+    starts = 10 * generator.standard_normal((ENSEMBLES, 1, FREE))
+    starts = starts + 0.2 * generator.standard_normal((ENSEMBLES, WALKERS, FREE))
+    draws = np.tile(starts, (STEPS, 1, 1, 1))
+    found = shortcomings(draws, np.zeros_like(moving()))
+    assert any(text.startswith("R-hat") for text in found)
+    assert f"{ENSEMBLES * WALKERS} walkers are stuck" in found
+
+
+def test_walkers_that_never_move_from_one_common_cloud_have_not_converged() -> None:
+    cloud = np.random.default_rng(9).standard_normal((ENSEMBLES, WALKERS, FREE))
+    draws = np.tile(cloud, (STEPS, 1, 1, 1))
+    assert len(shortcomings(draws, np.zeros_like(moving()))) >= 2
+
+
+def test_drift_is_caught_by_the_split() -> None:
+    """All ensembles drift together: they agree as a whole, their halves do not."""
+    draws = good_draws()
+    draws += 0.6 * np.linspace(-1, 1, STEPS)[:, np.newaxis, np.newaxis, np.newaxis]
+    assert (nested_rhat(draws) < 1.01).all()
+    assert (check(draws, moving(), BLOCK).rhat > 1.01).all()
+
+
+def test_one_stuck_walker_of_256_blocks() -> None:
+    generator = np.random.default_rng(10)
+    draws = autoregressive(0.5, STEPS, (ENSEMBLES, 64, FREE), generator)
+    accepted = moving(64)
+    assert [] == check(draws, accepted, BLOCK).shortcomings(1000)
+    draws[:, 1, 7] = 0.3
+    accepted[-1, 1, 7] = 0
+    assert ["1 walkers are stuck"] == check(draws, accepted, BLOCK).shortcomings(1000)
+
+
+def test_a_walker_that_was_stuck_earlier_no_longer_blocks() -> None:
+    accepted = moving()
+    accepted[0, 1, 7] = 0
+    assert [] == shortcomings(good_draws(), accepted)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", [(0, 0, 0, 0), (-1, 3, 5, 1), (slice(None), 2, 3, 0)])
+def test_what_is_not_finite_anywhere_never_counts_as_converged(
+    value: float, where: tuple[int | slice, ...]
+) -> None:
+    draws = good_draws()
+    draws[where] = value
+    assert [] != shortcomings(draws)
+
+
+@pytest.mark.parametrize("name", ["rhat", "ess_bulk", "ess_tail", "autocorrelation"])
+def test_a_statistic_that_is_not_a_number_never_passes(name: str) -> None:
+    good = Check(
+        steps=1000,
+        rhat=np.array([1.001, 1.002]),
+        ess_bulk=np.array([5000.0, 6000.0]),
+        ess_tail=np.array([5000.0, 6000.0]),
+        autocorrelation=np.array([3.0, 4.0]),
+        acceptance=0.4,
+        stuck=0,
+    )
+    assert [] == good.shortcomings(2000)
+    for values in ([np.nan, 1.0], [1.0, np.nan], [np.nan, np.nan]):
+        scaled = getattr(good, name) * np.array(values)
+        assert 1 == len(replace(good, **{name: scaled}).shortcomings(2000))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"rhat": np.array([1.0, 1.02])}, "R-hat 1.020 is not below 1.01"),
+        ({"ess_bulk": np.array([1999.0, 3000.0])}, "ESS 1999 has not reached 2000"),
+        ({"ess_tail": np.array([1500.0, 3000.0])}, "ESS 1500 has not reached 2000"),
+        ({"autocorrelation": np.array([3.0, 25.0])}, "40 autocorrelation times are fewer than 50"),
+        ({"stuck": 3}, "3 walkers are stuck"),
+    ],
+)
+def test_each_shortcoming_is_told(change: dict[str, FloatArray | int], says: str) -> None:
+    good = Check(1000, np.ones(2), np.full(2, 3e3), np.full(2, 3e3), np.full(2, 4.0), 0.4, 0)
+    assert [says] == replace(good, **change).shortcomings(2000)  # type: ignore[arg-type]
+
+
+def test_acceptance_is_the_mean_fraction_of_moves() -> None:
+    accepted = moving()
+    accepted[0] = 50
+    expected = (50 + 20 * (len(accepted) - 1)) / (len(accepted) * BLOCK)
+    assert expected == pytest.approx(check(good_draws(), accepted, BLOCK).acceptance)
+
+
+def test_a_chain_too_short_to_judge_has_not_converged() -> None:
+    draws = good_draws()[:3]
+    assert [] != check(draws, moving()[:1], 3).shortcomings(1)
+
+
+@pytest.mark.parametrize("variance", [0.3, 0.5, 0.8])
+def test_pareto_k_of_a_normal_proposal(variance: float) -> None:
+    """N(0, v) as the proposal for N(0, 1) has weights of tail shape k = 1 − v."""
+    draws = np.random.default_rng(11).standard_normal(40_000)
+    log_weights = -0.5 * draws**2 * (1 - 1 / variance)
+    assert 1 - variance == pytest.approx(pareto_k(log_weights), abs=0.07)
+
+
+def test_pareto_k_trusts_a_fitted_student_and_not_one_that_misses_a_mode() -> None:
+    generator = np.random.default_rng(12)
+    draws = generator.standard_normal((10_000, 5))
+    fitted = StudentProposal.fitted(draws)
+    density = -0.5 * np.sum(draws**2, axis=1)
+    assert pareto_k(density - fitted.log_density(draws)) < 0.5
+    draws[:50] += 12
+    density = np.logaddexp(
+        np.log(0.995) - 0.5 * np.sum(draws**2, axis=1),
+        np.log(0.005) - 0.5 * np.sum((draws - 12) ** 2, axis=1),
+    )
+    assert pareto_k(density - fitted.log_density(draws)) > 0.7
+
+
+def test_pareto_k_does_not_trust_walkers_that_stay_where_the_proposal_hardly_goes() -> None:
+    """The largest weights are all one walker's, so their tail has no shape."""
+    generator = np.random.default_rng(13)
+    log_weights = generator.standard_normal(10_000)
+    log_weights[:1500] = 30.0
+    assert not pareto_k(log_weights) < 0.7
+
+
+def test_pareto_k_of_what_is_not_a_number_is_not_trusted() -> None:
+    log_weights = np.random.default_rng(14).standard_normal(1000)
+    log_weights[3] = np.nan
+    assert not pareto_k(log_weights) < 0.7

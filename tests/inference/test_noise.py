@@ -1,0 +1,195 @@
+"""Both likelihoods are those of a multivariate normal distribution, at extreme values too."""
+
+from __future__ import annotations
+
+from decimal import Decimal, localcontext
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import kstest, multivariate_normal
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
+
+PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
+
+SCALES = (1e-200, 1e-160, 1e-9, 1e-3, 1.0, 1e3)
+TIMES = (1e-6, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e3, 1e6, 1e9)
+EXTREMES = [
+    (sensor, process, time)
+    for sensor, process, time in product(SCALES, SCALES, TIMES)
+    # Both vanishing would leave nothing that a residual could be.
+    if max(sensor, process) >= 1e-9
+]
+
+
+def covariance(theta: FloatArray, samples: int) -> FloatArray:
+    """C[i, j] = σ² exp(−|i − j| / τ) + s² [i = j], times in samples."""
+    sensor, process, time = theta
+    apart = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+    dense: FloatArray = process**2 * np.exp(-apart / time) + sensor**2 * np.eye(samples)
+    return dense
+
+
+def simulated(theta: FloatArray, samples: int, generator: np.random.Generator) -> FloatArray:
+    sensor, process, time = theta
+    shocks = generator.standard_normal(samples)
+    state, states = shocks[0], []
+    for shock in shocks:
+        states.append(state)
+        state = np.exp(-1 / time) * state + np.sqrt(-np.expm1(-2 / time)) * shock
+    residual: FloatArray = process * np.array(states) + sensor * generator.standard_normal(samples)
+    return residual
+
+
+def decimal_log_density(theta: tuple[float, float, float], residual: FloatArray) -> float:
+    """Log density by a dense Cholesky factorisation with eighty digits."""
+    with localcontext() as context:
+        context.prec = 80
+        sensor, process, time = (Decimal(value) for value in theta)
+        size = residual.size
+        lags = [process**2 * (-lag / time).exp() for lag in map(Decimal, range(size))]
+        lags[0] += sensor**2
+        factor = [[Decimal(0)] * size for _ in range(size)]
+        white: list[Decimal] = []
+        total = Decimal(0)
+        for i in range(size):
+            row = factor[i]
+            for j in range(i + 1):
+                rest = lags[i - j] - sum(row[k] * factor[j][k] for k in range(j))
+                row[j] = rest.sqrt() if i == j else rest / factor[j][j]
+            known = sum(row[k] * white[k] for k in range(i))
+            white.append((Decimal(float(residual[i])) - known) / row[i])
+            total -= white[i] ** 2 / 2 + row[i].ln() + (2 * PI).ln() / 2
+        return float(total)
+
+
+def assert_same(expected: float, got: float, samples: int) -> None:
+    assert abs(expected - got) <= 1e-10 * (samples + abs(expected))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60))
+@settings(deadline=None, max_examples=50)
+def test_white_noise_is_a_multivariate_normal(seed: int, samples: int) -> None:
+    generator = np.random.default_rng(seed)
+    sensor = float(np.exp(generator.normal(0, 2)))
+    residual = generator.standard_normal(samples)
+    expected = multivariate_normal(np.zeros(samples), sensor**2 * np.eye(samples)).logpdf(residual)
+    got = WhiteNoise().log_density(np.array([[sensor]]), residual[np.newaxis])[0]
+    assert_same(float(expected), got, samples)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60))
+@settings(deadline=None, max_examples=100)
+def test_discrepancy_noise_is_a_multivariate_normal(seed: int, samples: int) -> None:
+    generator = np.random.default_rng(seed)
+    theta = np.exp(generator.normal(0, 1, 3))
+    residual = simulated(theta, samples, generator)
+    dense = multivariate_normal(np.zeros(samples), covariance(theta, samples))
+    got = DiscrepancyNoise(1.0).log_density(theta[np.newaxis], residual[np.newaxis])[0]
+    assert_same(float(dense.logpdf(residual)), got, samples)
+
+
+def test_exact_at_extreme_values() -> None:
+    """Sds down to 1e-200 and times from 1e-6 to 1e9 samples, for residuals of the model's kind."""
+    generator = np.random.default_rng(2)
+    noise = DiscrepancyNoise(1.0)
+    for theta in EXTREMES:
+        residual = simulated(np.array(theta), 10, generator)
+        got = noise.log_density(np.array([theta]), residual[np.newaxis])[0]
+        assert_same(decimal_log_density(theta, residual), got, 10)
+
+
+@pytest.mark.parametrize("theta", EXTREMES[:: len(EXTREMES) // 25])
+def test_exact_at_extreme_values_for_a_residual_that_the_model_does_not_expect(
+    theta: tuple[float, float, float],
+) -> None:
+    residual = np.random.default_rng(3).standard_normal(10)
+    expected = decimal_log_density(theta, residual)
+    got = DiscrepancyNoise(1.0).log_density(np.array([theta]), residual[np.newaxis])[0]
+    assert_same(expected, got, 10)
+
+
+@pytest.mark.parametrize("theta", [(1.0, 1e-9, 1e3), (1e-200, 1.0, 1e4), (0.3, 1.5, 500.0)])
+def test_long_series_lose_no_precision(theta: tuple[float, float, float]) -> None:
+    """By the sequential form of the density: each sample given those before it."""
+    samples = 20_000
+    residual = simulated(np.array(theta), samples, np.random.default_rng(4))
+    sensor, process, kept = theta[0] ** 2, theta[1] ** 2, np.exp(-1 / theta[2])
+    mean, variance, expected = 0.0, process, 0.0
+    for reading in residual:
+        total = variance + sensor
+        expected -= 0.5 * ((reading - mean) ** 2 / total + np.log(2 * np.pi * total))
+        mean, variance = mean + variance / total * (reading - mean), variance * sensor / total
+        mean, variance = kept * mean, kept**2 * variance - np.expm1(-2 / theta[2]) * process
+    got = DiscrepancyNoise(1.0).log_density(np.array([theta]), residual[np.newaxis])[0]
+    assert_same(expected, got, samples)
+
+
+def test_without_discrepancy_the_noise_is_white() -> None:
+    residual = np.random.default_rng(5).standard_normal((1, 100))
+    expected = WhiteNoise().log_density(np.array([[0.7]]), residual)
+    got = DiscrepancyNoise(0.1).log_density(np.array([[0.7, 0.0, 1.0]]), residual)
+    np.testing.assert_allclose(expected, got, rtol=1e-13)
+
+
+def test_the_correlation_time_is_in_seconds() -> None:
+    residual = np.random.default_rng(6).standard_normal((1, 50))
+    expected = DiscrepancyNoise(1.0).log_density(np.array([[0.5, 1.0, 20.0]]), residual)
+    got = DiscrepancyNoise(1e-3).log_density(np.array([[0.5, 1.0, 20e-3]]), residual)
+    np.testing.assert_allclose(expected, got, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["white", "discrepancy"])
+def test_rows_are_independent(kind: str) -> None:
+    """A model's density does not depend on its neighbours in the batch, bit for bit."""
+    generator = np.random.default_rng(7)
+    noise = noise_model("white" if kind == "white" else "discrepancy", 0.01)
+    theta = np.exp(generator.normal(size=(8, len(noise.parameters))))
+    residual = generator.standard_normal((8, 40))
+    together = noise.log_density(theta, residual)
+    alone = [noise.log_density(theta[[i]], residual[[i]])[0] for i in range(8)]
+    np.testing.assert_array_equal(alone, together)
+
+
+def test_noise_model_goes_by_its_name() -> None:
+    assert noise_model("white", 0.1) == WhiteNoise()
+    assert noise_model("discrepancy", 0.1) == DiscrepancyNoise(0.1)
+
+
+def test_the_residual_is_not_modified() -> None:
+    residual = np.random.default_rng(8).standard_normal((1, 30))
+    before = residual.copy()
+    DiscrepancyNoise(1.0).log_density(np.array([[0.5, 1.0, 3.0]]), residual)
+    np.testing.assert_array_equal(before, residual)
+
+
+@pytest.mark.parametrize("theta", [(0.5, 1.0, 20.0), (0.01, 1.0, 3.0), (1.0, 0.05, 200.0)])
+def test_whitened_noise_is_white_with_unit_variance(theta: tuple[float, float, float]) -> None:
+    """Kolmogorov-Smirnov and the correlations at lags 1 to 5, four standard errors each."""
+    samples = 20_000
+    series = simulated(np.array(theta), samples, np.random.default_rng(9))
+    noise = DiscrepancyNoise(1.0)
+    white = noise.whiten(np.array([theta]), np.stack([series, 2 * series]))
+    np.testing.assert_allclose(2 * white[0], white[1])
+    settled = white[0, 2000:]
+    assert kstest(settled, "norm").pvalue > 1e-4
+    for lag in range(1, 6):
+        assert abs(np.mean(settled[lag:] * settled[:-lag])) < 4 / np.sqrt(settled.size)
+
+
+def test_white_noise_that_is_whitened_as_another_is_not_white() -> None:
+    """The twin: the check above notices a discrepancy that is left out."""
+    series = simulated(np.array([0.5, 1.0, 20.0]), 20_000, np.random.default_rng(9))
+    left = DiscrepancyNoise(1.0).whiten(np.array([[1.2, 1e-9, 20.0]]), series[np.newaxis])[0]
+    assert abs(np.mean(left[1:] * left[:-1])) > 4 / np.sqrt(left.size)
+
+
+def test_marginal_sds_are_those_of_the_two_parts() -> None:
+    discrepancy, sensor = DiscrepancyNoise(1.0).marginal_sd(np.array([[0.5, 1.5, 3.0]]))
+    assert (1.5, 0.5) == (discrepancy[0], sensor[0])
+    discrepancy, sensor = WhiteNoise().marginal_sd(np.array([[0.5]]))
+    assert (0.0, 0.5) == (discrepancy[0], sensor[0])

@@ -1,0 +1,152 @@
+"""The point fit stands on the mode, knows the curvature there, and tells optima apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.noise import WhiteNoise
+from bwbayes.inference.pointfit import PointFit, fit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from tests.inference.problems import posterior_of, short_posterior, truth
+
+CASES = ("white", "discrepancy", "lag")
+
+
+def case(name: str) -> Posterior:
+    if name == "lag":
+        return short_posterior("discrepancy", 400, "lag", {}, seed=3)
+    return short_posterior("white" if name == "white" else "discrepancy", 300, seed=2)
+
+
+@pytest.fixture(scope="module")
+def fits() -> dict[str, tuple[Posterior, PointFit]]:
+    return {name: (case(name), fit(case(name), np.random.default_rng(1))) for name in CASES}
+
+
+Fits = dict[str, tuple[Posterior, PointFit]]
+
+
+def coordinates_of_truth(posterior: Posterior) -> FloatArray:
+    columns = [posterior.prior.names.index(name) for name in posterior.names]
+    return posterior.prior.unconstrain(truth(posterior)[:, columns])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_mode_is_more_probable_than_the_truth(fits: Fits, name: str) -> None:
+    posterior, point = fits[name]
+    assert point.log_density == posterior.log_density(point.mode[np.newaxis])[0]
+    assert point.log_density > posterior.log_density(coordinates_of_truth(posterior))[0]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_truth_is_within_reach_of_the_mode(fits: Fits, name: str) -> None:
+    """Twice the log density ratio is below the chi-square's 1 - 1e-4 quantile."""
+    posterior, point = fits[name]
+    behind = point.log_density - posterior.log_density(coordinates_of_truth(posterior))[0]
+    assert 2 * behind < chi2(point.mode.size).ppf(1 - 1e-4)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_gradient_at_the_mode_vanishes(fits: Fits, name: str) -> None:
+    """Less than 0.03 nats per posterior sd along each axis of the posterior."""
+    posterior, point = fits[name]
+    axes = np.linalg.cholesky(point.covariance).T
+    step = 1e-3
+    plus, minus = (posterior.log_density(point.mode + sign * step * axes) for sign in (1, -1))
+    assert np.max(np.abs((plus - minus) / (2 * step))) < 0.03
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_covariance_is_that_of_the_curvature(fits: Fits, name: str) -> None:
+    """In units of the reported covariance a numerical Hessian is the identity."""
+    posterior, point = fits[name]
+    axes = np.linalg.cholesky(point.covariance).T
+    size, step = point.mode.size, 0.03
+    hessian = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            corners = [
+                point.mode + step * (a * axes[i] + b * axes[j])
+                for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            ]
+            pp, pm, mp, mm = posterior.log_density(np.array(corners))
+            hessian[i, j] = -(pp - pm - mp + mm) / (4 * step**2)
+    np.testing.assert_allclose(np.eye(size), hessian, atol=0.15)
+
+
+def test_a_fit_is_deterministic_for_a_seed() -> None:
+    one, two = (fit(case("white"), np.random.default_rng(5)) for _ in range(2))
+    for name in ("mode", "covariance", "optima", "prior_covariance"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_the_mode_does_not_depend_on_the_seed(fits: Fits) -> None:
+    posterior, point = fits["white"]
+    other = fit(posterior, np.random.default_rng(6))
+    apart = other.mode - point.mode
+    assert apart @ np.linalg.inv(point.covariance) @ apart < 0.01
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_mode_is_the_first_optimum(fits: Fits, name: str) -> None:
+    _, point = fits[name]
+    np.testing.assert_array_equal(point.mode, point.optima[0])
+    assert 1 == len(point.optima)
+
+
+class MirrorActuator(Actuator):
+    """A model that cannot tell the sign of its offset."""
+
+    def displacement(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:  # type: ignore[override]
+        """Return the displacement, its offset taken as a size."""
+        return super().displacement(np.abs(theta), voltage)
+
+
+def test_several_optima_are_reported_as_distinct() -> None:
+    """A model with two mirrored solutions gives both, once each."""
+    usual = short_posterior(
+        "white",
+        200,
+        fixed={"initial": 0.0, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172},
+        priors={"offset": Distribution("normal", {"mean": 0.0, "sd": 10.0})},
+    )
+    mirrored = Posterior(
+        usual.voltage,
+        usual.displacement + 6.0,
+        usual.training,
+        MirrorActuator("none", "first", 0.01),
+        WhiteNoise(),
+        usual.prior,
+    )
+    point = fit(mirrored, np.random.default_rng(7))
+    assert ("d", "offset", "sensor_sd") == mirrored.names
+    free, _ = mirrored.prior.constrain(point.optima)
+    np.testing.assert_allclose([-6.0, 6.0], np.sort(free[:, 1]), atol=0.15)
+    density = mirrored.log_density(point.optima)
+    np.testing.assert_allclose(density[0], density[1], atol=1e-3)
+
+
+def test_noise_alone_can_be_fitted() -> None:
+    """With all physical parameters fixed the sensor's sd is the residual's."""
+    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
+    posterior = short_posterior("white", 400, fixed={**known, "offset": 0.0})
+    point = fit(posterior, np.random.default_rng(8))
+    residual = posterior.displacement - posterior.simulate(truth(posterior))[0]
+    sensor = posterior.prior.constrain(point.mode[np.newaxis])[0][0, 0]
+    np.testing.assert_allclose(np.sqrt(np.mean(residual**2)), sensor, rtol=0.01)
+
+
+def test_without_a_finite_density_there_is_no_fit() -> None:
+    usual = short_posterior("white", 50)
+    posterior = posterior_of(
+        usual.voltage, usual.displacement, usual.actuator, "white", {"initial": 0.0}
+    )
+    posterior.displacement[10] = np.nan
+    with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
+        fit(posterior, np.random.default_rng(9))

@@ -1,0 +1,211 @@
+"""The posterior against a slow one: a scalar model, sample by sample, and dense matrices."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.inference.posterior import Posterior
+from tests.inference.problems import INTERVAL, short_posterior, single, truth
+
+
+def scalar_displacement(theta: dict[str, float], voltage: FloatArray) -> FloatArray:
+    """Equation (6) sample by sample, n = 1, and the lag by an integral over each interval."""
+    h = theta["initial"]
+    rest = theta["d"] * voltage[0] - h
+    x, drive = 0.0, 0.0
+    displacement = [rest + theta["offset"]]
+    for before, after in itertools.pairwise(voltage.tolist()):
+        sign, left = float(np.sign(after - before)), abs(after - before)
+        g = sign * h
+        if g < 0:
+            # Relax with beta - gamma until h crosses zero, or the interval ends.
+            rate = theta["beta"] - theta["gamma"]
+            travel = min(left, float(np.log(1 - g * rate / theta["alpha"]) / rate))
+            limit = theta["alpha"] / rate
+            g, left = limit + (g - limit) * exp(-rate * travel), left - travel
+        limit = theta["alpha"] / (theta["beta"] + theta["gamma"])
+        g = limit + (g - limit) * exp(-(theta["beta"] + theta["gamma"]) * left)
+        h = sign * g
+        slope = (theta["d"] * after - h - rest - drive) / INTERVAL
+        lag = theta["lag"]
+        # tau x' + x = drive + slope t has the particular solution drive + slope (t - tau).
+        kept = exp(-INTERVAL / lag)
+        x = drive + slope * (INTERVAL - lag) + (x - drive + slope * lag) * kept
+        drive += slope * INTERVAL
+        displacement.append(x + rest + theta["offset"])
+    return np.array(displacement)
+
+
+def dense_log_likelihood(posterior: Posterior, theta: FloatArray) -> float:
+    named = dict(zip(posterior.prior.names, theta.tolist(), strict=True))
+    residual = posterior.displacement - scalar_displacement(named, posterior.voltage)
+    total = 0.0
+    for window in posterior.training:
+        part = residual[window]
+        apart = np.abs(np.subtract.outer(np.arange(part.size), np.arange(part.size)))
+        covariance = named["sensor_sd"] ** 2 * np.eye(part.size)
+        if "discrepancy_sd" in named:
+            kept = np.exp(-INTERVAL * apart / named["discrepancy_time"])
+            covariance += named["discrepancy_sd"] ** 2 * kept
+        total += float(stats.multivariate_normal(np.zeros(part.size), covariance).logpdf(part))
+    return total
+
+
+WINDOWS = (slice(5, 40), slice(70, 120))
+
+
+@pytest.mark.parametrize("noise", ["white", "discrepancy"])
+@pytest.mark.parametrize("training", [None, WINDOWS])
+def test_log_density_is_that_of_a_slow_computation(
+    noise: str, training: tuple[slice, ...] | None
+) -> None:
+    posterior = short_posterior(
+        "white" if noise == "white" else "discrepancy", 150, "lag", {}, training=training
+    )
+    draws = posterior.prior.draw(np.random.default_rng(1), 12)
+    z = posterior.prior.unconstrain(draws)
+    theta = posterior.prior.theta(draws)
+    expected = posterior.prior.constrain(z)[1] + [
+        dense_log_likelihood(posterior, row) for row in theta
+    ]
+    got = posterior.log_density(z)
+    assert np.max(np.abs(expected - got) / (150 + np.abs(expected))) < 1e-9
+
+
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 130])
+def test_a_batch_is_its_rows(size: int) -> None:
+    posterior = short_posterior(samples=100, dynamics="lag", fixed={})
+    z = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(2), size))
+    z[0, 0] = 40.0  # one row is outside
+    together = posterior.log_density(z)
+    alone = np.concatenate([posterior.log_density(row[np.newaxis]) for row in z])
+    assert -np.inf == together[0] == alone[0]
+    np.testing.assert_allclose(alone[1:], together[1:], rtol=1e-12)
+
+
+def test_samples_outside_the_training_windows_do_not_count() -> None:
+    posterior = short_posterior("white", 150, training=WINDOWS)
+    theta = truth(posterior)
+    before = posterior.log_likelihood(theta)
+    held_out = np.ones(150, dtype=bool)
+    for window in WINDOWS:
+        held_out[window] = False
+    posterior.displacement[held_out] = np.nan
+    np.testing.assert_array_equal(before, posterior.log_likelihood(theta))
+
+
+def test_windows_share_one_simulation_from_the_first_sample() -> None:
+    """A window's likelihood differs from that of a record that starts with the window."""
+    posterior = short_posterior("white", 150, training=(slice(70, 120),))
+    theta = truth(posterior)
+    whole = short_posterior("white", 150)
+    simulated = whole.simulate(theta)
+    assert (1, 120) == posterior.simulate(theta).shape
+    np.testing.assert_array_equal(simulated[:, :120], posterior.simulate(theta))
+    residual = (whole.displacement - simulated)[:, 70:120]
+    expected = WhiteNoise().log_density(theta[:, -1:], residual)
+    np.testing.assert_allclose(expected, posterior.log_likelihood(theta), rtol=1e-12)
+
+
+def test_white_windows_add_up() -> None:
+    theta = truth(short_posterior("white", 150))
+    parts = [
+        short_posterior("white", 150, training=(window,)).log_likelihood(theta)
+        for window in (slice(0, 70), slice(70, 150))
+    ]
+    whole = short_posterior("white", 150).log_likelihood(theta)
+    np.testing.assert_allclose(np.sum(parts, axis=0), whole, rtol=1e-12)
+
+
+def test_fixed_parameters_take_their_value() -> None:
+    """The posterior with d fixed is the whole posterior at that d, up to d's prior."""
+    whole = short_posterior("white", 100)
+    fixed = short_posterior("white", 100, fixed={"initial": 0.0, "d": 0.71})
+    assert ("alpha", "beta", "gamma", "offset", "sensor_sd") == fixed.names
+    free = np.array([[0.36, 0.027, 0.017, 0.1, 0.3], [0.34, 0.03, 0.01, 0.0, 0.4]])
+    expected = whole.log_likelihood(whole.prior.theta(np.insert(free, 0, 0.71, axis=1)))
+    got = fixed.log_likelihood(fixed.prior.theta(free))
+    np.testing.assert_allclose(expected, got, rtol=1e-12)
+
+
+@dataclass(frozen=True)
+class BrokenNoise(WhiteNoise):
+    """A likelihood that fails for every other model."""
+
+    value: float = np.nan
+
+    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the white noise's density with a hole in every other place."""
+        density = super().log_density(theta, residual)
+        density[::2] = self.value
+        return density
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_likelihood_that_is_not_finite_is_no_evidence(value: float) -> None:
+    sound = short_posterior("white", 100)
+    broken = Posterior(
+        sound.voltage,
+        sound.displacement,
+        sound.training,
+        sound.actuator,
+        BrokenNoise(value=value),
+        sound.prior,
+    )
+    z = sound.prior.unconstrain(sound.prior.draw(np.random.default_rng(3), 6))
+    expected = sound.log_density(z)
+    expected[::2] = -np.inf
+    np.testing.assert_array_equal(expected, broken.log_density(z))
+
+
+def test_coordinates_that_are_not_numbers_have_no_density() -> None:
+    posterior = short_posterior("white", 50)
+    z = np.zeros((3, len(posterior.names)))
+    z[1, 2], z[2, 0] = np.nan, np.inf
+    assert [True, False, False] == np.isfinite(posterior.log_density(z)).tolist()
+
+
+def test_all_models_outside_have_no_density() -> None:
+    posterior = short_posterior("white", 50)
+    z = np.full((2, len(posterior.names)), 50.0)
+    assert [-np.inf, -np.inf] == posterior.log_density(z).tolist()
+
+
+def test_the_input_is_not_modified() -> None:
+    posterior = short_posterior(samples=50)
+    z = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(4), 5))
+    before = z.copy()
+    posterior.log_density(z)
+    np.testing.assert_array_equal(before, z)
+
+
+def test_parameters_must_be_those_of_the_model() -> None:
+    sound = short_posterior("white", 50)
+    with pytest.raises(InputError, match=r"^prior: its parameters must be d, .*, in this order"):
+        Posterior(
+            sound.voltage,
+            sound.displacement,
+            sound.training,
+            sound.actuator,
+            DiscrepancyNoise(INTERVAL),
+            sound.prior,
+        )
+    offset = single("offset", sound.prior.free[-2].prior or pytest.fail("has a prior"))
+    with pytest.raises(InputError, match="in this order"):
+        Posterior(
+            sound.voltage,
+            sound.displacement,
+            sound.training,
+            sound.actuator,
+            sound.noise,
+            offset,
+        )

@@ -1,0 +1,256 @@
+"""A sampling ends for a reason that it tells, with the same bits wherever and however it ran."""
+
+from __future__ import annotations
+
+import itertools
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.chain import PHASES, Chain, Phase
+from bwbayes.inference.diagnostics import Check
+from bwbayes.inference.pointfit import PointFit, fit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
+from tests.inference.problems import gaussian, short_posterior, target
+
+PLAN = SamplingPlan(
+    ess=400,
+    walkers=12,
+    block=20,
+    least_pilot_steps=100,
+    most_pilot_steps=400,
+    most_steps=1000,
+)
+POSTERIOR, POINT = gaussian(3)
+
+
+def new_chain(plan: SamplingPlan = PLAN, seed: int = 1) -> Chain:
+    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(seed))
+
+
+def run(plan: SamplingPlan = PLAN, seed: int = 1, workers: int = 1) -> tuple[Chain, Outcome]:
+    chain = new_chain(plan, seed)
+    with ThreadPoolExecutor(workers) as executor:
+        return chain, sample(POSTERIOR, plan, chain, executor)
+
+
+@pytest.fixture(scope="module")
+def finished() -> tuple[Chain, Outcome]:
+    return run()
+
+
+def assert_same_chain(one: Chain, two: Chain) -> None:
+    for phase in PHASES:
+        assert one.blocks(phase) == two.blocks(phase)
+        for name in ("coordinates", "log_density", "accepted"):
+            np.testing.assert_array_equal(getattr(one, name)(phase), getattr(two, name)(phase))
+    for mine, yours in zip(one.ends, two.ends, strict=True):
+        np.testing.assert_array_equal(mine.random_state, yours.random_state)
+    if one.proposal is None or two.proposal is None:
+        assert one.proposal is two.proposal
+    else:
+        np.testing.assert_array_equal(one.proposal.centre, two.proposal.centre)
+        np.testing.assert_array_equal(one.proposal.factor, two.proposal.factor)
+
+
+def assert_same_outcome(one: Outcome, two: Outcome) -> None:
+    assert (one.converged, one.stop_reason) == (two.converged, two.stop_reason)
+    np.testing.assert_array_equal(one.check.rhat, two.check.rhat)
+    np.testing.assert_array_equal(one.check.ess_bulk, two.check.ess_bulk)
+
+
+def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
+    chain, outcome = finished
+    assert outcome.converged
+    assert "converged on two checks in a row" == outcome.stop_reason
+    assert [] == outcome.check.shortcomings(PLAN.ess)
+    assert chain.steps("sampling") == outcome.check.steps
+    assert chain.proposal is not None
+
+
+def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
+    """Mean and variance within four standard errors of the effective draws it claims."""
+    chain, outcome = finished
+    found = draws(POSTERIOR, chain)
+    error = 4 / np.sqrt(outcome.check.ess_bulk)
+    assert (np.abs(np.mean(found, axis=(0, 1, 2))) < error).all()
+    assert (np.abs(np.var(found, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
+
+
+def test_it_stops_at_the_first_two_checks_that_find_nothing_missing() -> None:
+    checks: list[Check] = []
+
+    def watcher(phase: Phase, found: Check | None) -> None:
+        if found is not None:
+            assert "sampling" == phase
+            checks.append(found)
+
+    with ThreadPoolExecutor(1) as executor:
+        sample(POSTERIOR, PLAN, new_chain(), executor, watcher)
+    passed = [not found.shortcomings(PLAN.ess) for found in checks]
+    assert passed[-2:] == [True, True]
+    assert not any(one and two for one, two in itertools.pairwise(passed[:-1]))
+
+
+def test_the_watcher_hears_of_every_block_of_every_ensemble() -> None:
+    heard: list[Phase] = []
+
+    def watcher(phase: Phase, found: Check | None) -> None:
+        if found is None:
+            heard.append(phase)
+
+    chain = new_chain()
+    with ThreadPoolExecutor(1) as executor:
+        sample(POSTERIOR, PLAN, chain, executor, watcher)
+    for phase in PHASES:
+        assert chain.blocks(phase) * PLAN.ensembles == heard.count(phase)
+
+
+def test_two_threads_give_the_same_bits(finished: tuple[Chain, Outcome]) -> None:
+    chain, outcome = run(workers=2)
+    assert_same_chain(finished[0], chain)
+    assert_same_outcome(finished[1], outcome)
+
+
+def test_processes_give_the_same_bits(finished: tuple[Chain, Outcome]) -> None:
+    chain = new_chain()
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
+        outcome = sample(POSTERIOR, PLAN, chain, executor)
+    assert_same_chain(finished[0], chain)
+    assert_same_outcome(finished[1], outcome)
+
+
+def test_another_seed_gives_other_draws(finished: tuple[Chain, Outcome]) -> None:
+    chain, _ = run(seed=2)
+    first = finished[0].coordinates("pilot")[0]
+    assert not np.array_equal(first, chain.coordinates("pilot")[0])
+
+
+def test_a_used_up_budget_is_told_with_what_is_missing() -> None:
+    chain, outcome = run(replace(PLAN, most_steps=60, ess=1e6))
+    assert not outcome.converged
+    assert outcome.stop_reason.startswith("budget of 60 steps used up: ")
+    assert "ESS" in outcome.stop_reason
+    assert 60 == chain.steps("sampling")
+
+
+def test_a_budget_that_ends_with_the_first_good_check_is_told() -> None:
+    steps = run()[1].check.steps
+    _, outcome = run(replace(PLAN, most_steps=steps - PLAN.block))
+    assert not outcome.converged
+    assert outcome.stop_reason.endswith("only the last check passed")
+
+
+def test_the_pilot_has_a_budget_of_its_own() -> None:
+    """Ensembles that never find each other go on after it, and do not converge."""
+
+    def islands(x: FloatArray) -> FloatArray:
+        return np.where(np.max(np.abs(x % 100 - 50), axis=1) < 20, 0.0, -np.inf)
+
+    plan = replace(PLAN, most_pilot_steps=140, most_steps=100, walkers=4)
+    posterior = target(islands, 2)
+    optima = np.array([[100 * i + 50.0, 50.0] for i in range(4)])
+    covariance = np.eye(2)
+    point = PointFit(optima[0], covariance, 0.0, optima, covariance)
+    chain = first_chain(posterior, point, plan, np.random.default_rng(3))
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(posterior, plan, chain, executor)
+    assert 140 == chain.steps("pilot")
+    assert not outcome.converged
+    assert "R-hat" in outcome.stop_reason
+
+
+class InterruptedRunError(Exception):
+    """Somebody pulled the plug."""
+
+
+class PluggedExecutor(Executor):
+    """Runs calls at once, a given number of them, and then fails."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run, or fail."""
+        if self.left == 0:
+            raise InterruptedRunError
+        self.left -= 1
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+# Four calls a block: in the first block of the pilot, later there, at its end, and in the sampling.
+@pytest.mark.parametrize("calls", [0, 3, 9, 20, 23, 26])
+def test_an_interrupted_chain_goes_on_to_the_same_end(
+    finished: tuple[Chain, Outcome], calls: int
+) -> None:
+    chain = new_chain()
+    with pytest.raises(InterruptedRunError):
+        sample(POSTERIOR, PLAN, chain, PluggedExecutor(calls))
+    assert calls // PLAN.ensembles == chain.blocks("pilot") + chain.blocks("sampling")
+    with ThreadPoolExecutor(2) as executor:
+        outcome = sample(POSTERIOR, PLAN, chain, executor)
+    assert_same_chain(finished[0], chain)
+    assert_same_outcome(finished[1], outcome)
+
+
+def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
+    finished: tuple[Chain, Outcome],
+) -> None:
+    chain, outcome = run(replace(PLAN, most_steps=40))
+    assert not outcome.converged
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(POSTERIOR, PLAN, chain, executor)
+    assert_same_chain(finished[0], chain)
+    assert_same_outcome(finished[1], outcome)
+
+
+def test_a_finished_chain_is_left_as_it_is(finished: tuple[Chain, Outcome]) -> None:
+    chain, _ = run()
+    again = sample(POSTERIOR, PLAN, chain, PluggedExecutor(0))
+    assert_same_chain(finished[0], chain)
+    assert_same_outcome(finished[1], again)
+
+
+@pytest.mark.parametrize("walkers", [2, 4])
+def test_too_few_walkers_are_refused(walkers: int) -> None:
+    with pytest.raises(
+        InputError, match=rf"^sampling.walkers: {walkers} are too few for 3 free .* at least 6$"
+    ):
+        new_chain(replace(PLAN, walkers=walkers))
+
+
+@pytest.mark.parametrize(("change", "says"), [({"ensembles": 3}, "4"), ({"walkers": 13}, "even")])
+def test_a_plan_that_cannot_be_is_refused(change: dict[str, int], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        replace(PLAN, **change)
+
+
+def test_one_parameter_alone_is_sampled() -> None:
+    """The offset of a known actuator under known white noise: a normal posterior."""
+    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
+    posterior: Posterior = short_posterior("white", 50, fixed={**known, "sensor_sd": 0.3})
+    assert ("offset",) == posterior.names
+    point = fit(posterior, np.random.default_rng(4))
+    plan = replace(PLAN, walkers=8)
+    chain = first_chain(posterior, point, plan, np.random.default_rng(4))
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(posterior, plan, chain, executor)
+    assert outcome.converged
+    zero = posterior.prior.theta(np.zeros((1, 1)))
+    residual = posterior.displacement - posterior.simulate(zero)[0]
+    expected = stats.norm(np.mean(residual), 0.3 / np.sqrt(50))
+    found = draws(posterior, chain).ravel()
+    error = 4 * expected.std() / np.sqrt(outcome.check.ess_bulk[0])
+    # The prior pulls by less than a thousandth of the posterior's sd.
+    assert expected.mean() == pytest.approx(np.mean(found), abs=error)
+    assert expected.std() == pytest.approx(np.std(found), rel=0.15)

@@ -1,0 +1,290 @@
+"""The whole actuator against a slow simulation, and what its parts promise together."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator, Dynamics, State
+from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.linear import Hold
+from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
+
+DYNAMICS: tuple[Dynamics, ...] = get_args(Dynamics)
+HOLDS: tuple[Hold, ...] = get_args(Hold)
+# The paper's Table 1 in the package's units, with a mass that lets the second order ring.
+VALUES = {
+    "d": 0.7,
+    "alpha": 0.3575,
+    "beta": 0.0272,
+    "gamma": 0.0172,
+    "exponent": 1.0,
+    "initial": 1.5,
+    "lag": 3.85e-3,
+    "mass": 2.0,
+    "damping": 1580.0,
+    "stiffness": 4.10e5,
+    "offset": 12.0,
+}
+
+
+def theta_of(actuator: Actuator, **changes: float) -> FloatArray:
+    """One model (parameters,) of Table 1, with changes."""
+    return np.array([{**VALUES, **changes}[name] for name in actuator.parameters])
+
+
+def batch_of(actuator: Actuator, size: int) -> FloatArray:
+    """Models (size, parameters) scattered around Table 1."""
+    scatter = np.random.default_rng(1).uniform(0.7, 1.3, (size, len(actuator.parameters)))
+    theta = theta_of(actuator) * scatter
+    theta[:, actuator.parameters.index("exponent")] = np.resize([1.0, 1.0, 2.0, 1.3], size)
+    return theta
+
+
+def kinds(interval: float = 1e-3) -> list[Actuator]:
+    return [Actuator(dynamics, hold, interval) for dynamics in DYNAMICS for hold in HOLDS]
+
+
+def name_of(actuator: Actuator) -> str:
+    return f"{actuator.dynamics}, {actuator.hold}"
+
+
+every_kind = pytest.mark.parametrize("actuator", kinds(), ids=name_of)
+
+
+def simulate(actuator: Actuator, theta: FloatArray, voltage: FloatArray) -> FloatArray:
+    """Follow one model sample by sample, with a Runge-Kutta integrator inside each interval."""
+    value = dict(zip(actuator.parameters, theta.tolist(), strict=True))
+    model = Model(value["alpha"], value["beta"], value["gamma"], value["exponent"])
+    follow = by_samples if model.exponent in (1.0, 2.0) else by_integration
+    drive = value["d"] * voltage - follow(voltage, model, value["initial"])
+    if actuator.dynamics == "none":
+        return np.asarray(drive + value["offset"])
+    x, result = np.array([drive[0], 0.0]), [drive[0]]
+    for now, following in pairwise(drive.tolist()):
+        slope = (following - now) / actuator.interval if actuator.hold == "first" else 0.0
+
+        def rate(t: float, x: FloatArray, now: float = now, slope: float = slope) -> list[float]:
+            gap = now + slope * t - x[0]
+            if actuator.dynamics == "lag":
+                return [gap / value["lag"], 0.0]
+            force = value["stiffness"] * gap - value["damping"] * x[1]
+            return [x[1], force / value["mass"]]
+
+        span = (0.0, actuator.interval)
+        x = solve_ivp(rate, span, x, "DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
+        result.append(x[0])
+    return np.asarray(np.array(result) + value["offset"])
+
+
+@every_kind
+@pytest.mark.parametrize("exponent", [1.0, 2.0, 1.3])
+def test_agrees_with_a_slow_simulation(actuator: Actuator, exponent: float) -> None:
+    theta, voltage = theta_of(actuator, exponent=exponent, gamma=0.01), random_walk(2, turns=10)
+    expected = simulate(actuator, theta, voltage)
+    assert_close(expected, actuator.displacement(theta, voltage)[0], 1e-8)
+
+
+def test_without_dynamics_displacement_is_the_drive_and_the_offset() -> None:
+    actuator, voltage = Actuator("none"), random_walk(3)
+    h = hysteresis(voltage, VALUES["alpha"], VALUES["beta"], VALUES["gamma"], initial=1.5)
+    np.testing.assert_allclose(
+        actuator.displacement(theta_of(actuator), voltage), 0.7 * voltage - h + 12.0, rtol=1e-12
+    )
+
+
+def test_parameters_are_named_in_the_order_of_the_columns() -> None:
+    hysteretic = ("d", "alpha", "beta", "gamma", "exponent", "initial")
+    assert (*hysteretic, "offset") == Actuator("none").parameters
+    assert (*hysteretic, "lag", "offset") == Actuator("lag").parameters
+    second = (*hysteretic, "mass", "damping", "stiffness", "offset")
+    assert second == Actuator("second-order").parameters
+
+
+@every_kind
+@given(cuts=st.lists(st.integers(1, 149), max_size=6, unique=True))
+@settings(deadline=None, max_examples=15)
+def test_pieces_equal_the_whole(actuator: Actuator, cuts: list[int]) -> None:
+    theta, voltage = batch_of(actuator, 8), random_walk(4)
+    state: State | None = None
+    pieces = []
+    for piece in np.split(voltage, sorted(cuts)):
+        displacement, state = actuator.advance(theta, piece, state)
+        pieces.append(displacement)
+    assert_close(actuator.displacement(theta, voltage), np.hstack(pieces), 1e-12)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.3, 2.0])
+def test_pieces_go_on_from_a_saturated_state(exponent: float) -> None:
+    """With gamma > beta a state at the ceiling must not be refused for its rounding."""
+    actuator, voltage = Actuator("none"), 100 * np.sin(np.linspace(0, 30, 400))
+    ratio = np.random.default_rng(5).uniform(1.0, 1.5, 60)
+    theta = np.tile(theta_of(actuator, beta=0.3, exponent=exponent, initial=0.0), (60, 1))
+    theta[:, actuator.parameters.index("gamma")] = 0.3 * ratio
+    state: State | None = None
+    for piece in np.array_split(voltage, 40):
+        displacement, state = actuator.advance(theta, piece, state)
+        assert np.isfinite(displacement).all()
+
+
+@every_kind
+def test_a_state_can_be_used_twice(actuator: Actuator) -> None:
+    theta = batch_of(actuator, 3)
+    _, state = actuator.advance(theta, random_walk(6))
+    once, _ = actuator.advance(theta, random_walk(7), state)
+    again, _ = actuator.advance(theta, random_walk(7), state)
+    np.testing.assert_array_equal(once, again)
+
+
+@every_kind
+def test_constant_voltage_leaves_the_actuator_at_rest(actuator: Actuator) -> None:
+    for voltage in (np.full(50, 30.0), np.array([30.0])):
+        got = actuator.displacement(theta_of(actuator), voltage)[0]
+        np.testing.assert_allclose(got, 0.7 * 30 - 1.5 + 12, rtol=1e-14)
+
+
+@every_kind
+def test_after_a_step_the_displacement_settles_on_the_drive(actuator: Actuator) -> None:
+    voltage = np.concatenate([np.zeros(5), np.full(400, 50.0)])
+    at_once = Actuator("none").displacement(theta_of(Actuator("none")), voltage)[0, -1]
+    got = actuator.displacement(theta_of(actuator), voltage)[0, -1]
+    assert pytest.approx(at_once, rel=1e-12) == got
+
+
+@every_kind
+def test_offset_shifts_everything(actuator: Actuator) -> None:
+    low = actuator.displacement(theta_of(actuator, offset=-3.0), random_walk(8))
+    high = actuator.displacement(theta_of(actuator, offset=4.0), random_walk(8))
+    np.testing.assert_allclose(high - low, 7.0, rtol=1e-12)
+
+
+@every_kind
+def test_mirrored_voltage_mirrors_the_displacement(actuator: Actuator) -> None:
+    there = actuator.displacement(theta_of(actuator, offset=0.0), random_walk(9))
+    back = actuator.displacement(theta_of(actuator, offset=0.0, initial=-1.5), -random_walk(9))
+    np.testing.assert_allclose(-there, back, rtol=0, atol=1e-12)
+
+
+@every_kind
+def test_a_model_does_not_depend_on_its_batch(actuator: Actuator) -> None:
+    theta = batch_of(actuator, 12)
+    together = actuator.displacement(theta, random_walk(10))
+    assert (12, 151) == together.shape
+    for row in range(12):
+        assert_close(actuator.displacement(theta[row], random_walk(10))[0], together[row], 1e-12)
+
+
+@every_kind
+def test_arguments_stay_as_they_are(actuator: Actuator) -> None:
+    theta, voltage = batch_of(actuator, 3), random_walk(11)
+    _, state = actuator.advance(theta, voltage)
+    remembered = state.filter.copy()
+    actuator.advance(theta, voltage, state)
+    np.testing.assert_array_equal(batch_of(actuator, 3), theta)
+    np.testing.assert_array_equal(random_walk(11), voltage)
+    np.testing.assert_array_equal(remembered, state.filter)
+
+
+@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
+def test_a_held_drive_arrives_half_a_sample_later(dynamics: Dynamics) -> None:
+    """On a smooth voltage that is slow against the sampling."""
+    time = np.arange(4000) * 1e-3
+    voltage = 100 * np.sin(2 * np.pi * time)
+    outputs = {}
+    for hold in HOLDS:
+        actuator = Actuator(dynamics, hold, 1e-3)
+        outputs[hold] = actuator.displacement(theta_of(actuator), voltage)[0, 1000:]
+    speed = np.gradient(outputs["first"], 1e-3)
+    delay = (outputs["first"] - outputs["zero"]) @ speed / (speed @ speed)
+    assert pytest.approx(0.5e-3, rel=0.05) == delay
+
+
+@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
+def test_a_finer_sampling_changes_little_and_ever_less(dynamics: Dynamics) -> None:
+    """With the first-order hold the error falls with the square of the interval."""
+
+    def sampled(factor: int) -> FloatArray:
+        actuator = Actuator(dynamics, "first", 8e-3 / factor)
+        voltage = 100 * np.sin(2 * np.pi * np.arange(100 * factor + 1) * 8e-3 / factor)
+        return np.asarray(actuator.displacement(theta_of(actuator), voltage)[0, ::factor])
+
+    exact = sampled(64)
+    coarse, fine = (np.abs(sampled(factor) - exact).max() for factor in (1, 4))
+    assert coarse < 0.5
+    assert fine < coarse / 8
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_vanishing_mass_is_a_lag_of_damping_over_stiffness(hold: Hold) -> None:
+    second, lag = Actuator("second-order", hold), Actuator("lag", hold)
+    expected = lag.displacement(theta_of(lag, lag=1580.0 / 4.10e5), random_walk(12))
+    got = second.displacement(theta_of(second, mass=1e-12), random_walk(12))
+    assert_close(expected, got, 1e-10)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (1, 9), (2, 7), (1, 2, 8)])
+def test_theta_of_a_wrong_shape_is_refused_with_the_names_of_its_columns(
+    shape: tuple[int, ...],
+) -> None:
+    with pytest.raises(InputError, match=r"^theta: has shape .*d, alpha, .*, lag, offset$"):
+        Actuator("lag").displacement(np.ones(shape), [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, math.nan) for name in VALUES),
+        *((name, math.inf) for name in VALUES),
+        ("alpha", 0.0),
+        ("beta", -0.01),
+        ("gamma", -0.03),
+        ("exponent", 0.5),
+        ("lag", -1e-3),
+        ("mass", 0.0),
+        ("mass", -1.0),
+        ("damping", -1.0),
+        ("stiffness", 0.0),
+    ],
+)
+def test_a_parameter_outside_its_domain_is_named(name: str, value: float) -> None:
+    for actuator in kinds():
+        if name in actuator.parameters:
+            theta = np.vstack([theta_of(actuator), theta_of(actuator, **{name: value})])
+            with pytest.raises(InputError, match=f"^{name}: [^\n]* in model 1; [^\n]*$"):
+                actuator.displacement(theta, [0.0, 1.0])
+
+
+@pytest.mark.parametrize("voltage", [[], 1.0, [[0.0, 1.0]], [0.0, math.nan]])
+@pytest.mark.parametrize("continued", [False, True])
+def test_voltage_that_is_no_row_of_numbers_is_refused(voltage: object, continued: bool) -> None:
+    actuator = Actuator("lag")
+    state = actuator.advance(theta_of(actuator), [0.0, 1.0])[1] if continued else None
+    with pytest.raises(InputError, match=r"^voltage: "):
+        actuator.advance(theta_of(actuator), voltage, state)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("dynamics", {"dynamics": "third-order"}),
+        ("hold", {"hold": "First"}),
+        *(("interval", {"interval": value}) for value in (0.0, -1e-3, math.nan, math.inf)),
+    ],
+)
+def test_an_actuator_that_cannot_be_is_refused(name: str, wrong: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=f"^{name}: "):
+        Actuator(**wrong)  # type: ignore[arg-type]
+
+
+def test_no_models_give_no_rows() -> None:
+    actuator = Actuator("lag")
+    assert (0, 2) == actuator.displacement(np.empty((0, 8)), [0.0, 1.0]).shape

@@ -1,0 +1,376 @@
+"""Hysteresis along whole records: against an integrator, closed forms, and the model's laws."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import cumulative_trapezoid
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.waveforms import identification_signal, verification_signal
+from bwbayes.errors import InputError
+from bwbayes.model import boucwen
+from bwbayes.model.boucwen import ceiling, hysteresis, monotone_stretches
+from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
+
+ALPHA = 0.3575
+TABLE_1 = Model(ALPHA, 0.0272, 0.0172)
+# (β, γ) for h near 10 um: the paper's, equal, opposite, γ < 0, γ > β.
+SHAPES = ((0.0272, 0.0172), (0.02, 0.02), (0.02, -0.02), (0.03, -0.01), (0.02, 0.03))
+EXPONENTS = (1.0, 1.2, 2.0, 3.0, 10.0)
+
+
+def model(shape: tuple[float, float], exponent: float) -> Model:
+    """Give a shape the units of an exponent, such that h stays near 10 um."""
+    beta, gamma = (rate * 10.0 ** (1 - exponent) for rate in shape)
+    return Model(ALPHA, beta, gamma, exponent)
+
+
+def starts(parameters: Model) -> tuple[float, ...]:
+    """Inside the ceiling on both sides, and beyond it where that is allowed."""
+    highest = min(float(ceiling(*np.array([*parameters])[:, np.newaxis])[0]), 10.0)
+    inside = (0.0, 0.7 * highest, -0.7 * highest)
+    return inside if parameters.gamma > parameters.beta else (*inside, 2 * highest, -2 * highest)
+
+
+def bound(exponent: float) -> float:
+    """Largest error that is promised, in units of the largest |h|."""
+    return 1e-9 if exponent in (1.0, 2.0) else 1e-8
+
+
+def signals() -> dict[str, FloatArray]:
+    return {
+        "identification": identification_signal().sample(20.0)[1],
+        "verification": verification_signal().sample(4.0)[1],
+        "random walk": random_walk(1, turns=20),
+    }
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize("name", signals())
+def test_agrees_with_an_integrator(name: str, exponent: float) -> None:
+    voltage = signals()[name]
+    shapes = SHAPES if name == "random walk" else SHAPES[:3]
+    for index, shape in enumerate(shapes):
+        parameters = model(shape, exponent)
+        initial = starts(parameters)[index % 3]
+        expected = by_integration(voltage, parameters, initial)
+        got = hysteresis(voltage, *parameters, initial=initial)[0]
+        assert_close(expected, got, bound(exponent))
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_agrees_with_an_integrator_from_beyond_the_ceiling(exponent: float) -> None:
+    voltage = random_walk(2, turns=6)
+    parameters = model(SHAPES[0], exponent)
+    for initial in starts(parameters)[3:]:
+        expected = by_integration(voltage, parameters, initial)
+        got = hysteresis(voltage, *parameters, initial=initial)[0]
+        assert_close(expected, got, bound(exponent))
+
+
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_agrees_with_the_scalar_closed_form_from_sample_to_sample(
+    shape: tuple[float, float], exponent: float
+) -> None:
+    parameters = model(shape, exponent)
+    for voltage in (identification_signal().sample(100.0)[1], random_walk(3, turns=100)):
+        for initial in starts(parameters):
+            expected = by_samples(voltage, parameters, initial)
+            got = hysteresis(voltage, *parameters, initial=initial)[0]
+            assert_close(expected, got, 1e-11 if exponent == 1 else 1e-9)
+
+
+@given(
+    beta=st.floats(0.0, 0.2),
+    fraction=st.floats(-1.0, 1.0),
+    start=st.integers(-3000, 3000).map(lambda h: h / 100),
+    corners=st.lists(st.integers(-10_000, 10_000).map(lambda u: u / 100), min_size=1, max_size=20),
+)
+@settings(deadline=None, max_examples=150)
+def test_any_passive_linear_model_agrees_with_the_scalar_closed_form(
+    beta: float, fraction: float, start: float, corners: list[float]
+) -> None:
+    parameters, voltage = Model(ALPHA, beta, fraction * beta), np.array(corners)
+    expected = by_samples(voltage, parameters, start)
+    got = hysteresis(voltage, *parameters, initial=start)[0]
+    assert_close(expected, got, 1e-12)
+
+
+def test_virgin_curve_is_the_exponential() -> None:
+    voltage = np.linspace(0, 100, 11)
+    rate = TABLE_1.beta + TABLE_1.gamma
+    expected = -ALPHA * np.expm1(-rate * voltage) / rate
+    np.testing.assert_allclose(hysteresis(voltage, *TABLE_1)[0], expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize("limit", [(0.02, 0.02), (0.02, -0.02)])
+def test_equal_and_opposite_rates_are_limits_and_not_exceptions(
+    limit: tuple[float, float], exponent: float
+) -> None:
+    voltage = 0.3 * random_walk(4)
+    expected = hysteresis(voltage, *model(limit, exponent), initial=-3.0)[0]
+    for off in (1e-9, 1e-12, 1e-15):
+        near = model((limit[0] * (1 + off), limit[1]), exponent)
+        assert_close(expected, hysteresis(voltage, *near, initial=-3.0)[0], 100 * off + 1e-9)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_without_beta_there_is_no_hysteresis(exponent: float) -> None:
+    voltage = 0.3 * random_walk(5)
+    rising = np.sort(np.abs(voltage))
+    virgin = hysteresis(np.concatenate([[0.0], rising]), *model((0.0, 0.02), exponent))[0]
+    expected = np.sign(voltage) * np.interp(np.abs(voltage), rising, virgin[1:])
+    path = np.concatenate([[0.0], voltage])
+    assert_close(expected, hysteresis(path, *model((0.0, 0.02), exponent))[0][1:], 1e-9)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0])
+def test_saturation_without_beta_stays_finite_and_below_the_ceiling(fraction: float) -> None:
+    """There the ceiling is a state of unstable rest: rounding must not push h through it."""
+    voltage = 1000 * np.sin(np.linspace(0, 30, 400))
+    for beta in (0.0, 1e-18, 1e-9):
+        initial = fraction * ALPHA / (beta + ALPHA)
+        h = hysteresis(voltage, ALPHA, beta, ALPHA, initial=initial)
+        assert np.isfinite(h).all()
+        assert np.abs(h).max() <= 1 + 1e-12
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_plateaus_change_nothing(exponent: float) -> None:
+    """Leading, at turning points, within a stretch and trailing."""
+    voltage, parameters = random_walk(6), model(SHAPES[0], exponent)
+    repeats = np.ones(voltage.size, dtype=int)
+    repeats[[0, 3, 6, 12, 20, -1]] = (4, 2, 5, 3, 2, 6)
+    once = hysteresis(voltage, *parameters, initial=2.0)[0]
+    got = hysteresis(np.repeat(voltage, repeats), *parameters, initial=2.0)[0]
+    assert_close(np.repeat(once, repeats), got, 1e-12)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize("samples", [1, 2, 50])
+def test_constant_voltage_keeps_the_initial_state(exponent: float, samples: int) -> None:
+    for initial in (0.0, 3.0, -3.0, 30.0):
+        got = hysteresis(np.full(samples, 7.0), *model(SHAPES[0], exponent), initial=initial)
+        np.testing.assert_array_equal(np.full((1, samples), initial), got)
+
+
+def test_two_samples_are_one_step() -> None:
+    for voltage in ([0.0, 30.0], [30.0, 0.0]):
+        expected = by_samples(np.array(voltage), TABLE_1, 2.0)
+        np.testing.assert_allclose(hysteresis(voltage, *TABLE_1, initial=2.0)[0], expected)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_mirrored_voltage_and_start_give_mirrored_h(exponent: float) -> None:
+    parameters = model(SHAPES[0], exponent)
+    expected = -hysteresis(random_walk(7), *parameters, initial=2.0)
+    np.testing.assert_array_equal(expected, hysteresis(-random_walk(7), *parameters, initial=-2.0))
+
+
+@given(
+    repeats=st.lists(st.integers(1, 4), min_size=61, max_size=61),
+    exponent=st.sampled_from(EXPONENTS),
+)
+@settings(deadline=None, max_examples=40)
+def test_h_depends_on_the_path_and_not_on_the_pace(repeats: list[int], exponent: float) -> None:
+    """Repeated and inserted samples leave h at the common points as it was."""
+    voltage, parameters = random_walk(8, turns=10), model(SHAPES[0], exponent)
+    fractions = [np.arange(count) / count for count in repeats[:-1]]
+    place = np.concatenate([index + part for index, part in enumerate(fractions)] + [[60.0]])
+    common = np.flatnonzero(place == np.round(place))
+    expected = hysteresis(voltage, *parameters, initial=1.0)[0]
+    refined = np.interp(place, np.arange(61), voltage)
+    assert_close(expected, hysteresis(refined, *parameters, initial=1.0)[0][common], 1e-11)
+    held = np.repeat(voltage, repeats)
+    ends = np.cumsum(repeats) - 1
+    assert_close(expected, hysteresis(held, *parameters, initial=1.0)[0][ends], 1e-12)
+
+
+def test_only_changes_of_voltage_matter() -> None:
+    expected = hysteresis(random_walk(9), *TABLE_1, initial=1.0)[0]
+    assert_close(expected, hysteresis(random_walk(9) + 500.0, *TABLE_1, initial=1.0)[0], 1e-11)
+
+
+def test_a_model_does_not_depend_on_its_batch() -> None:
+    generator = np.random.default_rng(10)
+    models = [model(SHAPES[row % 5], EXPONENTS[row % 4]) for row in range(60)]
+    initial = generator.uniform(-4, 4, len(models))
+    alpha, beta, gamma, exponent = np.array(models).T
+    batch = hysteresis(random_walk(10), alpha, beta, gamma, exponent, initial)
+    for row, parameters in enumerate(models):
+        alone = hysteresis(random_walk(10), *parameters, initial=initial[row])[0]
+        assert_close(alone, batch[row], 1e-12)
+
+
+def test_scalars_and_rows_mix() -> None:
+    voltage, gamma = random_walk(11), np.array([0.01, -0.01])
+    got = hysteresis(voltage, ALPHA, 0.02, gamma)
+    assert (2, voltage.size) == got.shape
+    for row in range(2):
+        assert_close(hysteresis(voltage, ALPHA, 0.02, gamma[row])[0], got[row], 1e-14)
+
+
+@pytest.mark.parametrize("piece", [1, 7, 64])
+def test_cutting_long_stretches_changes_nothing(
+    piece: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for exponent in (1.0, 3.0):
+        parameters = model(SHAPES[0], exponent)
+        expected = hysteresis(random_walk(12), *parameters)[0]
+        with monkeypatch.context() as patch:
+            patch.setattr(boucwen, "PIECE", piece)
+            got = hysteresis(random_walk(12), *parameters)[0]
+        assert_close(expected, got, 1e-11)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+def test_h_stays_below_the_ceiling_and_reaches_it(exponent: float) -> None:
+    for shape in SHAPES:
+        parameters = model(shape, exponent)
+        highest = ceiling(*np.array([*parameters])[:, np.newaxis])[0]
+        start = min(highest, 10.0)
+        h = hysteresis(10 * random_walk(13), *parameters, initial=-start)
+        assert np.abs(h).max() <= highest * (1 + 1e-11)
+        if np.isfinite(highest):
+            far = hysteresis([0.0, 5000.0], *parameters)[0, -1]
+            assert pytest.approx(highest, rel=1e-9) == far
+
+
+def test_ceiling_is_infinite_where_gamma_is_minus_beta() -> None:
+    row = np.array([0.02])
+    assert np.inf == ceiling(np.array([ALPHA]), row, -row, np.array([2.0]))[0]
+
+
+def dissipation(corners: list[float], parameters: Model, initial: float) -> FloatArray:
+    """∫ h du − Δ(h²)/(2α) up to every sample, in um V."""
+    count = len(corners) - 1
+    voltage = np.interp(np.linspace(0, count, 400 * count + 1), np.arange(count + 1), corners)
+    h = hysteresis(voltage, *parameters, initial=initial)[0]
+    supplied = cumulative_trapezoid(h, voltage, initial=0)
+    return np.asarray(supplied - (h**2 - h[0] ** 2) / (2 * parameters.alpha))
+
+
+@given(
+    beta=st.floats(0.0, 0.1),
+    fraction=st.floats(-1.0, 1.0),
+    start=st.integers(-20, 20).map(float),
+    corners=st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=8),
+)
+@settings(deadline=None, max_examples=80)
+def test_no_path_draws_energy_from_a_passive_model(
+    beta: float, fraction: float, start: float, corners: list[float]
+) -> None:
+    assert dissipation(corners, Model(ALPHA, beta, fraction * beta), start).min() >= -0.05
+
+
+def test_gamma_above_beta_is_not_passive() -> None:
+    assert dissipation([0.0, 10.0], Model(ALPHA, 0.01, 0.03), -7.0).min() < -2.0
+
+
+def test_a_minor_loop_does_not_close_but_settles() -> None:
+    """Back at the voltage of the reversal h is lower than before, by less in every round."""
+    voltage = np.array([0.0, 80.0, *[20.0, 80.0] * 12])
+    h = hysteresis(voltage, *TABLE_1)[0]
+    assert_close(by_samples(voltage, TABLE_1, 0.0), h, 1e-13)
+    gaps = np.diff(h[1::2])
+    assert pytest.approx(-0.972087, rel=1e-5) == gaps[0]
+    np.testing.assert_allclose(gaps[1:4] / gaps[:3], 0.0164, rtol=0.03)
+    assert np.abs(gaps[-3:]).max() < 1e-13
+
+
+def test_plateaus_belong_to_the_stretch_that_leads_to_them() -> None:
+    voltage = np.array([1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 0.0, 0.0, 1.0, 1.0])
+    assert [(0, 5, 1.0), (5, 7, -1.0), (7, 9, 1.0)] == list(monotone_stretches(voltage))
+
+
+def test_a_constant_voltage_is_one_stretch_and_one_sample_none() -> None:
+    assert [(0, 3, 1.0)] == list(monotone_stretches(np.full(4, 2.0)))
+    assert [] == list(monotone_stretches(np.array([2.0])))
+
+
+@given(
+    steps=st.lists(st.integers(-2, 2), max_size=60),
+    longest=st.one_of(st.none(), st.integers(1, 9)),
+)
+@settings(deadline=None)
+def test_stretches_partition_the_record(steps: list[int], longest: int | None) -> None:
+    voltage = np.cumsum([0.0, *steps])
+    stretches = list(monotone_stretches(voltage, longest))
+    edges = [0, *(stretch.last for stretch in stretches)]
+    assert edges[:-1] == [stretch.first for stretch in stretches]
+    assert voltage.size - 1 == edges[-1]
+    for first, last, direction in stretches:
+        assert (direction * np.diff(voltage[first : last + 1]) >= 0).all()
+        assert 1 <= last - first <= (longest or voltage.size)
+    if longest is None:
+        assert all(one.direction == -two.direction for one, two in pairwise(stretches))
+
+
+GOOD = {"voltage": [0.0, 1.0], "alpha": ALPHA, "beta": 0.02, "gamma": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("argument", "wrong"),
+    [
+        ("alpha", {"alpha": 0.0}),
+        ("alpha", {"alpha": -1.0}),
+        ("alpha", {"alpha": [ALPHA, -1.0]}),
+        ("alpha", {"alpha": math.nan}),
+        ("alpha", {"alpha": [[ALPHA]]}),
+        ("alpha", {"alpha": []}),
+        ("alpha", {"alpha": [1.0, 1.0], "beta": [0.02, 0.02, 0.02]}),
+        ("beta", {"beta": -0.01, "gamma": 0.02}),
+        ("beta", {"beta": -0.03, "gamma": 0.01}),
+        ("beta", {"beta": math.inf}),
+        ("gamma", {"gamma": -0.03}),
+        ("gamma", {"gamma": math.nan}),
+        ("gamma", {"gamma": 0.03, "initial": 8.0}),
+        ("gamma", {"gamma": 0.03, "initial": -8.0}),
+        ("exponent", {"exponent": 0.99}),
+        ("exponent", {"exponent": math.inf}),
+        ("initial", {"initial": math.nan}),
+        ("initial", {"initial": [0.0, 1.0], "alpha": [ALPHA, ALPHA, ALPHA]}),
+        ("voltage", {"voltage": []}),
+        ("voltage", {"voltage": 3.0}),
+        ("voltage", {"voltage": [[0.0, 1.0]]}),
+        ("voltage", {"voltage": [0.0, math.nan]}),
+        ("voltage", {"voltage": [0.0, -math.inf]}),
+    ],
+)
+def test_outside_the_domain_one_line_names_the_argument(
+    argument: str, wrong: dict[str, object]
+) -> None:
+    with pytest.raises(InputError, match=f"^{argument}: [^\n]*$"):
+        hysteresis(**{**GOOD, **wrong})  # type: ignore[arg-type]
+
+
+def test_the_edges_of_the_domain_are_inside() -> None:
+    for beta, gamma, initial in ((0.0, 0.0, 5.0), (0.0, 0.1, ALPHA / 0.1), (0.1, -0.1, -50.0)):
+        for exponent in (1.0, 2.5):
+            start = initial if exponent == 1 else np.sign(initial)
+            h = hysteresis([0, 10, -10], ALPHA, beta, gamma, exponent, start)
+            assert np.isfinite(h).all()
+
+
+@pytest.mark.parametrize("exponents", [(1.0,), (1.0, 1.5, 2.0, 5.0, 10.0)])
+def test_finite_for_parameters_over_many_decades(exponents: tuple[float, ...]) -> None:
+    generator = np.random.default_rng(14)
+    voltage = np.concatenate([np.zeros(2), random_walk(14, turns=8, samples=5)])
+    for _ in range(10):
+        alpha = 10 ** generator.uniform(-6, 6, 1000)
+        beta = 10 ** generator.uniform(-8, 4, 1000)
+        gamma = beta * generator.choice([-1, 1, 0, *generator.uniform(-1, 3, 20)], 1000)
+        beta[gamma > 0] *= generator.choice([0, 1, 1, 1], (gamma > 0).sum())
+        exponent = generator.choice(exponents, 1000)
+        highest = np.minimum(ceiling(alpha, beta, gamma, exponent), 1e6)
+        inside = np.where(gamma > beta, 1.0, 10 ** generator.uniform(-3, 3, 1000))
+        initial = highest * inside * generator.uniform(-1, 1, 1000)
+        assert np.isfinite(hysteresis(voltage, alpha, beta, gamma, exponent, initial)).all()

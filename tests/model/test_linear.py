@@ -1,0 +1,259 @@
+"""The recursions against scipy, closed forms and limits, for every kind of pole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.signal import cont2discrete, dlsim
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.linear import Hold, Recursion, first_order_lag, second_order
+
+INTERVAL = 1e-3
+HOLDS: tuple[Hold, ...] = ("first", "zero")
+# Mass in kg, damping in N s/m, stiffness in N/m: the paper's, poles at -259.5 and -1.18e6 /s.
+TABLE_1 = (0.00134, 1580.0, 4.10e5)
+
+
+def from_poles(first: complex, second: complex) -> tuple[float, float, float]:
+    """Mass, damping and stiffness, the last one 1, of two poles in 1/s."""
+    product = (first * second).real
+    return 1 / product, -(first + second).real / product, 1.0
+
+
+# In units of the sampling rate: slow, ordinary, fast and mixed; nearly equal; complex; undamped.
+POLES: dict[str, tuple[complex, complex]] = {
+    "slow": (-1e-3, -3e-3),
+    "one slow": (-1e-4, -2.0),
+    "ordinary": (-0.1, -0.6),
+    "fast": (-3.0, -40.0),
+    "very fast": (-50.0, -3000.0),
+    "equal": (-0.3, -0.3),
+    "equal and fast": (-4.0, -4.0),
+    "equal and slow": (-2e-3, -2e-3),
+    **{f"apart by {gap:g}": (-0.4, -0.4 * (1 + gap)) for gap in (1e-3, 1e-6, 1e-9, 1e-12)},
+    **{f"fast, apart by {gap:g}": (-2.0, -2.0 * (1 + gap)) for gap in (1e-3, 1e-6, 1e-9, 1e-12)},
+    "nearly equal, complex": (-0.4 + 1e-8j, -0.4 - 1e-8j),
+    "at one": (-1.0, -1.0),
+    "complex": (-0.1 + 0.5j, -0.1 - 0.5j),
+    "complex and fast": (-0.5 + 9j, -0.5 - 9j),
+    "undamped": (0.7j, -0.7j),
+    "undamped and fast": (2.9j, -2.9j),
+}
+
+
+def batch(*parameters: float) -> list[FloatArray]:
+    return [np.array([value]) for value in parameters]
+
+
+def oscillator(parameters: tuple[float, float, float], hold: Hold) -> Recursion:
+    mass, damping, stiffness = batch(*parameters)
+    return second_order(mass, damping, stiffness, INTERVAL, hold)
+
+
+def from_rest(recursion: Recursion, drive: FloatArray) -> FloatArray:
+    """Output (samples,) of the first model for a drive (samples,) that starts at zero."""
+    return np.asarray(recursion.run(drive[np.newaxis].copy(), recursion.at_rest())[0])
+
+
+def walk(samples: int = 400) -> FloatArray:
+    """Return a random walk (samples,) that starts at zero."""
+    steps = np.random.default_rng(1).normal(size=samples - 1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def by_matrix_exponential(rate: FloatArray, hold: Hold, drive: FloatArray) -> FloatArray:
+    """Step a system over every interval; the drive and its slope ride along as the last states."""
+    transition = expm(rate * INTERVAL)
+    state, positions = np.zeros(len(rate)), []
+    for now, following in zip(drive, [*drive[1:], drive[-1]], strict=True):
+        positions.append(state[0])
+        state[-2:] = now, (following - now) / INTERVAL if hold == "first" else 0.0
+        state = transition @ state
+    return np.array(positions)
+
+
+def oscillator_rate(mass: float, damping: float, stiffness: float) -> FloatArray:
+    """d/dt of displacement, velocity, drive and slope of the drive."""
+    pull = stiffness / mass
+    return np.array([[0, 1, 0, 0], [-pull, -damping / mass, pull, 0], [0, 0, 0, 1.0], [0] * 4])
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("poles", POLES.values(), ids=POLES)
+def test_second_order_agrees_with_the_matrix_exponential(
+    poles: tuple[complex, complex], hold: Hold
+) -> None:
+    parameters = from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL)
+    expected = by_matrix_exponential(oscillator_rate(*parameters), hold, walk())
+    got = from_rest(oscillator(parameters, hold), walk())
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_stiff_poles_of_table_1_agree_with_scipy(hold: Hold) -> None:
+    mass, damping, stiffness = TABLE_1
+    # Time in ms and position with velocity in um/ms keep scipy's matrices well scaled.
+    system = (
+        np.array([[0.0, 1.0], [-stiffness / mass * 1e-6, -damping / mass * 1e-3]]),
+        np.array([[0.0], [stiffness / mass * 1e-6]]),
+        np.array([[1.0, 0.0]]),
+        np.zeros((1, 1)),
+    )
+    discrete = cont2discrete(system, INTERVAL * 1e3, "foh" if hold == "first" else "zoh")
+    expected = dlsim(discrete, walk()[:, np.newaxis])[1][:, 0]
+    got = from_rest(oscillator(TABLE_1, hold), walk())
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+@given(
+    frequency=st.floats(-2.5, 4.0).map(lambda power: 10.0**power),
+    ratio=st.floats(0.0, 30.0),
+    hold=st.sampled_from(HOLDS),
+)
+@settings(deadline=None, max_examples=100)
+def test_any_oscillator_agrees_with_the_matrix_exponential(
+    frequency: float, ratio: float, hold: Hold
+) -> None:
+    """Frequency in rad per sample, damping ratio from none to stiff."""
+    natural = frequency / INTERVAL
+    parameters = (1 / natural**2, 2 * ratio / natural, 1.0)
+    expected = by_matrix_exponential(oscillator_rate(*parameters), hold, walk(60))
+    got = from_rest(oscillator(parameters, hold), walk(60))
+    # The angle of an undamped oscillation is known to its rounding only.
+    tolerance = 1e-10 + 1e-12 * frequency
+    np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * np.abs(walk(60)).max())
+
+
+def step(samples: int) -> FloatArray:
+    """Zero, then one from sample 1 on: (samples,)."""
+    drive = np.ones(samples)
+    drive[0] = 0.0
+    return drive
+
+
+def test_held_step_gives_the_closed_step_responses() -> None:
+    time = np.arange(199) * INTERVAL
+    decay, turn, fast = 200.0, 700.0, 1.2e6
+    natural = np.hypot(decay, turn)
+    responses = {
+        (-decay, -decay): 1 - (1 + decay * time) * np.exp(-decay * time),
+        (-decay, -fast): 1
+        - (fast * np.exp(-decay * time) - decay * np.exp(-fast * time)) / (fast - decay),
+        (-decay + 1j * turn, -decay - 1j * turn): 1
+        - np.exp(-decay * time) * (np.cos(turn * time) + decay / turn * np.sin(turn * time)),
+        (1j * natural, -1j * natural): 1 - np.cos(natural * time),
+    }
+    for poles, expected in responses.items():
+        got = from_rest(oscillator(from_poles(*poles), "zero"), step(200))
+        np.testing.assert_allclose(got[1:], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("poles", POLES.values(), ids=POLES)
+@pytest.mark.parametrize("hold", HOLDS)
+def test_static_gain_is_one(poles: tuple[complex, complex], hold: Hold) -> None:
+    """Up to the coefficients' rounding, which slow poles magnify."""
+    recursion = oscillator(from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL), hold)
+    gain = recursion.numerator.sum() / recursion.denominator.sum()
+    fading = abs((1 - np.exp(poles[0])) * (1 - np.exp(poles[1])))
+    assert pytest.approx(1.0, abs=1e-15 + 1e-15 / fading) == gain
+
+
+@pytest.mark.parametrize("lag", [1e-9, 1e-5, 4e-4, 1e-3, 3.85e-3, 0.5, 1e4])
+def test_lag_agrees_with_the_matrix_exponential(lag: float) -> None:
+    rate = np.array([[-1 / lag, 1 / lag, 0], [0, 0, 1.0], [0, 0, 0]])
+    for hold in HOLDS:
+        expected = by_matrix_exponential(rate, hold, walk())
+        got = from_rest(first_order_lag(np.array([lag]), INTERVAL, hold), walk())
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_lag_step_responses() -> None:
+    lag, count = 3.85e-3, np.arange(100)
+    held = from_rest(first_order_lag(np.array([lag]), INTERVAL, "zero"), step(101))
+    np.testing.assert_allclose(held[1:], -np.expm1(-count * INTERVAL / lag), rtol=0, atol=1e-14)
+    # Between samples 0 and 1 the first-order hold is a ramp; from there on an exponential.
+    first = lag / INTERVAL * -np.expm1(-INTERVAL / lag)
+    ramped = from_rest(first_order_lag(np.array([lag]), INTERVAL, "first"), step(101))
+    expected = 1 - first * np.exp(-count * INTERVAL / lag)
+    np.testing.assert_allclose(ramped[1:], expected, rtol=0, atol=1e-14)
+
+
+def test_without_a_lag_the_output_is_the_drive_as_it_is_held() -> None:
+    for lag in (0.0, 1e-320, 1e-30):
+        got = from_rest(first_order_lag(np.array([lag]), INTERVAL, "first"), walk())
+        np.testing.assert_allclose(got, walk(), rtol=0, atol=1e-12)
+        got = from_rest(first_order_lag(np.array([lag]), INTERVAL, "zero"), walk())
+        np.testing.assert_array_equal(walk()[:-1], got[1:])
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_vanishing_mass_leaves_the_lag(hold: Hold) -> None:
+    stiffness, lag = 4.1e5, 3.85e-3
+    expected = from_rest(first_order_lag(np.array([lag]), INTERVAL, hold), walk())
+    got = from_rest(oscillator((1e-14, lag * stiffness, stiffness), hold), walk())
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("parameters", [TABLE_1, from_poles(-100 + 300j, -100 - 300j)])
+def test_a_ramp_is_followed_at_a_constant_distance(parameters: tuple[float, float, float]) -> None:
+    """By b/k; by about half a sample more, up to its ripple, where the drive is held."""
+    ramp = np.arange(500.0) * INTERVAL
+    delay = parameters[1] / parameters[2]
+    for lagging in (True, False):
+        first, zero = (
+            first_order_lag(np.array([delay]), INTERVAL, hold)
+            if lagging
+            else oscillator(parameters, hold)
+            for hold in HOLDS
+        )
+        assert pytest.approx(delay, rel=1e-9) == ramp[-1] - from_rest(first, ramp)[-1]
+        later = from_rest(first, ramp)[-1] - from_rest(zero, ramp)[-1]
+        assert pytest.approx(INTERVAL / 2, rel=0.1) == later
+
+
+def test_an_undamped_oscillator_keeps_its_energy() -> None:
+    recursion = oscillator(from_poles(700j, -700j), "zero")
+    drive = np.zeros(50_000)
+    drive[1:] = 1.0
+    swing = from_rest(recursion, drive)
+    assert pytest.approx(2.0, abs=1e-3) == swing[-1000:].max()
+    assert pytest.approx(0.0, abs=1e-3) == swing[-1000:].min()
+
+
+@given(cut=st.integers(0, 400))
+@settings(deadline=None, max_examples=30)
+def test_two_pieces_equal_one(cut: int) -> None:
+    for poles in POLES.values():
+        recursion = oscillator(from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL), "first")
+        expected = from_rest(recursion, walk())
+        state = recursion.at_rest()
+        pieces = [recursion.run(piece, state) for piece in np.split(walk()[np.newaxis], [cut], 1)]
+        np.testing.assert_array_equal(expected, np.concatenate(pieces, axis=1)[0])
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_model_does_not_depend_on_its_batch(hold: Hold) -> None:
+    models = [from_poles(*(pole / INTERVAL for pole in pair)) for pair in POLES.values()]
+    mass, damping, stiffness = np.array(models).T
+    together = second_order(mass, damping, stiffness, INTERVAL, hold)
+    outputs = together.run(np.tile(walk(), (len(models), 1)), together.at_rest())
+    for row, parameters in enumerate(models):
+        alone = from_rest(oscillator(parameters, hold), walk())
+        np.testing.assert_allclose(outputs[row], alone, rtol=0, atol=1e-12 * np.abs(alone).max())
+
+
+def test_finite_for_parameters_over_many_decades() -> None:
+    generator = np.random.default_rng(2)
+    mass, damping, stiffness, lag = 10 ** generator.uniform(-12, 12, (4, 20_000))
+    damping[::7] = 0.0
+    for hold in HOLDS:
+        for recursion in (
+            second_order(mass, damping, stiffness, INTERVAL, hold),
+            first_order_lag(lag, INTERVAL, hold),
+        ):
+            assert np.isfinite(recursion.numerator).all()
+            assert np.isfinite(recursion.denominator).all()
