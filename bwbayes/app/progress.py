@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bwbayes.inference.chain import Chain, Phase
+from bwbayes.inference.chain import Phase
 from bwbayes.inference.diagnostics import LENGTH, Check
 from bwbayes.inference.sampling import SamplingPlan
 
@@ -26,13 +26,12 @@ PAUSE = 10.0
 class Progress:
     """Watches a sampling; use it as a context manager and as the sampler's watcher."""
 
-    def __init__(self, console: Console, chain: Chain, plan: SamplingPlan) -> None:
-        self.console, self.chain, self.plan = console, chain, plan
+    def __init__(self, console: Console, plan: SamplingPlan) -> None:
+        self.console, self.plan = console, plan
         self.begun = self.printed = time.monotonic()
         self.done = 0
         self.check: Check | None = None
         self.live = Live(console=console, transient=True) if console.is_terminal else None
-        self.before = self._steps()
 
     def __enter__(self) -> Progress:
         if self.live:
@@ -60,8 +59,8 @@ class Progress:
         elapsed = max(time.monotonic() - self.begun, 1e-9)
         steps = self.done * self.plan.block / self.plan.ensembles
         rate = steps * self.plan.ensembles * self.plan.walkers / elapsed
-        if phase == "pilot" or self.check is None:
-            return f"pilot     {steps:6.0f} steps   {rate:6.0f} models/s   ensembles are converging"
+        if self.check is None:
+            return f"{phase:9} {steps:6.0f} steps   {rate:6.0f} models/s   ensembles are converging"
         check = self.check
         fewest = float(np.min([check.ess_bulk, check.ess_tail]))
         return (
@@ -69,9 +68,6 @@ class Progress:
             f"ETA {self._remaining(steps / elapsed)}   acceptance {check.acceptance:.2f}   "
             f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}"
         )
-
-    def _steps(self) -> int:
-        return self.chain.steps("pilot") + self.chain.steps("sampling")
 
     def _remaining(self, steps_per_second: float) -> str:
         """Guess from the effective draws per step so far, and from the autocorrelation time."""

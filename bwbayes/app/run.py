@@ -8,14 +8,8 @@ the next one needs, so it does not matter in how many pieces a run is done.
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import platform
-import signal
 import time
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -28,8 +22,10 @@ from bwbayes.app.folder import RunFolder
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
+from bwbayes.app.workers import executor, one_thread
 from bwbayes.errors import InputError
 from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
@@ -42,7 +38,6 @@ from bwbayes.results.scores import Scores, score
 __all__ = [
     "assemble",
     "carry_on",
-    "executor",
     "finished",
     "load_run",
     "predictions",
@@ -97,14 +92,14 @@ def carry_on(
         The folder's files do not fit together, or another process is writing them.
     """
     begun = time.monotonic()
-    with folder.locked():
+    with folder.locked(), one_thread():
         if ess is not None or steps is not None:
             _retarget(folder, ess, steps)
         problem = load_run(folder)
         with (
             _chain(folder, problem, console) as chain,
             executor(workers) as pool,
-            Progress(console, chain, problem.plan) as progress,
+            Progress(console, problem.plan) as progress,
         ):
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ...", highlight=False)
@@ -121,7 +116,7 @@ def redraw(folder: RunFolder) -> Result:
     InputError
         The run has no draws yet, or another process is writing it.
     """
-    with folder.locked():
+    with folder.locked(), one_thread():
         if not folder.summary.is_file():
             raise InputError(
                 f"{folder.path}: the run is not finished; go on with `bwbayes resume {folder.path}`"
@@ -148,25 +143,6 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
     as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
     with executor(1) as pool:
         return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
-
-
-@contextmanager
-def executor(workers: int | None) -> Iterator[Executor]:
-    """Give an executor with that many workers: processes, or this process alone for one."""
-    count = workers or os.cpu_count() or 1
-    pool: Executor = ThreadPoolExecutor(1)
-    if count > 1:
-        # A worker must not die of the Ctrl-C that asks the whole run to stop in order.
-        pool = ProcessPoolExecutor(
-            count,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=signal.signal,
-            initargs=(signal.SIGINT, signal.SIG_IGN),
-        )
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def versions() -> dict[str, str]:
@@ -257,6 +233,9 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     windows = ", ".join(
         f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
     )
+    moves = "differential evolution alone"
+    if chain.proposals["sampling"] is not None:
+        moves = "Student-t mixture, differential evolution and snooker"
     return {
         "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
         "data_sha256": record.sha256,
@@ -264,9 +243,8 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
         "model": f"Bouc-Wen, dynamics {config.model.dynamics}, {config.model.hold}-order hold",
         "noise": config.model.noise,
         "sampling": (
-            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers, "
-            f"{chain.steps('pilot')} pilot steps, {chain.steps('sampling')} steps that count, "
-            + ("Student-t proposal" if chain.proposal else "differential evolution alone")
+            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
+            f"{', '.join(f'{chain.steps(phase)} steps of {phase}' for phase in PHASES)}; {moves}"
         ),
         "seed": str(config.seed),
     } | {f"version of {name}": text for name, text in versions().items()}

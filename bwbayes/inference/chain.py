@@ -1,7 +1,7 @@
 """The chain of a sampling: what every ensemble did, block by block.
 
 A :class:`Chain` keeps it in memory; :class:`~bwbayes.inference.chainfile.ChainFile` writes it to a
-file as well. The pilot's blocks are kept apart from those that count.
+file as well. The blocks of the pilot and the tuning are kept apart from those that count.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.ensemble import Block, EnsembleState
-from bwbayes.inference.moves import StudentProposal
+from bwbayes.inference.proposals import StudentMixture
 
 __all__ = ["PHASES", "Chain", "Phase"]
 
-Phase = Literal["pilot", "sampling"]
-PHASES: tuple[Phase, ...] = ("pilot", "sampling")
+Phase = Literal["pilot", "tuning", "sampling"]
+PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
 
 class Chain:
-    """Blocks of all ensembles, in two phases.
+    """Blocks of all ensembles, in three phases.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ class Chain:
 
     def __init__(self, starts: Sequence[EnsembleState]) -> None:
         self.starts = tuple(starts)
-        self.proposal: StudentProposal | None = None
+        self.proposals: dict[Phase, StudentMixture | None] = dict.fromkeys(PHASES)
         self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
 
-    def freeze(self, proposal: StudentProposal | None) -> None:
-        """Fix the proposal of the draws that count."""
-        self.proposal = proposal
+    def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
+        """Fix the proposal of a phase, before its first block."""
+        self.proposals[phase] = proposal
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
         """Add the next block of every ensemble."""

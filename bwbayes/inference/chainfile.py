@@ -5,10 +5,10 @@ flushed, then the number of blocks that count, and only what is counted is ever 
 killed in between loses the block in hand and nothing else. Going on from such a file first copies
 what counts into a fresh one, which also checks every checksum. This module alone knows the layout:
 
-    /start, /pilot, /sampling     coordinates, log_density, accepted, random_state
-    /proposal                     centre, factor, freedom of the frozen proposal
-    /point                        the point fit
-    /blocks                       pilot blocks, sampling blocks, proposal frozen (0 or 1)
+    /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, random_state
+    /proposal/PHASE                      weights, centres, factors of that phase's proposal
+    /point                               the point fit
+    /committed                           blocks of each phase; proposals of each phase (0 or 1)
 
 and what was run (config, versions, seed, hash of the data) as the file's attributes.
 """
@@ -22,13 +22,13 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.chain import PHASES, Chain, Phase
 from bwbayes.inference.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
-from bwbayes.inference.moves import StudentProposal
 from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.proposals import COMPONENTS, StudentMixture, StudentProposal
 
 __all__ = ["ChainFile"]
 
@@ -69,8 +69,7 @@ class ChainFile(Chain):
         _replace(temporary, path)
         made._open()
         for phase in PHASES:
-            if phase == "sampling" and chain.blocks("sampling"):
-                made.freeze(chain.proposal)
+            made.freeze(phase, chain.proposals[phase])
             for number in range(chain.blocks(phase)):
                 made.append(phase, chain.block_of(phase, number))
         return made
@@ -131,15 +130,15 @@ class ChainFile(Chain):
         self._commit(PHASES.index(phase), number + 1)
         super().append(phase, blocks)
 
-    def freeze(self, proposal: StudentProposal | None) -> None:
-        """Fix the proposal of the draws that count, in the file too."""
+    def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
+        """Fix the proposal of a phase, in the file too."""
         if proposal is not None:
-            group = self._file["proposal"]
-            group["centre"][:] = proposal.centre
-            group["factor"][:] = proposal.factor
-            group["freedom"][()] = proposal.freedom
-            self._commit(len(PHASES), 1)
-        super().freeze(proposal)
+            group = self._file[f"proposal/{phase}"]
+            group["weights"][:] = proposal.weights
+            group["centres"][:] = np.stack([c.centre for c in proposal.components])
+            group["factors"][:] = np.stack([c.factor for c in proposal.components])
+            self._commit(len(PHASES) + PHASES.index(phase), 1)
+        super().freeze(phase, proposal)
 
     def close(self) -> None:
         """Close the file."""
@@ -161,7 +160,7 @@ class ChainFile(Chain):
     def _commit(self, place: int, count: int) -> None:
         """Let ``count`` count, once everything before has reached the file."""
         self._file.flush()
-        self._file["blocks"][place] = count
+        self._file["committed"][place] = count
         self._file.flush()
 
     @classmethod
@@ -176,14 +175,11 @@ class ChainFile(Chain):
         states = zip(start["coordinates"], start["log_density"], start["random_state"], strict=True)
         block = int(file["pilot"]["coordinates"].chunks[0])
         loaded = cls(path, point, [EnsembleState(*state) for state in states], block)
-        *counts, frozen = (int(count) for count in file["blocks"][:])
-        if frozen:
-            group = file["proposal"]
-            loaded.proposal = StudentProposal(
-                group["centre"][:], group["factor"][:], float(group["freedom"][()])
-            )
-        for phase, count in zip(PHASES, counts, strict=True):
-            for number in range(count):
+        committed = file["committed"][:]
+        for place, phase in enumerate(PHASES):
+            if committed[len(PHASES) + place]:
+                loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
+            for number in range(committed[place]):
                 Chain.append(loaded, phase, _blocks(file[phase], number, block))
         return loaded
 
@@ -200,10 +196,11 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
     file["start/coordinates"] = np.stack([s.coordinates for s in starts])
     file["start/log_density"] = np.stack([s.log_density for s in starts])
     file["start/random_state"] = np.stack([s.random_state for s in starts])
-    file["proposal/centre"] = np.zeros(free)
-    file["proposal/factor"] = np.zeros((free, free))
-    file["proposal/freedom"] = 0.0
-    file["blocks"] = np.zeros(len(PHASES) + 1, dtype=np.int64)
+    for phase in PHASES:
+        file[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
+        file[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
+        file[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
+    file["committed"] = np.zeros(2 * len(PHASES), dtype=np.int64)
     shapes: dict[str, tuple[tuple[int, ...], Any]] = {
         "coordinates": ((block, ensembles, walkers, free), np.float64),
         "log_density": ((block, ensembles, walkers), np.float64),
@@ -222,9 +219,15 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
             )
 
 
-def _put(dataset: Any, rows: slice, values: FloatArray) -> None:
+def _put(dataset: Any, rows: slice, values: NDArray[Any]) -> None:
     dataset.resize(rows.stop, axis=0)
     dataset[rows] = values
+
+
+def _proposal(group: Any) -> StudentMixture:
+    """Read a frozen proposal."""
+    pairs = zip(group["centres"][:], group["factors"][:], strict=True)
+    return StudentMixture(group["weights"][:], tuple(StudentProposal(*pair) for pair in pairs))
 
 
 def _blocks(group: Any, number: int, block: int) -> list[Block]:

@@ -2,7 +2,8 @@
 
 With Y half the range of the displacement, U half the range of the voltage and Δ the sampling
 interval, every scale of the model is known to within a factor of a few: d is near Y/U, α a part of
-it, β near 1/U, a lag some samples. These priors never come from a fit, so the data are not used
+it, β near 1/U, a lag some samples, and what the model leaves over about a hundredth of the range,
+correlated over some hundreds of samples. These priors never come from a fit, so the data are not used
 twice; they are resolved once to explicit numbers, which a run prints and stores.
 """
 
@@ -95,8 +96,8 @@ def default_prior(
             "normal", {"mean": _round(ranges.middle), "sd": _round(displacement)}
         ),
         "sensor_sd": _lognormal(0.006 * displacement, 1.5),
-        "discrepancy_sd": Distribution("halfnormal", {"scale": _round(0.06 * displacement)}),
-        "discrepancy_time": _lognormal(250 * interval, 1.0),
+        "discrepancy_sd": Distribution("halfnormal", {"scale": _round(0.02 * displacement)}),
+        "discrepancy_time": _lognormal(250 * interval, 0.8),
     }
     if stiffness is not None:
         priors["damping"] = _lognormal(3 * interval * stiffness, 1.0)

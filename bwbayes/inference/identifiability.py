@@ -1,10 +1,10 @@
-"""What a record cannot tell: combinations of parameters that stay as the prior had them.
+"""What a record cannot tell: combinations of hysteresis parameters that stay as the prior had them.
 
 Every Bouc-Wen fit leaves a discrepancy of a percent of the range or so, and it comes back whenever
 the voltage takes the same way again: a hundred periods of one sine show one loop, not a hundred.
-So each distinct stretch of the voltage counts once here, under a discrepancy of at least that
-percent, and a combination of parameters is named when its sd would be nearly half
-of what the prior had. The posterior itself, which trusts the noise model, may look surer.
+So each distinct stretch of the voltage counts once here, under a discrepancy of that percent, and
+a combination of parameters is named when three tenths of its prior sd or more would be left. The
+posterior itself, which trusts the noise model, may look surer.
 """
 
 from __future__ import annotations
@@ -14,11 +14,15 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.parameters import POSITIVE, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.boucwen import monotone_stretches
 
-__all__ = ["undetermined"]
+__all__ = ["spectrum", "undetermined"]
+
+# Parameters that together make the loop. The others only have to be found beside them.
+LOOP = ("d", "alpha", "beta", "gamma", "exponent")
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -27,55 +31,67 @@ DISCREPANCY = 0.01
 SAME_STRETCH = 0.01
 
 # A combination is undetermined when this part of its prior sd or more is left.
-LEFT_OPEN = 0.45
+LEFT_OPEN = 0.3
 
 
 def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
-    """Name the combinations of physical parameters that the record does not determine.
+    """Name the combinations of loop parameters that the record does not determine.
 
-    The information of the training windows on the model's parameters is compared with the prior's,
-    both in unconstrained coordinates around the mode. ``alpha with beta`` means that both may grow
-    together, ``alpha against beta`` that one grows while the other falls.
+    ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
+    while the other falls.
     """
-    names = [posterior.names[i] for i in _physical(posterior)]
+    names = [posterior.names[i] for i in _columns(posterior, LOOP)]
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
-    left_open = directions.T[parts > LEFT_OPEN]
-    return [_combination(direction, names) for direction in left_open]
+    return [_combination(d, names) for d in directions.T[parts > LEFT_OPEN]]
 
 
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
-    """Return the part of the prior sd that is left along each principal direction.
+    """Return the part of the prior sd that is left along each principal direction of the loop.
 
-    The parts (physical,), the largest first, and the directions as columns (physical, physical),
-    in unconstrained coordinates over their prior sd.
+    The parts (loop parameters,), the largest first, and the directions as columns, in units of
+    each parameter's prior sd: relative to its value for a positive one, to β for γ.
     """
-    columns = _physical(posterior)
-    prior = point.prior_covariance[np.ix_(columns, columns)]
-    scale = np.sqrt(np.diag(prior))
-    slopes = _slopes(posterior, point.mode, columns, scale)
-    gain, directions = linalg.eigh(
-        _information(posterior, point, slopes), linalg.inv(prior / np.outer(scale, scale))
+    columns = _columns(posterior, posterior.actuator.parameters)
+    slopes = _slopes(posterior, point.mode, columns)
+    left = linalg.inv(np.eye(len(columns)) + _information(posterior, point, slopes))
+    loop = [i for i, column in enumerate(columns) if posterior.names[column] in LOOP]
+    variance, directions = linalg.eigh(left[np.ix_(loop, loop)])
+    return np.sqrt(variance[::-1]), directions[:, ::-1]
+
+
+def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
+    return [i for i, name in enumerate(posterior.names) if name in names]
+
+
+def _slopes(posterior: Posterior, mode: FloatArray, columns: list[int]) -> FloatArray:
+    """Change of the displacement per prior sd of each parameter, (physical, samples), um."""
+    free, _ = posterior.prior.constrain(mode[np.newaxis])
+    theta = posterior.prior.theta(free)[0]
+    values = dict(zip(posterior.prior.names, theta, strict=True))
+    scale = [_prior_sd(posterior.prior.free[column], values) for column in columns]
+    step = 1e-5
+    steps = np.zeros((len(columns), free.shape[1]))
+    steps[np.arange(len(columns)), columns] = step * np.array(scale)
+    plus, minus = np.split(
+        posterior.simulate(posterior.prior.theta(np.concatenate([free + steps, free - steps]))), 2
     )
-    return 1 / np.sqrt(1 + np.maximum(gain, 0)), directions
-
-
-def _physical(posterior: Posterior) -> list[int]:
-    return [i for i, n in enumerate(posterior.names) if n in posterior.actuator.parameters]
-
-
-def _slopes(
-    posterior: Posterior, mode: FloatArray, columns: list[int], scale: FloatArray
-) -> FloatArray:
-    """Change of the displacement per prior sd of each coordinate, (physical, samples), um."""
-    step = 1e-4
-    steps = np.zeros((len(columns), mode.size))
-    steps[np.arange(len(columns)), columns] = step * scale
-    free, _ = posterior.prior.constrain(np.concatenate([mode + steps, mode - steps]))
-    plus, minus = np.split(posterior.simulate(posterior.prior.theta(free)), 2)
     slopes: FloatArray = (plus - minus) / (2 * step)
     return slopes
+
+
+def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
+    """Return a parameter's prior sd around its value in ``values``."""
+    assert parameter.prior is not None
+    if parameter.name == "gamma":
+        # What |γ| ≤ β leaves to a parameter of which nothing else is known.
+        return values["beta"] / np.sqrt(3)
+    # Half of the central 68 % stands for the sd: some distributions have none.
+    low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
+    if parameter.name in POSITIVE:
+        return float(values[parameter.name] * np.log(high / low) / 2)
+    return (high - low) / 2
 
 
 def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> FloatArray:
@@ -88,7 +104,7 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     weights, duration = _stretches(posterior.voltage)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
-    values = np.array([[sds[1][0], max(sds[0][0], floor), duration / 2]])
+    values = np.array([[sds[1][0], floor, duration / 2]])
     total = np.zeros((slopes.shape[0], slopes.shape[0]))
     for window in windows:
         white = noise.whiten(values, slopes[:, window])

@@ -2,79 +2,23 @@
 
 Differential evolution steps along the difference of two other walkers, so it follows any ridge the
 ensemble lies on; a snooker step now and then helps between modes. Neither needs tuning, and they
-bring the pilot to the posterior. Once the pilot is there, a Student-t distribution fitted to
-its draws proposes places independently of where a walker is, which mixes about ten times faster.
-The fit is frozen before the draws that count, and at least a fifth of the steps remain
+bring the pilot to the posterior. Once the pilot is there, a mixture of Student-t distributions
+fitted to its draws proposes places independently of where a walker is, which mixes about ten times
+faster. The fit is frozen before the draws that count, and a quarter of the steps remain
 differential evolution and snooker, so that whatever the fit does not cover stays reachable.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from emcee import moves
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.proposals import Proposal
 
-__all__ = ["SnookerMove", "StudentProposal", "pilot_moves", "sampling_moves"]
+__all__ = ["SnookerMove", "pilot_moves", "sampling_moves"]
 
 Weighted = list[tuple[moves.Move, float]]
-
-
-@dataclass(frozen=True)
-class StudentProposal:
-    """A multivariate Student-t distribution as an independence proposal.
-
-    With ν degrees of freedom, centre μ and covariance-like scale LLᵀ over p coordinates,
-
-        log q(x) = −(ν + p)/2 log(1 + |L⁻¹(x − μ)|² / ν) + constant.
-
-    Parameters
-    ----------
-    centre
-        μ, (free,).
-    factor
-        L, lower triangular, (free, free).
-    freedom
-        ν; small enough for tails heavier than the posterior's.
-    """
-
-    centre: FloatArray
-    factor: FloatArray
-    freedom: float = 5.0
-
-    @classmethod
-    def fitted(cls, draws: FloatArray) -> StudentProposal:
-        """Fit to draws (count, free) by their mean and covariance.
-
-        The scale is the covariance itself, a little wider than the t of that covariance: a
-        proposal that is too wide costs acceptance, one that is too narrow costs mixing.
-        """
-        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
-        return cls(np.mean(draws, axis=0), np.linalg.cholesky(covariance))
-
-    def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (count,) at coordinates (count, free), up to a constant."""
-        white = np.linalg.solve(self.factor, (coordinates - self.centre).T)
-        size = self.centre.size
-        squares = np.sum(white * white, axis=0)
-        density: FloatArray = -0.5 * (self.freedom + size) * np.log1p(squares / self.freedom)
-        return density
-
-    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
-        """Draw coordinates (count, free) with emcee's generator."""
-        normal = random.standard_normal((count, self.centre.size))
-        spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
-        coordinates: FloatArray = self.centre + (normal * spread[:, np.newaxis]) @ self.factor.T
-        return coordinates
-
-    def __call__(
-        self, coordinates: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
-        proposed = self.draw(random, coordinates.shape[0])
-        return proposed, self.log_density(coordinates) - self.log_density(proposed)
 
 
 class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
@@ -113,7 +57,7 @@ def pilot_moves() -> Weighted:
     return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
 
 
-def sampling_moves(proposal: StudentProposal | None) -> Weighted:
+def sampling_moves(proposal: Proposal | None) -> Weighted:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()

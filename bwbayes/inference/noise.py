@@ -113,9 +113,10 @@ class DiscrepancyNoise:
             # Powers of a below exp(-40) add nothing.
             memory = int(min(samples, 1 - 40 / log_a[row]))
             powers = np.power(a[row], np.arange(memory))
-            pull = powers @ eta[:memory] / gain[row]
+            # Sums, not dot products: a linear algebra library may split those over threads.
+            pull = np.sum(powers * eta[:memory]) / gain[row]
             eta[:memory] -= unsure[row] * pull * powers
-            squares[row] = eta @ eta + unsure[row] * pull**2
+            squares[row] = np.sum(eta * eta) + unsure[row] * pull**2
         squares /= variance
         logs = samples * (np.log(variance) + LOG_TWO_PI) + np.log(gain)
         density: FloatArray = -0.5 * (squares + logs)

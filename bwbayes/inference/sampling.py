@@ -1,9 +1,11 @@
 """Sampling: several independent ensembles, run until the chain says that it has converged.
 
-The ensembles start far apart. A pilot brings them to the posterior and is thrown away; then draws
-count, and after each block of steps the chain is judged (:mod:`bwbayes.inference.diagnostics`),
-until two judgements in a row find nothing missing, or the budget of steps is used up. All
-decisions are functions of the chain alone, so a run that was interrupted goes on to the same end.
+The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
+short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
+away. Then draws count, and after each block of steps the chain is judged
+(:mod:`bwbayes.inference.diagnostics`), until two judgements in a row find nothing missing, or the
+budget of steps is used up. All decisions are functions of the chain alone, so a run that was
+interrupted goes on to the same end.
 """
 
 from __future__ import annotations
@@ -19,17 +21,20 @@ from bwbayes.errors import InputError
 from bwbayes.inference.chain import Chain, Phase
 from bwbayes.inference.diagnostics import Check, check, nested_rhat, pareto_k
 from bwbayes.inference.ensemble import Block, advance, start
-from bwbayes.inference.moves import StudentProposal, pilot_moves, sampling_moves
+from bwbayes.inference.moves import sampling_moves
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.proposals import StudentMixture
 
 __all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample"]
 
 # Nested R-hat of the pilot's second half below which its ensembles have found each other.
 PILOT_RHAT = 1.1
 
-# Above this the Student-t does not fit the pilot, and differential evolution goes on alone.
+# Above this the proposal does not cover the draws, and differential evolution goes on alone.
 LARGEST_PARETO_K = 0.7
+
+TUNING_BLOCKS = 4
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -114,10 +119,14 @@ def sample(
     The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of
     the result.
     """
-    while chain.blocks("sampling") == 0 and not _pilot_done(posterior, plan, chain):
+    while not chain.blocks("tuning") and not _pilot_done(posterior, plan, chain):
         _extend(posterior, plan, chain, "pilot", executor, watcher)
-    if chain.blocks("sampling") == 0:
-        chain.freeze(_proposal(chain))
+    while not chain.blocks("sampling") and chain.blocks("tuning") < TUNING_BLOCKS:
+        if not chain.blocks("tuning"):
+            chain.freeze("tuning", _fitted(chain, "pilot"))
+        _extend(posterior, plan, chain, "tuning", executor, watcher)
+    if not chain.blocks("sampling"):
+        chain.freeze("sampling", _trusted(chain, _fitted(chain, "tuning")))
         _extend(posterior, plan, chain, "sampling", executor, watcher)
     before = _check(posterior, plan, chain, chain.blocks("sampling") - 1)
     while True:
@@ -150,7 +159,7 @@ def _extend(
     watcher: Watcher,
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
-    moves = pilot_moves() if phase == "pilot" else sampling_moves(chain.proposal)
+    moves = sampling_moves(chain.proposals[phase])
     futures = [executor.submit(advance, posterior, moves, end, plan.block) for end in chain.ends]
     blocks: list[Block] = []
     for future in futures:
@@ -167,17 +176,28 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     return bool((nested_rhat(second_half) < PILOT_RHAT).all())
 
 
-def _proposal(chain: Chain) -> StudentProposal | None:
-    """Fit a proposal to the pilot's second half, if one fits."""
-    steps = chain.steps("pilot")
-    kept = chain.coordinates("pilot")[steps // 2 :]
-    flat = kept.reshape(-1, kept.shape[-1])
-    density = chain.log_density("pilot")[steps // 2 :].ravel()
+def _second_half(chain: Chain, phase: Phase) -> tuple[FloatArray, FloatArray]:
+    """Return coordinates (draws, free) and log density (draws,) of the later half of a phase."""
+    first = chain.steps(phase) // 2
+    kept = chain.coordinates(phase)[first:]
+    return kept.reshape(-1, kept.shape[-1]), chain.log_density(phase)[first:].ravel()
+
+
+def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:
+    """Fit a proposal to a phase's draws, if they span the space."""
     try:
-        proposal = StudentProposal.fitted(flat)
+        return StudentMixture.fitted(_second_half(chain, phase)[0])
     except np.linalg.LinAlgError:
         return None
-    return proposal if pareto_k(density - proposal.log_density(flat)) < LARGEST_PARETO_K else None
+
+
+def _trusted(chain: Chain, proposal: StudentMixture | None) -> StudentMixture | None:
+    """Keep a proposal only if it covers the tuning's draws."""
+    if proposal is None:
+        return None
+    coordinates, log_density = _second_half(chain, "tuning")
+    shape = pareto_k(log_density - proposal.log_density(coordinates))
+    return proposal if shape < LARGEST_PARETO_K else None
 
 
 def _check(posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> Check | None:

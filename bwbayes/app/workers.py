@@ -1,0 +1,57 @@
+"""Where the ensembles run: in processes of their own, or in this one.
+
+Matrix products here are small and the ensembles already share the cores, so the linear algebra
+library is kept to one thread: more would only wait for each other, and could change the last bits.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+
+from threadpoolctl import threadpool_limits
+
+__all__ = ["executor", "one_thread"]
+
+
+@contextmanager
+def executor(workers: int | None = None) -> Iterator[Executor]:
+    """Give an executor with that many workers, by default one a core.
+
+    Several are processes; a single one is this process itself.
+    """
+    count = workers or os.cpu_count() or 1
+    pool: Executor = ThreadPoolExecutor(1)
+    if count > 1:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_settle)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Keep this process's linear algebra to one thread, as a context."""
+    limited: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
+    return limited
+
+
+def _settle() -> None:
+    """Prepare a worker process: one thread, deaf to Ctrl-C, and gone when its parent is."""
+    one_thread()
+    # The Ctrl-C that asks a run to stop in order must not kill its workers first.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

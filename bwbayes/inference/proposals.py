@@ -1,0 +1,175 @@
+"""Distributions that propose places independently of where a walker is.
+
+A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian. A
+skewed one, with a long tail along some ridge, takes a few of them: a mixture fitted by expectation
+maximisation. Heavy tails on every component keep the ratio of posterior to proposal bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import skew
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
+
+# Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
+CUTS = (0.5, 0.85)
+COMPONENTS = len(CUTS) + 1
+
+ROUNDS = 50
+
+# Part of the whole covariance that every component keeps: the draws of a pilot are few.
+SHRINKAGE = 0.1
+
+
+class Proposal(Protocol):
+    """An independence proposal, as ``emcee.moves.MHMove`` takes it."""
+
+    def log_density(self, coordinates: FloatArray) -> FloatArray:
+        """Log density (count,) at coordinates (count, free), up to a constant."""
+
+    def __call__(
+        self, coordinates: FloatArray, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propose for ``coordinates`` (walkers, free): places and log q(old) − log q(new)."""
+
+
+@dataclass(frozen=True)
+class StudentProposal:
+    """A multivariate Student-t distribution as an independence proposal.
+
+    With ν degrees of freedom, centre μ and covariance-like scale LLᵀ over p coordinates,
+
+        log q(x) = −(ν + p)/2 log(1 + |L⁻¹(x − μ)|² / ν) − log det L + constant.
+
+    Parameters
+    ----------
+    centre
+        μ, (free,).
+    factor
+        L, lower triangular, (free, free).
+    freedom
+        ν; small enough for tails heavier than the posterior's.
+    """
+
+    centre: FloatArray
+    factor: FloatArray
+    freedom: float = 5.0
+
+    @classmethod
+    def fitted(cls, draws: FloatArray) -> StudentProposal:
+        """Fit to draws (count, free) by their mean and covariance.
+
+        The scale is the covariance itself, a little wider than the t of that covariance: a
+        proposal that is too wide costs acceptance, one that is too narrow costs mixing.
+        """
+        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+        return cls(np.mean(draws, axis=0), np.linalg.cholesky(covariance))
+
+    def log_density(self, coordinates: FloatArray) -> FloatArray:
+        """Log density (count,) at coordinates (count, free), up to one constant for every fit."""
+        white = np.linalg.solve(self.factor, (coordinates - self.centre).T)
+        size = self.centre.size
+        squares = np.sum(white * white, axis=0)
+        density: FloatArray = -0.5 * (self.freedom + size) * np.log1p(squares / self.freedom)
+        return density - np.sum(np.log(np.diag(self.factor)))
+
+    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
+        """Draw coordinates (count, free) with emcee's generator."""
+        normal = random.standard_normal((count, self.centre.size))
+        spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
+        coordinates: FloatArray = self.centre + (normal * spread[:, np.newaxis]) @ self.factor.T
+        return coordinates
+
+    def __call__(
+        self, coordinates: FloatArray, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
+        proposed = self.draw(random, coordinates.shape[0])
+        return proposed, self.log_density(coordinates) - self.log_density(proposed)
+
+
+@dataclass(frozen=True)
+class StudentMixture:
+    """A mixture of Student-t distributions, log q(x) = log Σ wⱼ qⱼ(x).
+
+    Parameters
+    ----------
+    weights
+        wⱼ, (components,), adding up to one.
+    components
+        The distributions, of one number of degrees of freedom.
+    """
+
+    weights: FloatArray
+    components: tuple[StudentProposal, ...]
+
+    @classmethod
+    def fitted(cls, draws: FloatArray) -> StudentMixture:
+        """Fit to draws (count, free), by expectation maximisation of a Gaussian mixture.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            The draws do not span the space.
+        """
+        whole = np.atleast_2d(np.cov(draws, rowvar=False))
+        np.linalg.cholesky(whole)
+        shape = skew(draws, axis=0)
+        most = int(np.argmax(np.abs(shape)))
+        # Ranks from the body of the distribution to its longer tail.
+        along = draws[:, most] * (1 if shape[most] >= 0 else -1)
+        start = np.searchsorted(np.quantile(along, CUTS), along)
+        share = np.eye(COMPONENTS)[start]
+        for _ in range(ROUNDS):
+            mixture = cls(share.mean(axis=0), tuple(_components(draws, share, whole)))
+            parts = [_gaussian(component, draws) for component in mixture.components]
+            logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
+            share = np.exp(logs - logsumexp(logs, axis=0)).T
+            # A component that starves is kept alive; its weight says how little it matters.
+            share = (share + 1e-3) / (1 + 1e-3 * share.shape[1])
+        return mixture
+
+    def log_density(self, coordinates: FloatArray) -> FloatArray:
+        """Log density (count,) at coordinates (count, free), up to a constant."""
+        parts = [component.log_density(coordinates) for component in self.components]
+        logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
+        return np.asarray(logsumexp(logs, axis=0))
+
+    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
+        """Draw coordinates (count, free) with emcee's generator."""
+        chosen = random.choice(len(self.components), size=count, p=self.weights)
+        drawn = np.stack([component.draw(random, count) for component in self.components])
+        picked: FloatArray = drawn[chosen, np.arange(count)]
+        return picked
+
+    def __call__(
+        self, coordinates: FloatArray, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
+        proposed = self.draw(random, coordinates.shape[0])
+        return proposed, self.log_density(coordinates) - self.log_density(proposed)
+
+
+def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list[StudentProposal]:
+    """Weighted means and covariances, one component for each column of ``share``."""
+    found = []
+    for part in (share / share.sum(axis=0)).T:
+        centre = part @ draws
+        away = draws - centre
+        covariance = (1 - SHRINKAGE) * (part[:, np.newaxis] * away).T @ away + SHRINKAGE * whole
+        found.append(StudentProposal(centre, np.linalg.cholesky(covariance)))
+    return found
+
+
+def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:
+    """Log density of the normal distribution with a component's centre and scale."""
+    white = np.linalg.solve(component.factor, (draws - component.centre).T)
+    density: FloatArray = -0.5 * np.sum(white * white, axis=0)
+    return density - np.sum(np.log(np.diag(component.factor)))
