@@ -1,1 +1,135 @@
-"""Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model."""
+"""Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
+
+A record of voltage and displacement becomes a posterior of the actuator's parameters, and the
+posterior becomes bands in which the displacement will be, for any voltage. A :class:`Problem`
+holds record, model and priors; :func:`sample` draws until its chain has converged, and only then
+is there anything to predict. The forward model alone is there too, for a batch of parameters::
+
+    import numpy as np
+    import bwbayes
+
+    voltage = 100 * np.sin(2 * np.pi * np.arange(0, 2, 1e-3))  # V
+    h = bwbayes.hysteresis(voltage, alpha=[0.30, 0.36], beta=0.027, gamma=0.017)  # (2, 2000), um
+
+The names here are what a Python user needs; each is loaded when it is first used, so that
+``import bwbayes`` costs nothing. ``notebooks/quickstart.ipynb`` shows them at work, and the
+modules they come from hold the rest.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+__all__ = [
+    "Actuator",
+    "Bands",
+    "Chain",
+    "Config",
+    "Distribution",
+    "InputError",
+    "InputWarning",
+    "JointPrior",
+    "Outcome",
+    "Parameter",
+    "PointFit",
+    "Posterior",
+    "Problem",
+    "Record",
+    "SamplingPlan",
+    "Scores",
+    "Start",
+    "VirtualTestStand",
+    "Waveform",
+    "draws",
+    "first_chain",
+    "hysteresis",
+    "load_config",
+    "noise_model",
+    "parse_config",
+    "point_fit",
+    "predict_record",
+    "predict_windows",
+    "read_record",
+    "resolve",
+    "sample",
+    "score",
+    "signal",
+    "thinned",
+    "write_record",
+]
+
+if TYPE_CHECKING:
+    from bwbayes.app.config import Config
+    from bwbayes.app.config import load as load_config
+    from bwbayes.app.config import parse as parse_config
+    from bwbayes.app.problem import Problem, resolve
+    from bwbayes.data.files import read_record, write_record
+    from bwbayes.data.record import Record
+    from bwbayes.data.teststand import VirtualTestStand
+    from bwbayes.data.waveforms import Waveform, signal
+    from bwbayes.errors import InputError, InputWarning
+    from bwbayes.inference.chain import Chain
+    from bwbayes.inference.distributions import Distribution
+    from bwbayes.inference.noise import noise_model
+    from bwbayes.inference.parameters import JointPrior, Parameter
+    from bwbayes.inference.pointfit import PointFit
+    from bwbayes.inference.pointfit import fit as point_fit
+    from bwbayes.inference.posterior import Posterior
+    from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
+    from bwbayes.model.actuator import Actuator
+    from bwbayes.model.boucwen import hysteresis
+    from bwbayes.results.bands import Bands
+    from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+    from bwbayes.results.scores import Scores, score
+else:
+    # The module of each name, and what it is called there if not the same.
+    HOMES = {
+        "Actuator": "model.actuator",
+        "Bands": "results.bands",
+        "Chain": "inference.chain",
+        "Config": "app.config",
+        "Distribution": "inference.distributions",
+        "InputError": "errors",
+        "InputWarning": "errors",
+        "JointPrior": "inference.parameters",
+        "Outcome": "inference.sampling",
+        "Parameter": "inference.parameters",
+        "PointFit": "inference.pointfit",
+        "Posterior": "inference.posterior",
+        "Problem": "app.problem",
+        "Record": "data.record",
+        "SamplingPlan": "inference.sampling",
+        "Scores": "results.scores",
+        "Start": "results.prediction",
+        "VirtualTestStand": "data.teststand",
+        "Waveform": "data.waveforms",
+        "draws": "inference.sampling",
+        "first_chain": "inference.sampling",
+        "hysteresis": "model.boucwen",
+        "load_config": "app.config:load",
+        "noise_model": "inference.noise",
+        "parse_config": "app.config:parse",
+        "point_fit": "inference.pointfit:fit",
+        "predict_record": "results.prediction",
+        "predict_windows": "results.prediction",
+        "read_record": "data.files",
+        "resolve": "app.problem",
+        "sample": "inference.sampling",
+        "score": "results.scores",
+        "signal": "data.waveforms",
+        "thinned": "results.prediction",
+        "write_record": "data.files",
+    }
+
+    def __getattr__(name: str) -> object:
+        """Load a public name from the module that it lives in."""
+        if name not in HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, original = HOMES[name].partition(":")
+        return getattr(import_module(f"{__name__}.{module}"), original or name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted({*globals(), *__all__})

@@ -3,8 +3,8 @@
 With Y half the range of the displacement, U half the range of the voltage and Δ the sampling
 interval, every scale of the model is known to within a factor of a few: d is near Y/U, α a part of
 it, β near 1/U, a lag some samples, and what the model leaves over about a hundredth of the range,
-correlated over some hundreds of samples. These priors never come from a fit, so the data are not used
-twice; they are resolved once to explicit numbers, which a run prints and stores.
+correlated over some hundreds of samples. These priors never come from a fit, so the data are not
+used twice; they are resolved once to explicit numbers, which a run prints and stores.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from scipy.special import ndtr, ndtri
+from scipy.special import erfcinv, erfinv, ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -82,6 +82,8 @@ class Distribution:
 
         The inverse of :meth:`to_normal`; where the bounds leave nothing, x is the lower one.
         """
+        if self._is_support(lower, upper):
+            return self._uncut(z), np.ones_like(z)
         whole = np.maximum(self._between(lower, upper), 0.0)
         below = self._cdf(lower) + ndtr(z) * whole
         above = self._sf(upper) + ndtr(-z) * whole
@@ -95,8 +97,22 @@ class Distribution:
         rising, falling = self._cdf(high) - start, self._sf(low) - self._sf(high)
         return np.where(start < 0.5, rising, falling)
 
-    # Normal and lognormal distributions, the default priors, skip the frozen distribution: its
-    # checks of arguments cost more than a short record's likelihood.
+    # The distributions of default priors skip the frozen distribution where they can: its checks of
+    # arguments cost more than a short record's likelihood.
+
+    def _is_support(self, lower: FloatArray, upper: FloatArray) -> bool:
+        """Tell whether the bounds cut nothing."""
+        alike = np.ndim(lower) == np.ndim(upper) == 0
+        return alike and self.support == (float(lower), float(upper))
+
+    def _uncut(self, z: FloatArray) -> FloatArray:
+        """Return the values of normal scores, without bounds."""
+        if self._mapped:
+            return self._value(z)
+        if self.name == "halfnormal":
+            near = np.where(z < 0, erfinv(ndtr(z)), erfcinv(ndtr(-z)))
+            return np.asarray(np.sqrt(2) * self.arguments["scale"] * near)
+        return np.where(z < 0, self._ppf(ndtr(z)), self._isf(ndtr(-z)))
 
     def _score(self, x: FloatArray) -> FloatArray:
         """Map x to a standard normal, for the two distributions that a formula maps."""
@@ -126,6 +142,12 @@ class Distribution:
     @property
     def _mapped(self) -> bool:
         return self.name in ("normal", "lognormal")
+
+    @cached_property
+    def support(self) -> tuple[float, float]:
+        """The least and the largest value."""
+        low, high = self.frozen.support()
+        return float(low), float(high)
 
     @cached_property
     def frozen(self) -> Any:

@@ -86,7 +86,7 @@ def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
     assert parameter.prior is not None
     if parameter.name == "gamma":
         # What |γ| ≤ β leaves to a parameter of which nothing else is known.
-        return values["beta"] / np.sqrt(3)
+        return values["beta"] / float(np.sqrt(3))
     # Half of the central 68 % stands for the sd: some distributions have none.
     low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
     if parameter.name in POSITIVE:

@@ -87,9 +87,9 @@ class Parameter:
     def support(self) -> tuple[float, float]:
         """Where prior, bounds and sign allow the parameter."""
         assert self.prior is not None
-        low, high = self.prior.frozen.support()
+        low, high = self.prior.support
         floor = 0.0 if self.name in POSITIVE else 1.0 if self.name == "exponent" else -np.inf
-        return max(float(low), self.lower, floor), min(float(high), self.upper)
+        return max(low, self.lower, floor), min(high, self.upper)
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:

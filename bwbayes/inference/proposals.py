@@ -27,6 +27,9 @@ ROUNDS = 50
 # Part of the whole covariance that every component keeps: the draws of a pilot are few.
 SHRINKAGE = 0.1
 
+# Share of every draw that every component keeps, so that none starves.
+LEAST_SHARE = 1e-3
+
 
 class Proposal(Protocol):
     """An independence proposal, as ``emcee.moves.MHMove`` takes it."""
@@ -68,17 +71,22 @@ class StudentProposal:
 
         The scale is the covariance itself, a little wider than the t of that covariance: a
         proposal that is too wide costs acceptance, one that is too narrow costs mixing.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            The draws do not span the space.
         """
-        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
-        return cls(np.mean(draws, axis=0), np.linalg.cholesky(covariance))
+        return cls(np.mean(draws, axis=0), np.linalg.cholesky(_covariance(draws)))
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (count,) at coordinates (count, free), up to one constant for every fit."""
         white = np.linalg.solve(self.factor, (coordinates - self.centre).T)
         size = self.centre.size
         squares = np.sum(white * white, axis=0)
-        density: FloatArray = -0.5 * (self.freedom + size) * np.log1p(squares / self.freedom)
-        return density - np.sum(np.log(np.diag(self.factor)))
+        tails = 0.5 * (self.freedom + size) * np.log1p(squares / self.freedom)
+        density: FloatArray = -tails - np.sum(np.log(np.diag(self.factor)))
+        return density
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
@@ -119,21 +127,18 @@ class StudentMixture:
         numpy.linalg.LinAlgError
             The draws do not span the space.
         """
-        whole = np.atleast_2d(np.cov(draws, rowvar=False))
-        np.linalg.cholesky(whole)
-        shape = skew(draws, axis=0)
+        whole = _covariance(draws)
+        shape = np.asarray(skew(draws, axis=0))
         most = int(np.argmax(np.abs(shape)))
         # Ranks from the body of the distribution to its longer tail.
         along = draws[:, most] * (1 if shape[most] >= 0 else -1)
         start = np.searchsorted(np.quantile(along, CUTS), along)
-        share = np.eye(COMPONENTS)[start]
+        share = _kept_alive(np.eye(COMPONENTS)[start])
         for _ in range(ROUNDS):
             mixture = cls(share.mean(axis=0), tuple(_components(draws, share, whole)))
             parts = [_gaussian(component, draws) for component in mixture.components]
             logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
-            share = np.exp(logs - logsumexp(logs, axis=0)).T
-            # A component that starves is kept alive; its weight says how little it matters.
-            share = (share + 1e-3) / (1 + 1e-3 * share.shape[1])
+            share = _kept_alive(np.exp(logs - logsumexp(logs, axis=0)).T)
         return mixture
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
@@ -157,6 +162,21 @@ class StudentMixture:
         return proposed, self.log_density(coordinates) - self.log_density(proposed)
 
 
+def _covariance(draws: FloatArray) -> FloatArray:
+    """Covariance (free, free) of draws (count, free) that span the space."""
+    # Rounding leaves some variance to draws that lie in a plane, or do not differ at all.
+    plane = np.column_stack([np.ones(len(draws)), draws])
+    if np.linalg.matrix_rank(plane) < plane.shape[1]:
+        raise np.linalg.LinAlgError("the draws do not span the space")
+    covariance: FloatArray = np.atleast_2d(np.cov(draws, rowvar=False))
+    return covariance
+
+
+def _kept_alive(share: FloatArray) -> FloatArray:
+    """Give every component something of each draw; its weight says how little it matters."""
+    return (share + LEAST_SHARE) / (1 + LEAST_SHARE * share.shape[1])
+
+
 def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list[StudentProposal]:
     """Weighted means and covariances, one component for each column of ``share``."""
     found = []
@@ -171,5 +191,6 @@ def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list
 def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:
     """Log density of the normal distribution with a component's centre and scale."""
     white = np.linalg.solve(component.factor, (draws - component.centre).T)
-    density: FloatArray = -0.5 * np.sum(white * white, axis=0)
-    return density - np.sum(np.log(np.diag(component.factor)))
+    squares = np.sum(white * white, axis=0)
+    density: FloatArray = -0.5 * squares - np.sum(np.log(np.diag(component.factor)))
+    return density

@@ -18,7 +18,7 @@ from bwbayes.inference.diagnostics import (
     pareto_k,
 )
 from bwbayes.inference.ensemble import advance, start
-from bwbayes.inference.moves import StudentProposal
+from bwbayes.inference.proposals import StudentProposal
 from tests.inference.problems import gaussian
 
 STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 16, 2

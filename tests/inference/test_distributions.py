@@ -44,7 +44,7 @@ NORMAL = Distribution("normal", {"mean": 1.0, "sd": 2.0})
 INFINITE = np.array(-np.inf), np.array(np.inf)
 
 
-@pytest.mark.parametrize(("distribution", "scipys"), FAMILIAR, ids=str)
+@pytest.mark.parametrize(("distribution", "scipys"), FAMILIAR, ids=[str(d) for d, _ in FAMILIAR])
 def test_names_and_arguments_mean_scipys_distribution(
     distribution: Distribution, scipys: Any
 ) -> None:

@@ -16,7 +16,8 @@ from bwbayes.inference.ensemble import (
     autocorrelation_time,
     start,
 )
-from bwbayes.inference.moves import StudentProposal, pilot_moves, sampling_moves
+from bwbayes.inference.moves import pilot_moves, sampling_moves
+from bwbayes.inference.proposals import StudentProposal
 from tests.inference.problems import gaussian, target
 
 FREE, WALKERS = 3, 12
