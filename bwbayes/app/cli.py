@@ -57,7 +57,8 @@ def run(
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     from bwbayes.app.config import load  # noqa: PLC0415  # --help need not wait for scipy
-    from bwbayes.app.run import start  # noqa: PLC0415
+    from bwbayes.app.run import load_run, start  # noqa: PLC0415
+    from bwbayes.app.screen import show_priors  # noqa: PLC0415
 
     wanted = load(config)
     if record is not None:
@@ -68,6 +69,8 @@ def run(
     if wanted.name is None:
         wanted = wanted.model_copy(update={"name": config.stem})
     folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+    if not quiet:
+        show_priors(load_run(folder).parameters, Console())
     return _finish(folder.path, workers, quiet)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -17,7 +17,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 
-__all__ = ["show_check", "show_result", "show_scores"]
+__all__ = ["show_check", "show_priors", "show_result", "show_scores"]
 
 
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
@@ -79,17 +79,7 @@ def show_check(config: Config, folder: Path, console: Console) -> None:
     )
     point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
     free, _ = posterior.prior.constrain(point.mode[None])
-    mode = dict(zip(posterior.names, free[0], strict=True))
-    table = Table("parameter", "prior", "point fit", "unit")
-    for parameter in problem.parameters:
-        fitted = mode.get(parameter.name)
-        table.add_row(
-            parameter.name,
-            _known_before(parameter),
-            "" if fitted is None else f"{fitted:.5g}",
-            parameter.unit,
-        )
-    console.print(table)
+    show_priors(problem.parameters, console, dict(zip(posterior.names, free[0], strict=True)))
     left_open = identifiability.undetermined(posterior, point)
     for remark in problem.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
@@ -101,5 +91,15 @@ def show_check(config: Config, folder: Path, console: Console) -> None:
         )
 
 
-def _known_before(parameter: Parameter) -> str:
-    return str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"
+def show_priors(
+    parameters: Sequence[Parameter], console: Console, fitted: Mapping[str, float] | None = None
+) -> None:
+    """Show every prior and fixed value as numbers, with the point fit if there is one."""
+    table = Table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
+    for parameter in parameters:
+        known = str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"
+        row = [parameter.name, known]
+        if fitted:
+            row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
+        table.add_row(*row, parameter.unit)
+    console.print(table)

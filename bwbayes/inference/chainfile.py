@@ -84,7 +84,7 @@ class ChainFile(Chain):
             The file is missing, not a chain, or damaged before the last block that counts.
         """
         try:
-            with h5py.File(path, "r", libver="latest", swmr=True) as file:
+            with _reading(path) as file:
                 return cls._load(path, file)
         except (OSError, KeyError, ValueError, RuntimeError) as error:
             why = "does not exist" if not path.exists() else f"cannot be read ({error})"
@@ -109,7 +109,7 @@ class ChainFile(Chain):
 
     def attributes(self) -> dict[str, str | int]:
         """Return what was run: config, versions, platform, seed, hash of the data."""
-        with h5py.File(self.path, "r", libver="latest", swmr=True) as file:
+        with _reading(self.path) as file:
             return {
                 name: value if isinstance(value, str) else int(value)
                 for name, value in file.attrs.items()
@@ -153,7 +153,6 @@ class ChainFile(Chain):
         self.close()
 
     def _open(self) -> None:
-        # Readers need no lock, and the writer's is its folder's.
         self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
         self._file.swmr_mode = True
 
@@ -182,6 +181,15 @@ class ChainFile(Chain):
             for number in range(committed[place]):
                 Chain.append(loaded, phase, _blocks(file[phase], number, block))
         return loaded
+
+
+def _reading(path: Path) -> Any:
+    """Open a file to read it, also while it is written.
+
+    HDF5's own locks stay off here as in the writer: readers need none, the writer's is its
+    folder's, and a process may not open a file with and without them.
+    """
+    return h5py.File(path, "r", libver="latest", swmr=True, locking=False)
 
 
 _POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import POSITIVE, Parameter
 from bwbayes.inference.pointfit import PointFit
@@ -27,8 +27,8 @@ LOOP = ("d", "alpha", "beta", "gamma", "exponent")
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
 
-# Stretches whose ends agree within this part of the voltage's range are the same.
-SAME_STRETCH = 0.01
+# Stretches that start within this part of the voltage's range, and go the same way, are the same.
+SAME_START = 0.01
 
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 0.3
@@ -101,7 +101,7 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     sds = posterior.noise.marginal_sd(theta[:, len(posterior.actuator.parameters) :])
     floor = DISCREPANCY * float(np.ptp(posterior.displacement[rows]))
-    weights, duration = _stretches(posterior.voltage)
+    weights, duration = _stretches(posterior.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sds[1][0], floor, duration / 2]])
@@ -112,15 +112,21 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     return total
 
 
-def _stretches(voltage: FloatArray) -> tuple[FloatArray, float]:
-    """Weight of each sample, one over how often its stretch occurs; mean samples a stretch."""
+def _stretches(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
+    """Weight of each sample, one over how often ``rows`` have its stretch; mean samples a stretch.
+
+    A stretch that ends early, as a record's last one, counts as a part.
+    """
     stretches = list(monotone_stretches(voltage))
-    ends = np.array([[voltage[s.first], voltage[s.last]] for s in stretches])
-    grid = np.round((ends - voltage.min()) / (SAME_STRETCH * max(np.ptp(voltage), 1e-300)))
-    _, kind, count = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
-    weights = np.empty(voltage.size)
-    for stretch, times in zip(stretches, count[kind], strict=True):
-        weights[stretch.first : stretch.last + 1] = 1 / times
+    starts = np.array([[voltage[s.first], s.direction] for s in stretches])
+    starts[:, 0] = np.round((starts[:, 0] - voltage.min()) / (SAME_START * np.ptp(voltage) or 1))
+    _, kind = np.unique(starts, axis=0, return_inverse=True)
+    used = np.bincount(rows, minlength=voltage.size)
+    samples = np.array([np.sum(used[s.first + 1 : s.last + 1]) for s in stretches])
+    weights = np.ones(voltage.size)
+    for stretch, alike in zip(stretches, kind[:, np.newaxis] == kind, strict=True):
+        longest = max(np.max(samples[alike]), 1)
+        weights[stretch.first : stretch.last + 1] = longest / max(np.sum(samples[alike]), longest)
     return weights, voltage.size / len(stretches)
 
 

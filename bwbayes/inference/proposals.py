@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.special import logsumexp
 from scipy.stats import skew
 
 from bwbayes.arrays import FloatArray
@@ -138,14 +137,15 @@ class StudentMixture:
             mixture = cls(share.mean(axis=0), tuple(_components(draws, share, whole)))
             parts = [_gaussian(component, draws) for component in mixture.components]
             logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
-            share = _kept_alive(np.exp(logs - logsumexp(logs, axis=0)).T)
+            share = _kept_alive(np.exp(logs - np.logaddexp.reduce(logs)).T)
         return mixture
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (count,) at coordinates (count, free), up to a constant."""
         parts = [component.log_density(coordinates) for component in self.components]
         logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
-        return np.asarray(logsumexp(logs, axis=0))
+        density: FloatArray = np.logaddexp.reduce(logs)
+        return density
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
@@ -174,7 +174,8 @@ def _covariance(draws: FloatArray) -> FloatArray:
 
 def _kept_alive(share: FloatArray) -> FloatArray:
     """Give every component something of each draw; its weight says how little it matters."""
-    return (share + LEAST_SHARE) / (1 + LEAST_SHARE * share.shape[1])
+    kept: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * share.shape[1])
+    return kept
 
 
 def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list[StudentProposal]:

@@ -1,6 +1,6 @@
 """The snooker move leaves a distribution as it is, and the phases use the moves they promise.
 
-How sure :func:`~tests.inference.problems.worst_score` is, and how rarely it is wrong, is told there.
+How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong, is told there.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -18,6 +19,7 @@ from bwbayes.inference.chain import PHASES, Chain, Phase
 from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.proposals import StudentMixture
 from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
 from tests.inference.problems import gaussian, short_posterior, target
 
@@ -31,6 +33,10 @@ PLAN = SamplingPlan(
 )
 POSTERIOR, POINT = gaussian(3)
 
+# Calls of the executor, four a block: in the first block of the pilot, later there and at its end,
+# in the tuning and at its end, and in the sampling.
+INTERRUPTIONS = (0, 9, 20, 26, 36, 42)
+
 
 def new_chain(plan: SamplingPlan = PLAN, seed: int = 1) -> Chain:
     return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(seed))
@@ -42,9 +48,43 @@ def run(plan: SamplingPlan = PLAN, seed: int = 1, workers: int = 1) -> tuple[Cha
         return chain, sample(POSTERIOR, plan, chain, executor)
 
 
+class Watched:
+    """What a watcher hears."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Phase] = []
+        self.checks: list[Check] = []
+
+    def __call__(self, phase: Phase, found: Check | None) -> None:
+        """Hear of a block, or of a check."""
+        if found is None:
+            self.blocks.append(phase)
+        else:
+            assert "sampling" == phase
+            self.checks.append(found)
+
+
 @pytest.fixture(scope="module")
-def finished() -> tuple[Chain, Outcome]:
-    return run()
+def watched() -> Watched:
+    return Watched()
+
+
+@pytest.fixture(scope="module")
+def finished(watched: Watched) -> tuple[Chain, Outcome]:
+    chain = new_chain()
+    with ThreadPoolExecutor(1) as executor:
+        return chain, sample(POSTERIOR, PLAN, chain, executor, watched)
+
+
+def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None) -> None:
+    if one is None or two is None:
+        assert one is two
+        return
+    np.testing.assert_array_equal(one.weights, two.weights)
+    for mine, yours in zip(one.components, two.components, strict=True):
+        assert mine.freedom == yours.freedom
+        np.testing.assert_array_equal(mine.centre, yours.centre)
+        np.testing.assert_array_equal(mine.factor, yours.factor)
 
 
 def assert_same_chain(one: Chain, two: Chain) -> None:
@@ -54,11 +94,7 @@ def assert_same_chain(one: Chain, two: Chain) -> None:
             np.testing.assert_array_equal(getattr(one, name)(phase), getattr(two, name)(phase))
     for mine, yours in zip(one.ends, two.ends, strict=True):
         np.testing.assert_array_equal(mine.random_state, yours.random_state)
-    if one.proposal is None or two.proposal is None:
-        assert one.proposal is two.proposal
-    else:
-        np.testing.assert_array_equal(one.proposal.centre, two.proposal.centre)
-        np.testing.assert_array_equal(one.proposal.factor, two.proposal.factor)
+        assert_same_proposal(one.proposals[phase], two.proposals[phase])
 
 
 def assert_same_outcome(one: Outcome, two: Outcome) -> None:
@@ -73,7 +109,22 @@ def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
     assert "converged on two checks in a row" == outcome.stop_reason
     assert [] == outcome.check.shortcomings(PLAN.ess)
     assert chain.steps("sampling") == outcome.check.steps
-    assert chain.proposal is not None
+    assert chain.proposals["sampling"] is not None
+
+
+@pytest.mark.parametrize(("phase", "before"), [("tuning", "pilot"), ("sampling", "tuning")])
+def test_a_proposal_is_fitted_to_the_later_half_of_the_phase_before(
+    finished: tuple[Chain, Outcome], phase: Phase, before: Phase
+) -> None:
+    """And stays frozen: it is a function of draws that do not count."""
+    chain, _ = finished
+    assert chain.proposals["pilot"] is None
+    half = chain.coordinates(before)[chain.steps(before) // 2 :]
+    assert_same_proposal(StudentMixture.fitted(half.reshape(-1, 3)), chain.proposals[phase])
+
+
+def test_the_tuning_has_its_length(finished: tuple[Chain, Outcome]) -> None:
+    assert 4 == finished[0].blocks("tuning")
 
 
 def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
@@ -85,33 +136,19 @@ def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
     assert (np.abs(np.var(found, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
 
 
-def test_it_stops_at_the_first_two_checks_that_find_nothing_missing() -> None:
-    checks: list[Check] = []
-
-    def watcher(phase: Phase, found: Check | None) -> None:
-        if found is not None:
-            assert "sampling" == phase
-            checks.append(found)
-
-    with ThreadPoolExecutor(1) as executor:
-        sample(POSTERIOR, PLAN, new_chain(), executor, watcher)
-    passed = [not found.shortcomings(PLAN.ess) for found in checks]
+@pytest.mark.usefixtures("finished")
+def test_it_stops_at_the_first_two_checks_that_find_nothing_missing(watched: Watched) -> None:
+    passed = [not found.shortcomings(PLAN.ess) for found in watched.checks]
     assert passed[-2:] == [True, True]
     assert not any(one and two for one, two in itertools.pairwise(passed[:-1]))
 
 
-def test_the_watcher_hears_of_every_block_of_every_ensemble() -> None:
-    heard: list[Phase] = []
-
-    def watcher(phase: Phase, found: Check | None) -> None:
-        if found is None:
-            heard.append(phase)
-
-    chain = new_chain()
-    with ThreadPoolExecutor(1) as executor:
-        sample(POSTERIOR, PLAN, chain, executor, watcher)
-    for phase in PHASES:
-        assert chain.blocks(phase) * PLAN.ensembles == heard.count(phase)
+def test_the_watcher_hears_of_every_block_of_every_ensemble(
+    finished: tuple[Chain, Outcome], watched: Watched
+) -> None:
+    chain, _ = finished
+    expected = [phase for phase in PHASES for _ in range(chain.blocks(phase) * PLAN.ensembles)]
+    assert expected == watched.blocks
 
 
 def test_two_threads_give_the_same_bits(finished: tuple[Chain, Outcome]) -> None:
@@ -142,8 +179,10 @@ def test_a_used_up_budget_is_told_with_what_is_missing() -> None:
     assert 60 == chain.steps("sampling")
 
 
-def test_a_budget_that_ends_with_the_first_good_check_is_told() -> None:
-    steps = run()[1].check.steps
+def test_a_budget_that_ends_with_the_first_good_check_is_told(
+    finished: tuple[Chain, Outcome],
+) -> None:
+    steps = finished[1].check.steps
     _, outcome = run(replace(PLAN, most_steps=steps - PLAN.block))
     assert not outcome.converged
     assert outcome.stop_reason.endswith("only the last check passed")
@@ -188,19 +227,49 @@ class PluggedExecutor(Executor):
         return future
 
 
-# Four calls a block: in the first block of the pilot, later there, at its end, and in the sampling.
-@pytest.mark.parametrize("calls", [0, 3, 9, 20, 23, 26])
+@pytest.mark.parametrize("calls", INTERRUPTIONS)
 def test_an_interrupted_chain_goes_on_to_the_same_end(
     finished: tuple[Chain, Outcome], calls: int
 ) -> None:
     chain = new_chain()
     with pytest.raises(InterruptedRunError):
         sample(POSTERIOR, PLAN, chain, PluggedExecutor(calls))
-    assert calls // PLAN.ensembles == chain.blocks("pilot") + chain.blocks("sampling")
+    assert calls // PLAN.ensembles == sum(chain.blocks(phase) for phase in PHASES)
     with ThreadPoolExecutor(2) as executor:
         outcome = sample(POSTERIOR, PLAN, chain, executor)
     assert_same_chain(finished[0], chain)
     assert_same_outcome(finished[1], outcome)
+
+
+def test_the_interruptions_meet_every_phase(finished: tuple[Chain, Outcome]) -> None:
+    chain, _ = finished
+    ends = PLAN.ensembles * np.cumsum([chain.blocks(phase) for phase in PHASES])
+    inside = np.searchsorted(ends, INTERRUPTIONS, side="right")
+    assert {0, 1, 2} == set(inside.tolist())
+    assert {*ends[:2].tolist()} <= set(INTERRUPTIONS)
+
+
+def test_a_proposal_that_does_not_cover_the_tuning_is_not_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing covers it when no Pareto k is small enough; differential evolution goes on alone."""
+    monkeypatch.setattr("bwbayes.inference.sampling.LARGEST_PARETO_K", -np.inf)
+    chain, outcome = run(replace(PLAN, most_steps=20))
+    assert chain.proposals["tuning"] is not None
+    assert chain.proposals["sampling"] is None
+    assert 20 == outcome.check.steps
+
+
+def test_without_any_proposal_differential_evolution_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flat(draws: FloatArray) -> StudentMixture:
+        raise np.linalg.LinAlgError(f"{len(draws)} draws in a plane")
+
+    monkeypatch.setattr(StudentMixture, "fitted", flat)
+    chain, outcome = run(replace(PLAN, most_steps=20))
+    assert dict.fromkeys(PHASES) == chain.proposals
+    assert 20 == outcome.check.steps
 
 
 def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
@@ -215,7 +284,7 @@ def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
 
 
 def test_a_finished_chain_is_left_as_it_is(finished: tuple[Chain, Outcome]) -> None:
-    chain, _ = run()
+    chain = copy.deepcopy(finished[0])
     again = sample(POSTERIOR, PLAN, chain, PluggedExecutor(0))
     assert_same_chain(finished[0], chain)
     assert_same_outcome(finished[1], again)
