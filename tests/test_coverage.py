@@ -27,7 +27,7 @@ from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
 from bwbayes.inference.sampling import draws, first_chain, sample
-from bwbayes.results.bands import LEVELS, Bands
+from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.result import Result
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"
@@ -74,7 +74,9 @@ def errors_off(covered: FloatArray, level: int) -> float:
     return float((np.mean(covered) - level / 100) / (np.std(covered, ddof=1) / covered.size**0.5))
 
 
-def parameters_covered(replicates: list[Replicate], level: int, narrowed: float = 1.0) -> FloatArray:
+def parameters_covered(
+    replicates: list[Replicate], level: int, narrowed: float = 1.0
+) -> FloatArray:
     """Part of the parameters (seeds,) whose central interval covers the truth.
 
     A narrowed interval keeps that part of the probability on either side of the median.
@@ -83,14 +85,16 @@ def parameters_covered(replicates: list[Replicate], level: int, narrowed: float 
     return np.array([np.mean(one) for one in inside])
 
 
-def bands_cover(replicates: list[Replicate], kind: str, level: int, width: float = 1.0) -> FloatArray:
+def bands_cover(
+    replicates: list[Replicate], kind: Kind, level: int, width: float = 1.0
+) -> FloatArray:
     """Part of the judged samples (seeds,) that lie inside the verification's bands."""
     parts = []
     for bands in (r.bands for r in replicates):
         target = bands.measured if kind == "sensor" else bands.truth
         assert target is not None
-        middle = (bands.upper[kind, level] + bands.lower[kind, level]) / 2  # type: ignore[index]
-        half = (bands.upper[kind, level] - bands.lower[kind, level]) / 2  # type: ignore[index]
+        middle = (bands.upper[kind, level] + bands.lower[kind, level]) / 2
+        half = (bands.upper[kind, level] - bands.lower[kind, level]) / 2
         inside = np.abs(target - middle) <= width * half
         parts.append(np.mean(inside[bands.scored_from :]))
     return np.array(parts)
@@ -102,7 +106,7 @@ def test_parameter_intervals_cover_the_truth(replicates: list[Replicate]) -> Non
 
 
 @pytest.mark.parametrize("kind", ["sensor", "displacement"])
-def test_bands_cover_the_verification_signal(replicates: list[Replicate], kind: str) -> None:
+def test_bands_cover_the_verification_signal(replicates: list[Replicate], kind: Kind) -> None:
     off = {level: errors_off(bands_cover(replicates, kind, level), level) for level in LEVELS}
     assert all(abs(value) < LIMIT for value in off.values()), off
 
@@ -116,7 +120,7 @@ def test_twin_intervals_that_are_too_narrow_are_found(replicates: list[Replicate
 
 
 @pytest.mark.parametrize("kind", ["sensor", "displacement"])
-def test_twin_bands_that_are_too_narrow_are_found(replicates: list[Replicate], kind: str) -> None:
+def test_twin_bands_that_are_too_narrow_are_found(replicates: list[Replicate], kind: Kind) -> None:
     off = {
         level: errors_off(bands_cover(replicates, kind, level, width=0.4), level)
         for level in LEVELS

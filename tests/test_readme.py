@@ -63,7 +63,9 @@ def test_the_first_command_converges_with_the_effective_draws_it_was_asked_for(
 
 def test_the_quoted_parameters_are_those_of_the_run(summary: Any) -> None:
     """Within a tenth of an sd: what is quoted is rounded, and other machines round differently."""
-    rows = [line.split("|")[1:-1] for line in block("numbers: ring_bender").strip().splitlines()[2:]]
+    rows = [
+        line.split("|")[1:-1] for line in block("numbers: ring_bender").strip().splitlines()[2:]
+    ]
     quoted = {row[0].strip(): [float(cell) for cell in row[2:]] for row in rows}
     assert set(summary["parameters"]) == set(quoted)
     for name, (truth, mean, sd) in quoted.items():

@@ -245,6 +245,11 @@ def main() -> None:
         message = error.format_message() if isinstance(error, click.ClickException) else str(error)
         click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
         status = BAD_INPUT
+    except OSError as error:
+        # A full disk, a folder that went away: what is on disk already stays whole.
+        where = f"{error.filename}: " if error.filename else ""
+        click.echo(f"bwbayes: {where}{error.strerror or error}; mend it and resume", err=True)
+        status = BAD_INPUT
     except (KeyboardInterrupt, click.Abort):
         click.echo("bwbayes: interrupted", err=True)
         status = INTERRUPTED

@@ -8,6 +8,7 @@ one back, with every default made explicit.
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,12 +20,14 @@ from pydantic import (
     Field,
     StringConstraints,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
 from bwbayes.errors import InputError
 
 __all__ = [
+    "LARGEST_SEED",
     "Config",
     "ModelConfig",
     "ParameterConfig",
@@ -35,6 +38,9 @@ __all__ = [
     "load",
     "parse",
 ]
+
+# What files hold as a whole number.
+LARGEST_SEED = 2**63 - 1
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
@@ -99,7 +105,7 @@ class ModelConfig(_Table):
 class ParameterConfig(_Table):
     """A parameter's prior or fixed value, bounds, and names for people."""
 
-    prior: dict[str, str | float] | None = None
+    prior: dict[str, float | str] | None = None
     fixed: float | None = None
     lower: float | None = None
     upper: float | None = None
@@ -146,7 +152,7 @@ class Config(_Table):
     """A whole run. ``truth`` holds the true parameters of a simulated record, to be shown."""
 
     name: Annotated[str, Field(min_length=1)] | None = None
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 1
     record: RecordConfig
     stand: StandConfig = StandConfig()
     model: ModelConfig = ModelConfig()
@@ -154,6 +160,14 @@ class Config(_Table):
     sampling: SamplingConfig = SamplingConfig()
     validation: dict[Name, ValidationConfig] = Field(default_factory=dict)
     truth: dict[str, float] = Field(default_factory=dict)
+
+    @field_validator("validation")
+    @classmethod
+    def _names_of_its_own(cls, found: dict[str, object]) -> dict[str, object]:
+        for name in found:
+            if name == "record" or re.fullmatch(r"training(-\d+)?", name):
+                raise ValueError(f"the name {name!r} is taken by the training record")
+        return found
 
 
 def load(path: Path) -> Config:
@@ -222,6 +236,7 @@ def _keys_at(place: list[str]) -> list[str]:
         "validation": ValidationConfig,
         "signal": SignalConfig,
     }
-    for part in place:
+    named = place[:1] in (["parameters"], ["validation"])
+    for part in place[:1] + place[1 + named :]:
         table = tables.get(part, table)
     return list(table.model_fields)

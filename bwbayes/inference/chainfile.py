@@ -2,8 +2,8 @@
 
 An HDF5 file in single-writer mode, whose datasets all exist from the start: a block is written and
 flushed, then the number of blocks that count, and only what is counted is ever read. A process
-killed in between loses the block in hand and nothing else. Going on from such a file first copies
-what counts into a fresh one, which also checks every checksum. This module alone knows the layout:
+killed in between loses the block in hand and nothing else. All numbers carry checksums. Going on
+from such a file first copies what counts into a fresh one. This module alone knows the layout:
 
     /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, random_state
     /proposal/PHASE                      weights, centres, factors of that phase's proposal
@@ -168,7 +168,7 @@ class ChainFile(Chain):
             raise ValueError(f"its format is {file.attrs['format']}, this version reads {FORMAT}")
         point = PointFit(
             **{name: file["point"][name][()] for name in _POINT[:-1]},
-            log_density=float(file["point"]["log_density"][()]),
+            log_density=float(file["point"]["log_density"][0]),
         )
         start = file["start"]
         states = zip(start["coordinates"], start["log_density"], start["random_state"], strict=True)
@@ -189,7 +189,11 @@ def _reading(path: Path) -> Any:
     HDF5's own locks stay off here as in the writer: readers need none, the writer's is its
     folder's, and a process may not open a file with and without them.
     """
-    return h5py.File(path, "r", libver="latest", swmr=True, locking=False)
+    # A file whose writer has not closed it is marked so, and opens in this mode only. For others
+    # it must be off: it waits for a writer to mend what is damaged, which may be for ever.
+    with path.open("rb") as file:
+        marked = file.read(12)[11:] == b"\5"
+    return h5py.File(path, "r", libver="latest", swmr=marked, locking=False)
 
 
 _POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
@@ -199,16 +203,18 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
     """Create every dataset, so that none has to be later."""
     ensembles = len(starts)
     walkers, free = starts[0].coordinates.shape
-    for name in _POINT:
-        file[f"point/{name}"] = getattr(point, name)
-    file["start/coordinates"] = np.stack([s.coordinates for s in starts])
-    file["start/log_density"] = np.stack([s.log_density for s in starts])
-    file["start/random_state"] = np.stack([s.random_state for s in starts])
+    whole: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
+    for name in ("coordinates", "log_density", "random_state"):
+        whole[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
     for phase in PHASES:
-        file[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
-        file[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
-        file[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
-    file["committed"] = np.zeros(2 * len(PHASES), dtype=np.int64)
+        whole[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
+        whole[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
+        whole[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
+    whole["committed"] = np.zeros(2 * len(PHASES), dtype=np.int64)
+    for name, values in whole.items():
+        data = np.atleast_1d(values)
+        # Only chunks carry checksums.
+        file.create_dataset(name, data=data, chunks=data.shape, fletcher32=True)
     shapes: dict[str, tuple[tuple[int, ...], Any]] = {
         "coordinates": ((block, ensembles, walkers, free), np.float64),
         "log_density": ((block, ensembles, walkers), np.float64),

@@ -3,7 +3,7 @@
 Every Bouc-Wen fit leaves a discrepancy of a percent of the range or so, and it comes back whenever
 the voltage takes the same way again: a hundred periods of one sine show one loop, not a hundred.
 So each distinct stretch of the voltage counts once here, under a discrepancy of that percent, and
-a combination of parameters is named when three tenths of its prior sd or more would be left. The
+a combination of parameters is named when a third of its prior sd or more would be left. The
 posterior itself, which trusts the noise model, may look surer.
 """
 
@@ -31,7 +31,7 @@ DISCREPANCY = 0.01
 SAME_START = 0.01
 
 # A combination is undetermined when this part of its prior sd or more is left.
-LEFT_OPEN = 0.3
+LEFT_OPEN = 1 / 3
 
 
 def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
@@ -123,10 +123,12 @@ def _stretches(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
     _, kind = np.unique(starts, axis=0, return_inverse=True)
     used = np.bincount(rows, minlength=voltage.size)
     samples = np.array([np.sum(used[s.first + 1 : s.last + 1]) for s in stretches])
-    weights = np.ones(voltage.size)
-    for stretch, alike in zip(stretches, kind[:, np.newaxis] == kind, strict=True):
-        longest = max(np.max(samples[alike]), 1)
-        weights[stretch.first : stretch.last + 1] = longest / max(np.sum(samples[alike]), longest)
+    longest = np.zeros(kind.max() + 1)
+    np.maximum.at(longest, kind, samples)
+    part = np.maximum(longest, 1) / np.maximum(np.bincount(kind, samples), 1)
+    weights = np.empty(voltage.size)
+    for stretch, weight in zip(stretches, part[kind], strict=True):
+        weights[stretch.first : stretch.last + 1] = weight
     return weights, voltage.size / len(stretches)
 
 

@@ -1,0 +1,130 @@
+"""A small run: a few hundred samples of the virtual test stand that converge within seconds."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from filelock import FileLock
+from rich.console import Console
+
+from bwbayes.app.config import Config, parse
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.run import start
+from bwbayes.inference.chain import PHASES
+
+__all__ = [
+    "TEXT",
+    "assert_same_end",
+    "begun",
+    "command",
+    "config",
+    "finished",
+    "numbers",
+    "quiet",
+]
+
+TEXT = """\
+seed = 3
+
+[record]
+signal = { amplitude = 100.0, frequency = 1.0, duration = 6.0, decay = 0.1, decay_from = 1.0 }
+train = [[0.0, 5.0]]
+
+[stand]
+sample_rate = 50.0
+
+[parameters]
+initial = { fixed = 0.0 }
+gamma = { fixed = 0.0172 }
+
+[sampling]
+ess = 200
+block = 25
+walkers = 18
+
+[validation.held-out]
+window = [5.0, 6.0]
+
+[validation.sine]
+signal = { amplitude = 60.0, frequency = 0.5, duration = 4.0 }
+from_rest = true
+"""
+
+
+def config(*changes: tuple[str, str]) -> Config:
+    """Return the small config with parts of its text replaced."""
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return parse(text, "small.toml")
+
+
+def begun(path: Path, *changes: tuple[str, str]) -> RunFolder:
+    """Return the folder of a run before its first step."""
+    return start(config(*changes), path.parent, path)
+
+
+def quiet() -> Console:
+    """Return a console that prints nothing."""
+    return Console(quiet=True)
+
+
+def command(*arguments: str | Path) -> list[str]:
+    """Return the command line that a person would type."""
+    return [str(Path(sys.executable).with_name("bwbayes")), *map(str, arguments)]
+
+
+def finished(factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the small run, made once by its command for all test processes.
+
+    It is for reading; copy it to change it.
+    """
+    shared = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    path = shared / "small-run" / "results" / "small"
+    with FileLock(shared / "small-run.lock"):
+        if not path.exists():
+            where = shared / "small-run"
+            shutil.rmtree(where, ignore_errors=True)
+            where.mkdir()
+            (where / "small.toml").write_text(TEXT)
+            done = subprocess.run(
+                command("run", "small.toml", "--workers", "1", "--quiet"),
+                cwd=where,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert (0, "", "") == (done.returncode, done.stdout, done.stderr)
+    return path
+
+
+def numbers(folder: Path) -> dict[str, Any]:
+    """Return the summary without what differs between two runs of the same."""
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    del found["wall_s"]
+    return found
+
+
+def assert_same_end(expected: Path, got: Path) -> None:
+    """Compare two runs bit by bit: chain, acceptance, random state, summary, bands."""
+    with h5py.File(expected / "chain.h5", "r") as one, h5py.File(got / "chain.h5", "r") as two:
+        for phase in PHASES:
+            for name in ("coordinates", "log_density", "accepted", "random_state"):
+                np.testing.assert_array_equal(
+                    one[phase][name][()], two[phase][name][()], err_msg=f"{phase} {name}"
+                )
+        np.testing.assert_array_equal(one["committed"][()], two["committed"][()])
+    assert numbers(expected) == numbers(got)
+    assert (expected / "bands.csv").read_bytes() == (got / "bands.csv").read_bytes()

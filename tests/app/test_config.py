@@ -1,0 +1,257 @@
+"""Configs say what is wrong in one line, and what they mean without their defaults."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from bwbayes.app.config import Config, dump, load, parse
+from bwbayes.errors import InputError
+from tests.app import small
+
+RECORD = '[record]\nfile = "record.csv"\n'
+
+
+def refused(text: str) -> str:
+    """Return what is said against a config."""
+    with pytest.raises(InputError) as error:
+        parse(text, "my.toml")
+    said = str(error.value)
+    assert "\n" not in said
+    assert said.startswith("my.toml: ")
+    return said.removeprefix("my.toml: ")
+
+
+def test_two_lines_are_a_config() -> None:
+    found = parse(RECORD, "my.toml")
+    assert found.record.file == "record.csv"
+    assert (1, "lag", "auto", "discrepancy") == (
+        found.seed,
+        found.model.dynamics,
+        found.model.hold,
+        found.model.noise,
+    )
+
+
+def test_five_lines_are_a_config() -> None:
+    found = parse(RECORD + '[model]\ndynamics = "none"\n[parameters]\n', "my.toml")
+    assert found.model.dynamics == "none"
+
+
+@pytest.mark.parametrize("named", ["ring_bender.toml", "measured_stack.toml"])
+def test_runs_of_this_project_are_configs(named: str) -> None:
+    runs = Path(__file__).parents[2] / "runs"
+    assert load(runs / named).sampling.ess == 2000
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "nearest"),
+    [
+        ("sead = 1\n" + RECORD, "sead", "seed"),
+        ('[recrod]\nfile = "a.csv"\n', "recrod", "record"),
+        (RECORD + "decimat = 2", "record.decimat", "decimate"),
+        ("[record]\nsignal = {amplitud = 1.0}", "record.signal.amplitud", "amplitude"),
+        (RECORD + "[stand]\nsample_rat = 50.0", "stand.sample_rat", "sample_rate"),
+        (RECORD + "[model]\ndynamic = 'lag'", "model.dynamic", "dynamics"),
+        (RECORD + "[sampling]\nwalker = 20", "sampling.walker", "walkers"),
+        (RECORD + "[parameters.d]\nfixd = 1.0", "parameters.d.fixd", "fixed"),
+        (RECORD + "[parameters.signal]\nfixd = 1.0", "parameters.signal.fixd", "fixed"),
+        (RECORD + "[validation.a]\nwindw = [1.0, 2.0]", "validation.a.windw", "window"),
+        (
+            RECORD + "[validation.a]\nsignal = {amplitude = 1.0, frequncy = 1.0, duration = 1.0}",
+            "validation.a.signal.frequncy",
+            "frequency",
+        ),
+    ],
+)
+def test_unknown_key_is_named_with_its_path_and_the_nearest(
+    text: str, path: str, nearest: str
+) -> None:
+    assert f"{path}: unknown key; did you mean {nearest}?" == refused(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("seed = '1'\n" + RECORD, "seed"),
+        ("seed = 1.5\n" + RECORD, "seed"),
+        ("seed = -1\n" + RECORD, "seed"),
+        ("seed = true\n" + RECORD, "seed"),
+        ("name = ''\n" + RECORD, "name"),
+        ("record = 3", "record"),
+        ("record = []", "record"),
+        ("", "record"),
+        ("[record]\nfile = 3", "record.file"),
+        (RECORD + "start = 1979-05-27", "record.start"),
+        (RECORD + "train = [1.0, 2.0]", "record.train"),
+        (RECORD + "train = []", "record.train"),
+        (RECORD + "train = [[1.0, 2.0, 3.0]]", "record.train"),
+        (RECORD + "train = [[1.0]]", "record.train"),
+        (RECORD + "decimate = 0", "record.decimate"),
+        (RECORD + "voltage_is = 'both'", "record.voltage_is"),
+        ("[record]\nsignal = 3", "record.signal"),
+        (
+            "[record]\nsignal = {amplitude = -1.0, frequency = 1.0, duration = 1.0}",
+            "record.signal.amplitude",
+        ),
+        ("[record]\nsignal = {amplitude = 1.0, frequency = 1.0}", "record.signal.duration"),
+        (RECORD + "[stand]\ndiscrepancy = 'some'", "stand.discrepancy"),
+        (RECORD + "[stand]\nsample_rate = 0.0", "stand.sample_rate"),
+        (RECORD + "[model]\nhold = 'second'", "model.hold"),
+        (RECORD + "[parameters]\nd = 0.7", "parameters.d"),
+        (RECORD + "[parameters.d]\nprior = 'normal'", "parameters.d.prior"),
+        (RECORD + "[parameters.d]\nprior = {mean = 1.0}", "parameters.d"),
+        (RECORD + "[parameters.d]\nprior = {distribution = 3}", "parameters.d"),
+        (RECORD + "[parameters.d]\nfixed = 1.0\nprior = {distribution = 'beta'}", "parameters.d"),
+        (RECORD + "[sampling]\nwalkers = 7", "sampling.walkers"),
+        (RECORD + "[sampling]\nensembles = 2", "sampling.ensembles"),
+        (RECORD + "[sampling]\ness = 0", "sampling.ess"),
+        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window"),
+        (RECORD + "[validation.'a/b']\nwindow = [1.0, 2.0]", "validation.a/b"),
+        (RECORD + "[validation.'']\nwindow = [1.0, 2.0]", "validation"),
+        (RECORD + "[validation.'..']\nwindow = [1.0, 2.0]", "validation..."),
+        (RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in = 0.0", "validation.a.lead_in"),
+        (RECORD + "[truth]\nd = 'large'", "truth.d"),
+    ],
+)
+def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
+    said = refused(text)
+    assert said.startswith(f"{path}")
+    assert re.match(r"[:.]", said.removeprefix(path))
+    assert said.endswith("; mend the config")
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        RECORD + "start = {}",
+        RECORD + "train = [[0.0, {}]]",
+        "[record]\nsignal = {{amplitude = 1.0, frequency = 1.0, duration = {}}}",
+        RECORD + "[parameters.d]\nfixed = {}",
+        RECORD + "[parameters.d]\nlower = {}",
+        RECORD + "[parameters.d]\nprior = {{distribution = 'normal', mean = {}, sd = 1.0}}",
+        RECORD + "[sampling]\ness = {}",
+        RECORD + "[validation.a]\nwindow = [0.0, {}]",
+        RECORD + "[truth]\nd = {}",
+    ],
+)
+def test_number_that_is_not_finite_is_refused(text: str, value: str) -> None:
+    assert "finite" in refused(text.format(value))
+
+
+@pytest.mark.parametrize("source", ["", 'file = "a.csv"\nsignal = "identification"\n'])
+def test_record_has_one_source(source: str) -> None:
+    assert "record: give either file or signal; mend the config" == refused(f"[record]\n{source}")
+
+
+@pytest.mark.parametrize(
+    "source", ["", 'file = "a.csv"\nwindow = [1.0, 2.0]', 'file = "a.csv"\nsignal = "step10"']
+)
+def test_validation_has_one_source(source: str) -> None:
+    said = refused(f"{RECORD}[validation.a]\n{source}")
+    assert "validation.a: give one of window, file and signal; mend the config" == said
+
+
+@pytest.mark.parametrize("name", ["record", "training", "training-2"])
+def test_validation_cannot_take_the_names_of_the_training_record(name: str) -> None:
+    """Its file would be the training record's, or its bands the training windows'."""
+    assert f"{name!r} is taken" in refused(f"{RECORD}[validation.{name}]\nsignal = 'step10'")
+
+
+@pytest.mark.parametrize("seed", ["100000000000000000000", "9223372036854775808"])
+def test_seed_is_a_number_that_files_can_hold(seed: str) -> None:
+    assert "seed" in refused(f"seed = {seed}\n{RECORD}")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[record",
+        "seed = 1\nseed = 2\n" + RECORD,
+        RECORD + RECORD,
+        "seed 1",
+        "file: a.csv",
+        "seed = 01",
+        "a = " + 5000 * "[",
+        "\0",
+    ],
+)
+def test_text_that_is_no_toml_is_refused(text: str) -> None:
+    assert refused(text).startswith("is no TOML")
+
+
+@settings(deadline=None)
+@given(st.text(max_size=40))
+def test_any_text_is_a_config_or_one_line(text: str) -> None:
+    refused("[model]\n" + text)
+
+
+@pytest.mark.parametrize("bom", [b"", b"\xef\xbb\xbf"])
+def test_file_may_start_with_a_byte_order_mark(tmp_path: Path, bom: bytes) -> None:
+    path = tmp_path / "my.toml"
+    path.write_bytes(bom + RECORD.encode())
+    assert load(path) == parse(RECORD, "")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "record: "),
+        (b"# nothing\n", "record: "),
+        (b"\xff\xfe[\0r\0", "is not UTF-8 text"),
+        (RECORD.encode() + b"# \xb5m", "is not UTF-8 text"),
+        (b"\x89HDF\r\n\x1a\n", "is not UTF-8 text"),
+    ],
+)
+def test_unusable_file_is_named(tmp_path: Path, content: bytes, why: str) -> None:
+    path = tmp_path / "my.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=re.escape(f"{path}: {why}")):
+        load(path)
+
+
+def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml: No such file"):
+        load(tmp_path / "none.toml")
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path}: Is a directory")):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        parse(RECORD, ""),
+        small.config(),
+        small.config(("seed = 3", 'seed = 3\nname = "µ \\"quoted\\" \\\\ name"')),
+    ],
+)
+def test_dumped_config_is_the_same_config(found: Config) -> None:
+    assert found == parse(dump(found), "")
+    assert dump(found) == dump(parse(dump(found), ""))
+
+
+@settings(deadline=None)
+@given(
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.floats(min_value=0, exclude_min=True, allow_infinity=False),
+    st.text(min_size=1, max_size=30),
+    st.integers(min_value=0, max_value=2**63 - 1),
+)
+def test_numbers_and_texts_survive_to_the_last_digit(
+    value: float, positive: float, text: str, seed: int
+) -> None:
+    made = parse(RECORD, "")
+    changed = made.model_copy(
+        update={
+            "name": text,
+            "seed": seed,
+            "truth": {"d": value},
+            "sampling": made.sampling.model_copy(update={"ess": positive}),
+        }
+    )
+    assert changed == parse(dump(changed), "")

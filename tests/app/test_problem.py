@@ -1,0 +1,256 @@
+"""A config becomes explicit numbers, once: the same ones from the same config."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.app.config import Config, dump, parse
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.run import load_run
+from bwbayes.data import Record, write_record
+from bwbayes.errors import InputError
+from bwbayes.inference.parameters import Parameter
+from tests.app import small
+
+
+def of(text: str, folder: Path) -> Problem:
+    return resolve(parse(text, "my.toml"), folder)
+
+
+def refused(text: str, folder: Path) -> str:
+    with pytest.raises(InputError) as error:
+        of(text, folder)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def record(samples: int = 400, seed: int = 1, interval: float = 0.01) -> Record:
+    """Make up a record whose ranges do not depend on the seed."""
+    generator = np.random.default_rng(seed)
+    voltage, displacement = generator.uniform(-1, 1, size=(2, samples))
+    for values in (voltage, displacement):
+        values[:2] = -1, 1
+    return Record(80 * voltage, 50 * displacement + 7, interval, voltage_is="command")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a record in it."""
+    write_record(record(), tmp_path / "record.csv")
+    return tmp_path
+
+
+RECORD = '[record]\nfile = "record.csv"\n'
+
+
+def by_name(problem: Problem) -> dict[str, Parameter]:
+    return {parameter.name: parameter for parameter in problem.parameters}
+
+
+def test_default_priors_depend_on_ranges_and_interval_alone(tmp_path: Path) -> None:
+    found = []
+    for number, samples in ((1, 400), (2, 900)):
+        write_record(record(samples, seed=number), tmp_path / "record.csv")
+        found.append(of(RECORD, tmp_path).parameters)
+    assert found[0] == found[1]
+    write_record(record(interval=0.02), tmp_path / "record.csv")
+    assert found[0] != of(RECORD, tmp_path).parameters
+
+
+def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
+    text = RECORD + "train = [[0.0, 2.0]]\n[validation.a]\nwindow = [2.0, 4.0]"
+    made = record()
+    assert made.displacement is not None
+    found = []
+    for factor in (1.0, 3.0):
+        displacement = made.displacement * np.where(np.arange(400) < 200, 1.0, factor)
+        write_record(replace(made, displacement=displacement), tmp_path / "record.csv")
+        found.append(of(text, tmp_path).parameters)
+    assert found[0] == found[1]
+
+
+def test_resolved_config_says_every_choice_in_numbers(folder: Path) -> None:
+    problem = of(RECORD, folder)
+    for parameter in problem.config.parameters.values():
+        assert (parameter.prior is None) != (parameter.fixed is None)
+        assert parameter.unit
+        assert parameter.label
+        assert parameter.description
+    assert set(problem.config.parameters) == {p.name for p in problem.parameters}
+    assert problem.config.model.hold == "first"  # a CSV that says nothing holds the output
+    assert problem.config.sampling.walkers == problem.plan.walkers
+
+
+@pytest.mark.parametrize("changes", [(), (("[stand]", "[model]\nnoise = 'white'\n[stand]"),)])
+def test_resolved_config_resolves_to_the_same_numbers(
+    tmp_path: Path, changes: tuple[tuple[str, str], ...]
+) -> None:
+    config = small.config(*changes)
+    first = resolve(config, tmp_path)
+    again = load_run(RunFolder.create(tmp_path / "run", first, overwrite=False))
+    assert first.config == again.config
+    assert dump(first.config) == dump(again.config)
+    assert first.record.sha256 == again.record.sha256
+    np.testing.assert_array_equal(first.record.truth, again.record.truth)
+    assert first.parameters == again.parameters
+    assert first.plan == again.plan
+    assert first.posterior.training == again.posterior.training
+    for name, one in first.validations.items():
+        other = again.validations[name]
+        assert (one.window, one.start) == (other.window, other.start)
+        if one.record is not None and other.record is not None:
+            assert one.record.sha256 == other.record.sha256
+    z = np.random.default_rng(1).standard_normal((5, first.posterior.prior.dimensions))
+    np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
+
+
+def test_part_of_a_record_is_resolved_once(folder: Path) -> None:
+    text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\ntrain = [[1.0, 2.0]]\n"
+    first = of(text, folder)
+    assert (100, 0.02, 1.0) == (first.record.samples, first.record.interval, first.record.start)
+    again = load_run(RunFolder.create(folder / "run", first, overwrite=False))
+    assert (again.record.samples, again.record.sha256) == (100, first.record.sha256)
+    assert again.parameters == first.parameters
+
+
+def test_run_folder_can_be_moved(tmp_path: Path) -> None:
+    made = small.begun(tmp_path / "run")
+    before = load_run(made)
+    moved = made.path.rename(tmp_path / "elsewhere")
+    assert before.record.sha256 == load_run(RunFolder.open(moved)).record.sha256
+
+
+@pytest.mark.parametrize(
+    ("voltage_is", "hold"), [("command", "zero"), ("output", "first"), (None, "first")]
+)
+def test_automatic_hold_follows_what_the_voltage_is(
+    folder: Path, voltage_is: str | None, hold: str
+) -> None:
+    said = "" if voltage_is is None else f"voltage_is = '{voltage_is}'\n"
+    problem = of(RECORD + said, folder)
+    assert hold == problem.config.model.hold == problem.posterior.actuator.hold
+
+
+def test_automatic_hold_of_the_test_stand_is_zero_order(tmp_path: Path) -> None:
+    assert "zero" == resolve(small.config(), tmp_path).posterior.actuator.hold
+
+
+def test_hold_that_is_given_is_kept(folder: Path) -> None:
+    text = RECORD + "voltage_is = 'command'\n[model]\nhold = 'first'"
+    assert "first" == of(text, folder).posterior.actuator.hold
+
+
+def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None:
+    text = RECORD + (
+        "[parameters.d]\nprior = {distribution = 'normal', mean = 0.7, sd = 0.1}\nlower = 0.2\n"
+        "unit = 'µm/V'\nlabel = 'D'\ndescription = 'gain'\n[parameters.gamma]\nfixed = 0.0"
+    )
+    found = by_name(of(text, folder))
+    d = found["d"]
+    assert d.prior is not None
+    assert ("normal", {"mean": 0.7, "sd": 0.1}) == (d.prior.name, dict(d.prior.arguments))
+    assert (0.2, np.inf, "µm/V", "D", "gain") == (d.lower, d.upper, d.unit, d.label, d.description)
+    assert (0.0, None) == (found["gamma"].fixed, found["gamma"].prior)
+
+
+def test_integer_is_a_number(folder: Path) -> None:
+    text = RECORD + "[parameters.d]\nprior = {distribution = 'uniform', lower = 0, upper = 2}"
+    assert by_name(of(text, folder))["d"].prior is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[parameters.alfa]\nfixed = 1.0", "parameters.alfa: the model has no such parameter; "
+         "did you mean alpha?"),
+        ("[parameters.mass]\nfixed = 1.0", "parameters.mass: the model has no such parameter; "),
+        ("[truth]\nalfa = 0.3", "truth.alfa: no such parameter; did you mean alpha?"),
+        ("[model]\ndynamics = 'second-order'", "parameters.mass: has no default prior; give prior"),
+        ("[model]\ndynamics = 'second-order'\n[parameters]\nmass = {fixed = 1e-3}",
+         "parameters.damping: has no default prior; give prior"),
+        ("[parameters.d]\nprior = {distribution = 'nrmal'}", "parameters.d.prior: nrmal: unknown"),
+        ("[parameters.d]\nprior = {distribution = 'normal', mean = 1.0}",
+         "parameters.d.prior: normal: sd is missing"),
+        ("[parameters.d]\nprior = {distribution = 'normal', mean = 1.0, sd = 1.0, df = 2.0}",
+         "parameters.d.prior: normal: df is unknown"),
+        ("[parameters.d]\nprior = {distribution = 'normal', mean = 'one', sd = 1.0}",
+         "parameters.d.prior: "),
+        ("[parameters.d]\nprior = {distribution = 'normal', mean = 1.0, sd = -1.0}",
+         "parameters.d.prior: "),
+        ("[parameters.d]\nlower = 2.0\nupper = 1.0", "d: "),
+        ("[parameters.d]\nfixed = -1.0", "d: "),
+        ("[validation.a]\nwindow = [1.0, 2.0]", "overlaps the held-out window 1 to 2 s"),
+        ("[validation.a]\nwindow = [2.0, 1.0]", "holds no sample"),
+        ("[validation.a]\nsignal = 'verificaton'", "did you mean 'verification'?"),
+        ("[validation.a]\nfile = 'none.csv'", "none.csv: does not exist"),
+        ("[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said: str) -> None:
+    assert said in refused(RECORD + text, folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("train = [[0.0, 2.0], [1.0, 3.0]]", "overlaps the training window 0 to 2 s"),
+        ("train = [[0.0, 9.0]]", "reaches outside the record"),
+        ("start = 3.0\nstop = 2.0", "holds no sample"),
+        ("decimate = 1000", "record"),
+    ],
+)
+def test_windows_that_cannot_be_cut_are_named(folder: Path, text: str, said: str) -> None:
+    assert said in refused(RECORD + text, folder)
+
+
+def test_training_window_without_drive_is_refused(tmp_path: Path) -> None:
+    made = record()
+    flat = np.where(np.arange(400) < 100, 5.0, made.voltage)
+    write_record(replace(made, voltage=flat), tmp_path / "record.csv")
+    assert "constant" in refused(RECORD + "train = [[0.0, 1.0]]", tmp_path)
+
+
+def test_signal_beyond_the_stand_is_refused(tmp_path: Path) -> None:
+    changed = small.config(("amplitude = 100.0", "amplitude = 101.0"))
+    with pytest.raises(InputError, match="100 V") as error:
+        resolve(changed, tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def with_seed(seed: int) -> Config:
+    return small.config(("seed = 3", f"seed = {seed}"))
+
+
+def test_seed_makes_the_stands_records(tmp_path: Path) -> None:
+    def readings(seed: int) -> dict[str, str]:
+        problem = resolve(with_seed(seed), tmp_path)
+        found = {n: v.record.sha256 for n, v in problem.validations.items() if v.record is not None}
+        return found | {"training": problem.record.sha256}
+
+    assert {"training", "sine"} == set(readings(1))
+    assert readings(1) == readings(1)
+    assert not set(readings(1).values()) & set(readings(2).values())
+
+
+def test_true_values_of_a_simulated_record_are_known(tmp_path: Path) -> None:
+    found = resolve(small.config(), tmp_path).config.truth
+    assert (0.7, 0.3575, 0.0272, 0.5) == tuple(
+        found[name] for name in ("d", "alpha", "beta", "sensor_sd")
+    )
+    assert "mass" not in found
+
+
+def test_warnings_of_a_record_become_remarks(tmp_path: Path) -> None:
+    made = record()
+    assert made.displacement is not None
+    clipped = np.clip(made.displacement, None, 30.0)
+    write_record(replace(made, displacement=clipped), tmp_path / "record.csv")
+    remarks = of(RECORD, tmp_path).remarks
+    assert len(remarks) == 1
+    assert re.search("clip", remarks[0])

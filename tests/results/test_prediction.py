@@ -1,0 +1,269 @@
+"""What predictions promise: nested bands, one simulation a record, honest unknown starts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.results import prediction
+from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+
+TRUTH = {
+    "d": 0.7,
+    "alpha": 0.3575,
+    "beta": 0.0272,
+    "gamma": 0.0172,
+    "exponent": 1.0,
+    "initial": 0.0,
+    "lag": 0.004,
+    "offset": 5.0,
+    "sensor_sd": 0.5,
+    "discrepancy_sd": 1.0,
+    "discrepancy_time": 0.2,
+}
+INTERVAL = 0.01
+
+
+def made(samples: int = 1200, offset: float = 5.0, start: float = 0.0) -> Record:
+    """Simulate a record of a decaying sine: model, discrepancy and sensor noise."""
+    time = np.arange(samples) * INTERVAL
+    voltage = 100 * np.sin(2 * np.pi * 0.5 * time + start) * np.exp(-0.1 * time)
+    actuator = Actuator("lag", "first", INTERVAL)
+    theta = np.array([[TRUTH[n] for n in actuator.parameters]])
+    generator = np.random.default_rng(4)
+    x = np.zeros(samples)
+    phi = np.exp(-INTERVAL / TRUTH["discrepancy_time"])
+    x[0] = generator.standard_normal()
+    for i in range(1, samples):
+        x[i] = phi * x[i - 1] + np.sqrt(1 - phi**2) * generator.standard_normal()
+    truth = actuator.displacement(theta, voltage)[0] - TRUTH["offset"] + offset + x
+    reading = truth + TRUTH["sensor_sd"] * generator.standard_normal(samples)
+    return Record(voltage, reading, INTERVAL, truth=truth, origin="made up")
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return made()
+
+
+@pytest.fixture(scope="module")
+def posterior(record: Record) -> Posterior:
+    actuator, noise = Actuator("lag", "first", INTERVAL), DiscrepancyNoise(INTERVAL)
+    wide = Distribution("normal", {"mean": 0.0, "sd": 10.0})
+    broad = Distribution("lognormal", {"median": 0.1, "sigma": 2.0})
+    parameters = [
+        Parameter(
+            name,
+            "",
+            name,
+            "",
+            prior=None if name == "exponent" else wide if value == 0 or name == "offset" else broad,
+            fixed=1.0 if name == "exponent" else None,
+        )
+        for name, value in TRUTH.items()
+    ]
+    assert record.displacement is not None
+    return Posterior(
+        record.voltage,
+        record.displacement,
+        (slice(0, 600),),
+        actuator,
+        noise,
+        JointPrior(parameters),
+    )
+
+
+@pytest.fixture(scope="module")
+def draws(posterior: Posterior) -> FloatArray:
+    """Draws around the truth, a few per cent wide: stand-ins for a posterior's."""
+    generator = np.random.default_rng(1)
+    centre = np.array([TRUTH[name] for name in posterior.names])
+    wide = 0.03 * np.abs(centre) + np.where(centre == 0, 0.1, 0.0)
+    return centre + wide * generator.standard_normal((300, centre.size))
+
+
+def predicted(
+    posterior: Posterior, draws: FloatArray, record: Record, start: Start, seed: int = 3
+) -> Bands:
+    return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
+
+
+def width(bands: Bands, kind: Kind = "parameter", level: int = 95) -> FloatArray:
+    return bands.upper[kind, level] - bands.lower[kind, level]
+
+
+def test_bands_are_nested_in_level_and_in_kind(
+    posterior: Posterior, draws: FloatArray, record: Record
+) -> None:
+    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)})[0]
+    for inner, outer in pairwise(LEVELS):
+        for kind in KINDS:
+            assert (bands.lower[kind, outer] <= bands.lower[kind, inner]).all()
+            assert (bands.upper[kind, inner] <= bands.upper[kind, outer]).all()
+    for level in LEVELS:
+        for tight, loose in pairwise(KINDS):
+            assert (width(bands, tight, level) < width(bands, loose, level)).all()
+
+
+def test_a_window_is_the_same_part_of_the_whole_record(
+    posterior: Posterior, draws: FloatArray, record: Record
+) -> None:
+    """One simulation from the first sample: a window does not start the model afresh."""
+    windows = {"all": slice(0, record.samples), "late": slice(700, 900)}
+    whole, late = predict_windows(posterior, draws, record, windows)
+    for (name, expected), (_, got) in zip(whole.columns(), late.columns(), strict=True):
+        np.testing.assert_allclose(expected[700:900], got, atol=1e-6, err_msg=name)
+    assert whole.training
+    assert not late.training
+
+
+def test_walking_through_in_other_pieces_changes_nothing(
+    posterior: Posterior, draws: FloatArray, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows = {"late": slice(500, 1100)}
+    expected = predict_windows(posterior, draws, record, windows)[0]
+    monkeypatch.setattr(prediction, "PIECE", 97)
+    got = predict_windows(posterior, draws, record, windows)[0]
+    for (name, one), (_, two) in zip(expected.columns(), got.columns(), strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-6, err_msg=name)
+
+
+def test_the_mean_is_that_of_the_draws_simulations(
+    posterior: Posterior, draws: FloatArray, record: Record
+) -> None:
+    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
+    expected = posterior.actuator.displacement(theta, record.voltage).mean(axis=0)
+    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)})[0]
+    np.testing.assert_allclose(expected, bands.mean, rtol=1e-9)
+
+
+def test_an_unknown_state_widens_the_start_and_is_forgotten_later(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    planned = replace(made(), displacement=None, truth=None)
+    rest = predicted(posterior, draws, planned, Start(from_rest=True))
+    unknown = predicted(posterior, draws, planned, Start())
+    assert width(unknown)[:5].mean() > 3 * width(rest)[:5].mean()
+    late = slice(300, 400)
+    assert width(unknown)[late].mean() < 0.5 * width(unknown)[:5].mean()
+
+
+def test_reachable_states_stay_inside_the_ceiling(
+    posterior: Posterior, draws: FloatArray, record: Record
+) -> None:
+    model = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
+    states = prediction._reachable(posterior, model, record.voltage, np.random.default_rng(0))
+    column = posterior.actuator.parameters.index
+    top = model[:, column("alpha")] / (model[:, column("beta")] + model[:, column("gamma")])
+    assert (np.abs(states) <= top).all()
+    assert (np.ptp(states, axis=0) > 0.5 * top).all()
+
+
+def test_the_offset_comes_from_the_lead_in(posterior: Posterior, draws: FloatArray) -> None:
+    """A record shifted by 30 um is predicted 30 um higher, and its bands are as wide."""
+    here = predicted(posterior, draws, made(), Start(from_rest=True))
+    there = predicted(posterior, draws, made(offset=35.0), Start(from_rest=True))
+    np.testing.assert_allclose(30.0, there.mean - here.mean, atol=0.02)
+    np.testing.assert_allclose(width(here), width(there), atol=0.02)
+
+
+def test_the_lead_in_is_told_and_a_longer_one_tells_more(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    short = predicted(posterior, draws, made(), Start(from_rest=True, lead_in=0.2))
+    long = predicted(posterior, draws, made(), Start(from_rest=True, lead_in=4.0))
+    assert (short.scored_from, long.scored_from) == (20, 400)
+    assert width(long).mean() < width(short).mean()
+
+
+def test_the_offsets_variance_is_that_of_the_conjugate_normal(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    """Against the dense normal equations for one draw."""
+    record = made()
+    assert record.displacement is not None
+    one = draws[:1]
+    mixed = prediction._draws(posterior, one)
+    states = np.zeros((1, 1))
+    informed = prediction._informed(
+        posterior, mixed, states, one, record, 100, np.random.default_rng(0)
+    )
+    sensor, sd, time = posterior.prior.theta(one)[0, -3:]
+    lags = np.abs(np.subtract.outer(np.arange(100), np.arange(100))) * INTERVAL
+    covariance = sd**2 * np.exp(-lags / time) + sensor**2 * np.eye(100)
+    model = mixed.model.copy()
+    model[:, posterior.actuator.parameters.index("initial")] = 0.0
+    model[:, posterior.actuator.parameters.index("offset")] = 0.0
+    rest = (
+        record.displacement[:100] - posterior.actuator.displacement(model, record.voltage[:100])[0]
+    )
+    weight = np.linalg.solve(covariance, np.ones(100))
+    wide = np.ptp(posterior.displacement)
+    precision = weight.sum() + 1 / wide**2
+    expected = (weight @ rest + np.mean(record.displacement[:100]) / wide**2) / precision
+    got = informed.model[0, posterior.actuator.parameters.index("offset")]
+    assert expected == pytest.approx(got, abs=1e-6)
+    assert precision**-0.5 == pytest.approx(informed.offset[0], rel=1e-6)
+
+
+def test_a_lead_in_finds_the_initial_state(posterior: Posterior, draws: FloatArray) -> None:
+    """With a record from rest, informed draws start nearer to rest than uninformed ones."""
+    record = made()
+    mixed = prediction._draws(posterior, draws)
+    generator = np.random.default_rng(0)
+    states = prediction._reachable(posterior, mixed.model, record.voltage, generator)
+    states[0] = 0.0
+    informed = prediction._informed(posterior, mixed, states, draws, record, 200, generator)
+    start = informed.model[:, posterior.actuator.parameters.index("initial")]
+    assert np.sqrt(np.mean(start**2)) < 0.5 * np.sqrt(np.mean(states[1:] ** 2))
+
+
+def test_a_planned_voltage_has_the_training_records_offset(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    planned = replace(made(), displacement=None, truth=None)
+    bands = predicted(posterior, draws, planned, Start(from_rest=True))
+    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
+    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
+    expected = posterior.actuator.displacement(theta, planned.voltage).mean(axis=0)
+    np.testing.assert_allclose(expected, bands.mean, rtol=1e-9)
+    assert bands.measured is bands.pit is bands.crps is None
+    assert bands.scored_from == 0
+
+
+def test_another_sampling_interval_gives_the_same_bands(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    fine = replace(made(), displacement=None, truth=None)
+    coarse = fine.decimate(2)
+    expected = predicted(posterior, draws, fine, Start(from_rest=True))
+    got = predicted(posterior, draws, coarse, Start(from_rest=True))
+    # Straight lines between every second sample leave a little of the sine out.
+    np.testing.assert_allclose(expected.mean[::2], got.mean, atol=0.2)
+    np.testing.assert_allclose(width(expected, "sensor")[::2], width(got, "sensor"), atol=0.05)
+
+
+@pytest.mark.parametrize("lead_in", [0.001, 12.0, 100.0])
+def test_a_lead_in_that_leaves_nothing_is_refused(
+    posterior: Posterior, draws: FloatArray, lead_in: float
+) -> None:
+    with pytest.raises(InputError, match="lead-in"):
+        predicted(posterior, draws, made(), Start(lead_in=lead_in))
+
+
+def test_thinning_takes_each_draw_at_most_once(draws: FloatArray) -> None:
+    kept = thinned(draws, np.random.default_rng(0), 100)
+    assert len(np.unique(kept, axis=0)) == 100
+    assert thinned(draws, np.random.default_rng(0), 1000) is draws
