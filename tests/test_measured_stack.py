@@ -13,9 +13,12 @@ from bwbayes.app import cli
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
 
-pytestmark = pytest.mark.skipif(
-    not RECORD.is_file(), reason="the measured record is not part of the project, and not here"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        not RECORD.is_file(), reason="the measured record is not part of the project, and not here"
+    ),
+    pytest.mark.xdist_group("measured stack"),
+]
 
 
 def run(folder: Path, config: Path) -> Any:
@@ -31,13 +34,13 @@ def run(folder: Path, config: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The run as it stands."""
+    """Run the config as it stands."""
     return run(tmp_path_factory.mktemp("honest") / "out", ROOT / "runs/measured_stack.toml")
 
 
 @pytest.fixture(scope="module")
 def white(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The same with white noise alone."""
+    """Run the same with white noise alone."""
     folder = tmp_path_factory.mktemp("white")
     text = (ROOT / "runs/measured_stack.toml").read_text(encoding="utf-8")
     start = text.index("[parameters.discrepancy_time]")

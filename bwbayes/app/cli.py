@@ -6,6 +6,7 @@ without converging. 130: interrupted; what was computed is kept.
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from bwbayes.app.config import LARGEST_SEED, load
 from bwbayes.errors import InputError
 
 __all__ = ["main"]
@@ -39,7 +41,7 @@ def cli() -> None:
 @click.argument("config", type=FILE)
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
-@click.option("--seed", type=click.IntRange(0), help="Seed, instead of the config's.")
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
 @click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
 @workers_option
 @quiet_option
@@ -98,7 +100,6 @@ def check(config: Path, record: Path | None) -> int:
 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
-    from bwbayes.app.config import load  # noqa: PLC0415
     from bwbayes.app.screen import show_check  # noqa: PLC0415
 
     wanted = load(config)
@@ -128,7 +129,7 @@ def check(config: Path, record: Path | None) -> int:
     show_default=True,
     help="How the stand's actuator departs from the model.",
 )
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), default=1, show_default=True)
 @click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
 def simulate(
     out: Path,
@@ -180,6 +181,8 @@ def predict(
 
     if (record is None) == (wanted is None):
         raise InputError("predict: give either --record or --signal")
+    if not 0 < lead_in < math.inf:
+        raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
     begin = Start(from_rest, not same_offset, lead_in)
     return write(folder, record, wanted, begin, out, Console())
 
@@ -240,7 +243,7 @@ def main() -> None:
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        status = cli.main(standalone_mode=False)
+        status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
     except (InputError, click.ClickException) as error:
         message = error.format_message() if isinstance(error, click.ClickException) else str(error)
         click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
@@ -249,6 +252,9 @@ def main() -> None:
         # A full disk, a folder that went away: what is on disk already stays whole.
         where = f"{error.filename}: " if error.filename else ""
         click.echo(f"bwbayes: {where}{error.strerror or error}; mend it and resume", err=True)
+        status = BAD_INPUT
+    except MemoryError:
+        click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)
         status = BAD_INPUT
     except (KeyboardInterrupt, click.Abort):
         click.echo("bwbayes: interrupted", err=True)

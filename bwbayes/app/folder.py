@@ -59,9 +59,9 @@ class RunFolder:
                     f"{path}: exists; go on with `bwbayes resume {path}`, choose another folder "
                     "with --out, or give --overwrite"
                 )
-            if not cls(path).config.exists() and not (path.is_dir() and not any(path.iterdir())):
+            if not cls(path)._may_go():
                 raise InputError(f"{path}: is not a run's folder; choose another with --out")
-        draft = path.with_name(f".{path.name}.partial")
+        draft = path.absolute().with_name(f".{path.name}.partial")
         try:
             shutil.rmtree(draft, ignore_errors=True)
             (draft / "records").mkdir(parents=True)
@@ -71,7 +71,8 @@ class RunFolder:
                     write_record(validation.record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
             if path.exists():
-                shutil.rmtree(path)
+                with cls(path).locked():
+                    shutil.rmtree(path)
             draft.rename(path)
         except OSError as error:
             reason = error.strerror or error
@@ -93,6 +94,12 @@ class RunFolder:
                 f"{path}: no run here; start one with `bwbayes run CONFIG --out {path}`"
             )
         return folder
+
+    def _may_go(self) -> bool:
+        """Tell whether nothing but a run would be lost with this folder."""
+        record = self.path / "records/record.h5"
+        empty = self.path.is_dir() and not any(self.path.iterdir())
+        return empty or (self.config.is_file() and record.is_file())
 
     @contextmanager
     def locked(self) -> Iterator[None]:

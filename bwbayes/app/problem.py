@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -148,12 +148,19 @@ def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, fl
 def _other_record(config: Config, name: str, folder: Path) -> Record:
     source = config.validation[name]
     if source.file is not None:
-        return read_record(folder / source.file, voltage_is=source.voltage_is)
-    assert source.signal is not None
-    made = _stand(config).run(
-        sampled_waveform(source.signal), generator(config.seed, f"record {name}")
-    )
-    return _named(made, source.signal)
+        record = read_record(folder / source.file, voltage_is=source.voltage_is)
+    else:
+        assert source.signal is not None
+        waveform = sampled_waveform(source.signal)
+        made = _stand(config).run(waveform, generator(config.seed, f"record {name}"))
+        record = _named(made, source.signal)
+    # Said now: it would be a pity after the sampling.
+    if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
+        raise InputError(
+            f"validation.{name}.lead_in: {source.lead_in:g} s is not a part of the record's "
+            f"{record.duration:g} s; choose another one"
+        )
+    return record
 
 
 def _stand(config: Config) -> VirtualTestStand:
@@ -175,12 +182,8 @@ def _split(config: Config, record: Record) -> Split:
 def _parameters(
     config: Config, names: tuple[str, ...], record: Record, training: tuple[slice, ...]
 ) -> list[Parameter]:
-    unknown = [name for name in config.parameters if name not in names]
-    if unknown:
-        near = difflib.get_close_matches(unknown[0], names, n=1, cutoff=0.0)
-        raise InputError(
-            f"parameters.{unknown[0]}: the model has no such parameter; did you mean {near[0]}?"
-        )
+    _require_known("parameters", config.parameters, names)
+    _require_known("truth", config.truth, CATALOGUE)
     rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
     assert record.displacement is not None
     voltage, displacement = record.voltage[rows], record.displacement[rows]
@@ -191,6 +194,13 @@ def _parameters(
     stiffness = _fixed(config, "stiffness", None)
     given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
     return [_parameter(name, given[name], ranges, exponent, stiffness) for name in names]
+
+
+def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+            raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
 
 
 def _fixed(config: Config, name: str, default: float | None) -> float | None:
@@ -252,7 +262,13 @@ def _default(
 def _plan(config: Config, prior: JointPrior) -> SamplingPlan:
     given = config.sampling
     # Six more than the least: complementary halves must span all directions.
-    walkers = given.walkers or max(2 * prior.dimensions + 6, 16)
+    least = 2 * prior.dimensions
+    walkers = given.walkers or max(least + 6, 16)
+    if walkers < least:
+        raise InputError(
+            f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
+            f"use at least {least}"
+        )
     return SamplingPlan(
         ess=given.ess,
         ensembles=given.ensembles,

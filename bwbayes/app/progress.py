@@ -52,7 +52,7 @@ class Progress:
             self.live.update(Text(line))
         elif found is not None and now - self.printed >= PAUSE:
             self.printed = now
-            self.console.print(line, highlight=False)
+            self.console.print(line, highlight=False, soft_wrap=True)
 
     def line(self, phase: Phase) -> str:
         """Return the line that is shown."""
@@ -75,8 +75,10 @@ class Progress:
         fewest = float(np.min([self.check.ess_bulk, self.check.ess_tail]))
         wanted = self.check.steps * self.plan.ess / fewest if fewest > 0 else np.inf
         wanted = max(wanted, LENGTH * float(np.max(self.check.autocorrelation)))
-        seconds = (min(wanted, self.plan.most_steps) - self.check.steps) / steps_per_second
-        if not np.isfinite(seconds):
+        left = min(wanted, self.plan.most_steps) - self.check.steps
+        # A run that goes on is judged before its first step.
+        if not (np.isfinite(left) and steps_per_second > 0):
             return "unknown"
+        seconds = left / steps_per_second
         minutes, rest = divmod(max(round(seconds), 0), 60)
         return f"{minutes}:{rest:02d}"

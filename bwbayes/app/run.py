@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import platform
+import shutil
 import time
 from dataclasses import replace
 from importlib.metadata import version
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bwbayes.app.config import Config, dump, load
+from bwbayes.app.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.problem import Problem, generator, resolve
@@ -101,6 +102,8 @@ def carry_on(
             executor(workers) as pool,
             Progress(console, problem.plan) as progress,
         ):
+            # It is written last, as the sign that all is there; now something is to come.
+            folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ...", highlight=False)
         result = assemble(problem, chain, outcome)
@@ -199,8 +202,10 @@ def _retarget(folder: RunFolder, ess: float | None, steps: int | None) -> None:
     sampling = config.sampling.model_copy(
         update={name: value for name, value in wanted.items() if value is not None}
     )
+    text = dump(config.model_copy(update={"sampling": sampling}))
+    parse(text, "resume")  # refuses what a config cannot say
     draft = folder.config.with_suffix(".partial")
-    draft.write_text(dump(config.model_copy(update={"sampling": sampling})), encoding="utf-8")
+    draft.write_text(text, encoding="utf-8")
     draft.replace(folder.config)
 
 
@@ -271,6 +276,7 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
     assert record.displacement is not None
     write_posterior(folder.path / "posterior.nc", result, record.voltage, record.displacement)
     write_bands(folder.path / "bands.csv", result.bands)
+    shutil.rmtree(folder.path / "figures", ignore_errors=True)  # no picture of an earlier end
     pictures = save(draw_all(result), folder.path / "figures")
     page = render(result, numbers, pictures)
     (folder.path / "report.html").write_text(page, encoding="utf-8")

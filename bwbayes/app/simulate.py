@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal, cast
 
-from bwbayes.app.config import SignalConfig
-from bwbayes.app.problem import generator, sampled_waveform
+from bwbayes.app.problem import generator
 from bwbayes.data import write_record
 from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.data.waveforms import Sine, Waveform
+from bwbayes.data.waveforms import signal as named
 from bwbayes.errors import InputError
 
 __all__ = ["simulate"]
@@ -41,13 +42,11 @@ def simulate(
     InputError
         An unknown signal, impossible values, or a file that cannot be written.
     """
-    wanted: str | SignalConfig = signal
-    if signal == "sine":
-        amplitude, frequency, duration = sine
-        wanted = SignalConfig(amplitude=amplitude, frequency=frequency, duration=duration)
+    amplitude, frequency, duration = sine
+    waveform = Waveform(Sine(amplitude, frequency), duration) if signal == "sine" else named(signal)
     kind = cast("Literal['none', 'process', 'structural']", discrepancy)
     stand = VirtualTestStand(kind, rate)
-    record = stand.run(sampled_waveform(wanted), generator(seed, "record"))
+    record = stand.run(waveform, generator(seed, "record"))
     record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
     write_record(record, out)
     parameters = out.with_name(f"{out.stem}.truth.json")
@@ -55,5 +54,5 @@ def simulate(
         parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
-    beside = out.with_name(f"{out.stem}.truth.csv")
-    return [out, *([beside] if beside.exists() and out.suffix == ".csv" else []), parameters]
+    beside = out.with_name(f"{out.stem}.truth{out.suffix}")
+    return [out, *([beside] if beside.exists() else []), parameters]

@@ -30,6 +30,7 @@ def executor(workers: int | None = None) -> Iterator[Executor]:
     if count > 1:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_settle)
+        _start(pool, count)
     try:
         yield pool
     finally:
@@ -40,6 +41,21 @@ def one_thread() -> AbstractContextManager[object]:
     """Keep this process's linear algebra to one thread, as a context."""
     limited: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
     return limited
+
+
+def _start(pool: Executor, count: int) -> None:
+    """Start the workers deaf to the requests that stop a run: its own process sees to those.
+
+    Without that, Ctrl-C would kill the workers first, or while they start make each complain.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        for _ in range(count):  # each starts a worker, which inherits what is blocked
+            pool.submit(_settle)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _settle() -> None:

@@ -37,6 +37,7 @@ def write_posterior(path: Path, result: Result, voltage: FloatArray, reading: Fl
             "constant_data": {"voltage": voltage},
         },
         dims={"displacement": ["sample"], "voltage": ["sample"]},
+        check_conventions=False,  # more walkers than steps are as they should be
     )
     along = {
         "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),

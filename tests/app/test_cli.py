@@ -1,0 +1,365 @@
+"""The command line: what it prints, what it leaves, and the status it ends with."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from bwbayes.app import cli
+from bwbayes.data import read_record
+from tests.app import small
+
+COMMANDS = ("run", "resume", "check", "simulate", "predict", "report")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command said, and its exit status."""
+
+    status: int
+    out: str
+    err: str
+
+
+Type = Callable[..., Said]
+
+
+@pytest.fixture
+def bwbayes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Type:
+    """Return a function that runs a command line in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def typed(*arguments: str | Path) -> Said:
+        monkeypatch.setattr("sys.argv", ["bwbayes", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        printed = capsys.readouterr()
+        assert isinstance(end.value.code, int)
+        return Said(end.value.code, printed.out, printed.err)
+
+    return typed
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+def assert_one_line(said: Said, *parts: str) -> None:
+    assert 2 == said.status
+    assert "" == said.out
+    assert re.fullmatch(r"bwbayes: [^\n]+\n", said.err), said.err
+    for part in parts:
+        assert part in said.err
+
+
+# Help and usage
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example_that_the_command_takes(bwbayes: Type, command: str) -> None:
+    said = bwbayes(command, "--help")
+    assert (0, "") == (said.status, said.err)
+    example = re.search(r"Example: bwbayes (\S+)((?:\s+\S+)+?)\n\n", said.out)
+    assert example is not None
+    assert command == example[1]
+    parsed = cli.cli.commands[command].make_context(command, example[2].split())
+    assert parsed.params
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
+def test_help_names_every_command(bwbayes: Type, arguments: tuple[str, ...]) -> None:
+    said = bwbayes(*arguments)
+    assert (0, "") == (said.status, said.err)
+    for command in COMMANDS:
+        assert f"  {command} " in said.out
+
+
+def test_version_is_the_packages(bwbayes: Type) -> None:
+    assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", bwbayes("--version").out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("frobnicate",), "No such command 'frobnicate'"),
+        (("run",), "Missing argument 'CONFIG'"),
+        (("run", "a.toml", "--bogus"), "No such option"),
+        (("run", "a.toml", "b.toml"), "unexpected extra argument"),
+        (("run", "a.toml", "--seed", "one"), "--seed"),
+        (("run", "a.toml", "--seed", "-1"), "--seed"),
+        (("run", "a.toml", "--seed", "99999999999999999999"), "--seed"),
+        (("run", "a.toml", "--workers", "0"), "--workers"),
+        (("run", "a.toml"), "a.toml: No such file"),
+        (("check", "a.toml"), "a.toml: No such file"),
+        (("resume", "none"), "none: no run here; start one with"),
+        (("resume", "none", "--steps", "0"), "--steps"),
+        (("report", "none"), "none: no run here; start one with"),
+        (("predict", "none", "--signal", "step10"), "none: no run here; start one with"),
+        (("predict", "none"), "give either --record or --signal"),
+        (("predict", "none", "--signal", "step10", "--record", "a.csv"), "either"),
+        (("predict", "none", "--signal", "step10", "--lead-in", "nan"), "lead-in"),
+        (("predict", "none", "--signal", "step10", "--lead-in", "-1"), "lead-in"),
+        (("simulate", "a.xyz"), "unknown suffix '.xyz'"),
+        (("simulate", "none/a.csv"), "none/a.csv: cannot be written"),
+        (("simulate", "a.csv", "--signal", "verificaton"), "did you mean 'verification'?"),
+        (("simulate", "a.csv", "--discrepancy", "some"), "--discrepancy"),
+        (("simulate", "a.csv", "--rate", "nan"), "sample_rate"),
+        (("simulate", "a.csv", "--rate", "0"), "sample_rate"),
+        (("simulate", "a.csv", "--signal", "sine", "--amplitude", "nan"), "amplitude"),
+        (("simulate", "a.csv", "--signal", "sine", "--frequency", "0"), "frequency"),
+        (("simulate", "a.csv", "--signal", "sine", "--frequency", "600"), "sample faster"),
+        (("simulate", "a.csv", "--signal", "sine", "--duration", "inf"), "duration"),
+    ],
+)
+def test_wrong_command_line_is_one_line(
+    bwbayes: Type, tmp_path: Path, arguments: tuple[str, ...], part: str
+) -> None:
+    assert_one_line(bwbayes(*arguments), part)
+    assert [] == list(tmp_path.iterdir())
+
+
+# Bad input
+
+ROWS = [f"{i / 100},{5 * (i % 7)},{2 * (i % 7)}" for i in range(60)]
+HEADER = "time_s,voltage_V,displacement_um"
+RECORD = '[record]\nfile = "record.csv"\n'
+
+
+def lines(*rows: str) -> bytes:
+    return ("\n".join(rows) + "\n").encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "problem"),
+    [
+        (lines(HEADER, *ROWS[:5], "0.05,abc,1", *ROWS[6:]), "7: voltage_V: ", "abc"),
+        (lines(HEADER, *ROWS[:5], "0.05,1,nan", *ROWS[6:]), "7: displacement_um: ", "nan"),
+        (lines(HEADER, *ROWS[:5], "0.05,1,inf", *ROWS[6:]), "7: displacement_um: ", "inf"),
+        (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "1e999"),
+        (lines(HEADER, *ROWS[:5], "0.05,,1", *ROWS[6:]), "7: voltage_V: ", "empty"),
+        (lines(HEADER, *ROWS[:5], "0.05,1", *ROWS[6:]), "7: ", "field"),
+        (lines(HEADER, *ROWS[:5], "0.05,1,1,1", *ROWS[6:]), "7: ", "field"),
+        (lines(HEADER, *ROWS[:20], *ROWS[25:]), "22: time_s: ", "0.06"),
+        (lines(HEADER, *ROWS[:20], ROWS[19], *ROWS[20:]), "22: time_s: ", "repeat"),
+        (lines(HEADER, *ROWS[:20], ROWS[5], *ROWS[21:]), "22: time_s: ", "back"),
+        (lines(HEADER, *ROWS).replace(b",", b";"), "1: ", "semicolon"),
+        (lines(*ROWS), "1: ", "header"),
+        (lines("t,u,y", *ROWS), "1: ", "time_s"),
+        (lines(HEADER), "", "no "),
+        (b"", "", "empty"),
+        (lines(HEADER, *ROWS) + b"0.6", "62: ", "field"),
+        (lines(HEADER, *ROWS[:5], "0.05,1\0,1", *ROWS[6:]), "7: ", "NUL"),
+        (b"\xff\xfe\0\1", "", "text"),
+        (lines(HEADER, *(f"{i / 100},5,{i % 7}" for i in range(60))), "", "constant"),
+        (lines(HEADER, *(f"{i / 100},{i % 7},5" for i in range(60))), "", "constant"),
+        (lines("time_s,voltage_V", *(row.rsplit(",", 1)[0] for row in ROWS)), "", "displacement"),
+    ],
+)
+def test_malformed_record_is_one_line_and_leaves_nothing(
+    bwbayes: Type, tmp_path: Path, content: bytes, place: str, problem: str
+) -> None:
+    (tmp_path / "record.csv").write_bytes(content)
+    (tmp_path / "my.toml").write_text(RECORD)
+    for command in ("run", "check"):
+        said = bwbayes(command, "my.toml")
+        assert_one_line(said, f"record.csv:{place}", problem)
+        assert ";" in said.err  # what to do
+    assert {"record.csv", "my.toml"} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", "record: field required"),
+        ("[record", "is no TOML"),
+        ("seed = 1\nseed = 2\n", "is no TOML"),
+        ('[record]\nfil = "record.csv"', "record.fil: unknown key; did you mean file?"),
+        (RECORD + "[sampling]\ness = nan", "sampling.ess: "),
+        (RECORD + "[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
+        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window: "),
+        (RECORD + "[validation.'a/b']\nwindow = [0.1, 0.2]", "validation.a/b"),
+        (RECORD + "[validation.a]\nwindow = [0.1, 0.2]", "overlaps"),
+        (RECORD + "[parameters.alfa]\nfixed = 1.0", "did you mean alpha?"),
+        (RECORD + "[model]\ndynamics = 'second-order'", "parameters.mass: has no default prior"),
+        ('[record]\nfile = "none.csv"', "none.csv: does not exist"),
+        ('[record]\nfile = "."', "is a directory"),
+        ('[record]\nsignal = "foo"', "signal: no 'foo'"),
+    ],
+)
+def test_malformed_config_is_one_line_and_leaves_nothing(
+    bwbayes: Type, tmp_path: Path, text: str, part: str
+) -> None:
+    (tmp_path / "record.csv").write_bytes(lines(HEADER, *ROWS))
+    (tmp_path / "my.toml").write_text(text)
+    for command in ("run", "check"):
+        assert_one_line(bwbayes(command, "my.toml"), part)
+    assert {"record.csv", "my.toml"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_existing_run_is_kept_with_a_hint(bwbayes: Type, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    small.begun(tmp_path / "results/small")
+    hint = "exists; go on with `bwbayes resume results/small`"
+    assert_one_line(bwbayes("run", "small.toml"), hint, "--overwrite")
+    assert_one_line(bwbayes("report", "results/small"), "not finished; go on with `bwbayes resume")
+    assert_one_line(bwbayes("predict", "results/small", "--signal", "step10"), "chain")
+
+
+@pytest.mark.parametrize("option", [("--ess", "nan"), ("--ess", "inf")])
+def test_impossible_target_leaves_the_run_as_it_is(
+    bwbayes: Type, tmp_path: Path, option: tuple[str, str]
+) -> None:
+    made = small.begun(tmp_path / "a")
+    before = made.config.read_bytes()
+    assert_one_line(bwbayes("resume", "a", *option), "ess")
+    assert before == made.config.read_bytes()
+
+
+def test_damaged_chain_is_one_line(bwbayes: Type, tmp_path: Path) -> None:
+    made = small.begun(tmp_path / "a")
+    made.chain.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(1000))
+    assert_one_line(bwbayes("resume", "a"), "chain.h5: the chain cannot be read")
+
+
+# What commands do
+
+
+def test_check_shows_priors_and_point_fit_and_writes_nothing(bwbayes: Type, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    said = bwbayes("check", "small.toml")
+    assert (0, "") == (said.status, said.err)
+    assert "300 samples every 0.02 s" in said.out
+    for name in ("alpha", "discrepancy_time", "lognormal(median", "fixed at 0.0172"):
+        assert name in said.out
+    assert [tmp_path / "small.toml"] == list(tmp_path.iterdir())
+
+
+def test_check_takes_another_record(bwbayes: Type, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    assert 0 == bwbayes("simulate", "a.csv", "--rate", "50", "--signal", "step50").status
+    assert_one_line(bwbayes("check", "small.toml", "--record", "none.csv"), "none.csv")
+    assert "550 samples" in bwbayes("check", "small.toml", "--record", "a.csv").out
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt", "h5", "mat"])
+def test_simulate_writes_record_and_truth(bwbayes: Type, tmp_path: Path, suffix: str) -> None:
+    said = bwbayes("simulate", f"a.{suffix}", "--signal", "sine", "--duration", "4", "--rate", "50")
+    assert (0, "") == (said.status, said.err)
+    text = suffix in ("csv", "txt")
+    expected = [f"a.{suffix}", *([f"a.truth.{suffix}"] if text else []), "a.truth.json"]
+    assert [f"wrote {name}" for name in expected] == said.out.splitlines()
+    assert set(expected) == {path.name for path in tmp_path.iterdir()}
+    found = read_record(tmp_path / f"a.{suffix}")
+    assert (200, "command") == (found.samples, found.voltage_is)
+    assert found.truth is not None
+    assert found.displacement is not None
+    assert np.std(found.displacement - found.truth) < 1  # the sensor's noise
+    assert 0.3575 == json.loads((tmp_path / "a.truth.json").read_text())["alpha"]
+
+
+def test_simulated_record_depends_on_its_seed(bwbayes: Type, tmp_path: Path) -> None:
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        said = bwbayes("simulate", f"{name}.csv", "--rate", "50", "--seed", seed)
+        assert 0 == said.status
+    first, again, other = (read_record(tmp_path / f"{name}.csv") for name in "abc")
+    assert first.sha256 == again.sha256 != other.sha256
+
+
+def test_default_folder_is_named_after_the_config(run: Path) -> None:
+    """The shared run was made without --out."""
+    assert ("results", "small") == (run.parent.name, run.name)
+    assert "small" in (run / "config.toml").read_text().splitlines()[0]
+
+
+def test_quiet_run_printed_nothing(run: Path) -> None:
+    """It is asserted where the shared run is made."""
+    assert json.loads((run / "summary.json").read_text())["converged"] is True
+
+
+def columns(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open() as file:
+        header = next(csv.reader(file))
+    return header, np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+BANDS = [
+    f"{kind}_{edge}_{level}_um"
+    for kind in ("parameter", "displacement", "sensor")
+    for level in (50, 90, 95)
+    for edge in ("lower", "upper")
+]
+
+
+def test_predict_writes_the_bands_of_a_signal(bwbayes: Type, run: Path, tmp_path: Path) -> None:
+    said = bwbayes("predict", run, "--signal", "step50", "--from-rest", "--out", "new/bands.csv")
+    assert (0, "") == (said.status, said.err)
+    assert "wrote new/bands.csv" in said.out
+    header, rows = columns(tmp_path / "new/bands.csv")
+    assert ["time_s", "voltage_V", "mean_um"] == header[:3]
+    assert sorted(BANDS) == sorted(header[3:])
+    assert (550, 21) == rows.shape
+    assert np.isfinite(rows).all()
+
+
+def test_predict_writes_the_bands_of_a_measured_record(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    bwbayes("simulate", "new.csv", "--rate", "100", "--seed", "5")
+    said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv")
+    assert (0, "") == (said.status, said.err)
+    assert "CRPS" in said.out
+    assert "%" in said.out
+    header, rows = columns(tmp_path / "bands.csv")
+    assert ["time_s", "voltage_V", "displacement_um", "mean_um"] == header[:4]
+    assert sorted(BANDS) == sorted(header[4:])
+    record = read_record(tmp_path / "new.csv")
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.time, rows[:, 0], atol=1e-9)
+    np.testing.assert_allclose(record.displacement, rows[:, 2], rtol=1e-6)
+
+
+def test_predict_takes_a_voltage_alone(bwbayes: Type, run: Path, tmp_path: Path) -> None:
+    rows = [f"{i / 100},{50 * np.sin(i / 30)}" for i in range(300)]
+    (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows))
+    said = bwbayes("predict", run, "--record", "plan.csv", "--out", "bands.csv")
+    assert (0, "") == (said.status, said.err)
+    assert "CRPS" not in said.out
+    header, _ = columns(tmp_path / "bands.csv")
+    assert ["time_s", "voltage_V", "mean_um"] == header[:3]
+
+
+def test_lead_in_longer_than_the_record_is_refused(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "new.csv").write_bytes(lines(HEADER, *ROWS))
+    said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv")
+    assert_one_line(said, "lead-in of 1 s leaves nothing of 0.6 s")
+    assert not (tmp_path / "bands.csv").exists()
+    said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv", "--lead-in", "0.2")
+    assert 0 == said.status
+
+
+@pytest.mark.parametrize("command", [(), ("--help",)])
+def test_installed_command_starts(command: tuple[str, ...]) -> None:
+    done = subprocess.run(small.command(*command), capture_output=True, text=True, check=False)
+    assert (0, "") == (done.returncode, done.stderr)
+    assert "Commands:" in done.stdout
+
+
+def test_group_works_in_clicks_own_runner() -> None:
+    assert 0 == CliRunner().invoke(cli.cli, ["run", "--help"]).exit_code

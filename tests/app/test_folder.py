@@ -1,0 +1,164 @@
+"""A run's folder comes to be whole or not at all, has one writer, and is never lost by mistake."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import pytest
+
+from bwbayes.app.config import load
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import Problem, resolve
+from bwbayes.errors import InputError
+from tests.app import small
+
+FORKS = multiprocessing.get_context("forkserver")
+NOBODY = 65534
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    return resolve(small.config(), tmp_path_factory.mktemp("config"))
+
+
+def content(path: Path) -> dict[str, bytes]:
+    files = [file for file in path.rglob("*") if file.is_file() and file.name != ".lock"]
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def assert_refused(path: Path, problem: Problem, *, overwrite: bool, why: str) -> None:
+    with pytest.raises(InputError, match=why) as error:
+        RunFolder.create(path, problem, overwrite)
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -> None:
+    made = RunFolder.create(tmp_path / "results" / "a", problem, overwrite=False)
+    assert {"config.toml", "records/record.h5", "records/sine.h5"} == set(content(made.path))
+    assert [made.path] == list((tmp_path / "results").iterdir())
+    assert problem.config == load(made.config)
+    assert made == RunFolder.open(made.path)
+
+
+def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Problem) -> None:
+    path = tmp_path / "a"
+    made = RunFolder.create(path, problem, overwrite=False)
+    made.chain.write_bytes(b"draws")
+    before = content(path)
+    assert_refused(path, problem, overwrite=False, why=f"go on with `bwbayes resume {path}`")
+    assert before == content(path)
+    RunFolder.create(path, problem, overwrite=True)
+    assert not made.chain.exists()
+    assert made.config.is_file()
+
+
+@pytest.mark.parametrize("named", ["thesis.tex", "config.toml", "records/notes.txt"])
+def test_folder_that_is_no_runs_is_never_replaced(
+    tmp_path: Path, problem: Problem, named: str
+) -> None:
+    path = tmp_path / "mine"
+    (path / named).parent.mkdir(parents=True)
+    (path / named).write_text("years of work")
+    assert_refused(path, problem, overwrite=False, why="exists")
+    assert_refused(path, problem, overwrite=True, why="is not a run's folder")
+    assert {named: b"years of work"} == content(path)
+
+
+def test_file_is_never_replaced(tmp_path: Path, problem: Problem) -> None:
+    path = tmp_path / "mine"
+    path.write_text("years of work")
+    assert_refused(path, problem, overwrite=True, why="is not a run's folder")
+    assert "years of work" == path.read_text()
+    assert_refused(path / "below", problem, overwrite=False, why="Not a directory")
+
+
+def test_empty_folder_may_be_used_when_told(tmp_path: Path, problem: Problem) -> None:
+    path = tmp_path / "empty"
+    path.mkdir()
+    assert_refused(path, problem, overwrite=False, why="exists")
+    assert RunFolder.create(path, problem, overwrite=True).config.is_file()
+
+
+def test_what_an_interrupted_start_left_does_not_hurt(tmp_path: Path, problem: Problem) -> None:
+    left = tmp_path / ".a.partial"
+    (left / "records").mkdir(parents=True)
+    (left / "records/old.h5").write_bytes(b"half a record")
+    made = RunFolder.create(tmp_path / "a", problem, overwrite=False)
+    assert "records/old.h5" not in content(made.path)
+    assert [made.path] == list(tmp_path.iterdir())
+
+
+def test_folder_without_a_run_cannot_be_opened(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "none"):
+        with pytest.raises(InputError, match=f"{path}: no run here; start one with"):
+            RunFolder.open(path)
+
+
+def hold(path: Path, held: Event, enough: Event) -> None:
+    with RunFolder(path).locked():
+        held.set()
+        enough.wait(60)
+
+
+def test_second_writer_is_refused_while_the_first_one_lives(
+    tmp_path: Path, problem: Problem
+) -> None:
+    made = RunFolder.create(tmp_path / "a", problem, overwrite=False)
+    held, enough = FORKS.Event(), FORKS.Event()
+    other = FORKS.Process(target=hold, args=(made.path, held, enough))
+    other.start()
+    try:
+        assert held.wait(60)
+        before = content(made.path)
+        with pytest.raises(InputError, match="another process is writing"), made.locked():
+            pass
+        assert_refused(made.path, problem, overwrite=True, why="another process is writing")
+        assert before == content(made.path)
+    finally:
+        other.kill()  # which gives the lock back
+        other.join()
+    with made.locked():
+        pass
+
+
+@contextmanager
+def powerless() -> Iterator[None]:
+    """Give up root's right to write anywhere."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.fixture
+def read_only() -> Iterator[Path]:
+    """Return a folder that may only be read."""
+    # Not below pytest's own folder, which others may not even enter.
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name)
+        yield path
+        path.chmod(0o755)
+
+
+def test_read_only_folder_is_refused(read_only: Path, problem: Problem) -> None:
+    made = RunFolder.create(read_only / "a", problem, overwrite=False)
+    for path in (made.path, read_only):
+        path.chmod(0o555)
+    with powerless():
+        assert_refused(read_only / "b", problem, overwrite=False, why="Permission denied")
+        with pytest.raises(InputError, match="Permission denied; make the folder"), made.locked():
+            pass
+        assert_refused(made.path, problem, overwrite=True, why="Permission denied")
+    made.path.chmod(0o755)
+    assert made.config.is_file()

@@ -1,0 +1,411 @@
+"""A run leaves what it should, says nothing it cannot know, and does not depend on its pieces."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+
+from bwbayes.app import run as module
+from bwbayes.app.cli import _finish
+from bwbayes.app.config import load, parse
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.predict import predict
+from bwbayes.app.progress import Progress
+from bwbayes.app.run import carry_on, redraw
+from bwbayes.data import read_record, write_record
+from bwbayes.errors import InputError
+from bwbayes.inference import sampling
+from bwbayes.inference.chain import Phase
+from bwbayes.inference.chainfile import ChainFile
+from bwbayes.inference.diagnostics import Check
+from bwbayes.results.prediction import Start
+from tests.app import small
+
+FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
+LEVELS = {"50", "90", "95"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> RunFolder:
+    """Return a copy of the finished run, to be changed."""
+    shutil.copytree(run, tmp_path / "copy")
+    return RunFolder.open(tmp_path / "copy")
+
+
+@pytest.fixture
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the time that pictures take, where they are not what is tested."""
+    monkeypatch.setattr(module, "draw_all", lambda _: {})
+
+
+# What a run leaves
+
+
+def test_run_leaves_these_files(run: Path) -> None:
+    assert {
+        "config.toml",
+        "chain.h5",
+        "posterior.nc",
+        "summary.json",
+        "bands.csv",
+        "report.html",
+        "figures",
+        "records",
+        ".lock",
+    } == {path.name for path in run.iterdir()} | {".lock"}
+    pictures = {path.name for path in (run / "figures").iterdir()}
+    assert {"loop.png", "corner.png", "trace.png", "ranks.png", "coverage.png"} <= pictures
+    assert {f"bands_{name}.png" for name in ("training", "held-out", "sine")} <= pictures
+
+
+def test_summary_is_written_last(run: Path) -> None:
+    last = (run / "summary.json").stat().st_mtime_ns
+    others = [p for p in run.rglob("*") if p.is_file() and p.name not in ("summary.json", ".lock")]
+    assert max(p.stat().st_mtime_ns for p in others) <= last
+
+
+def assert_numbers(table: dict[str, Any], *names: str) -> None:
+    for name in names:
+        assert type(table[name]) is float, name
+
+
+def test_summary_says_how_the_run_ended(run: Path) -> None:
+    found = json.loads((run / "summary.json").read_text())
+    assert found["converged"] is True
+    assert "converged on two checks in a row" == found["stop_reason"]
+    assert 3 == found["seed"]
+    assert_numbers(found, "wall_s")
+    assert 0 < found["wall_s"]
+    assert {"python", "bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py"} <= set(
+        found["versions"]
+    )
+    assert all(isinstance(text, str) for text in found["versions"].values())
+    problem = module.load_run(RunFolder(run))
+    assert problem.record.sha256 == found["data_sha256"]
+
+
+def test_summary_has_every_free_parameter(run: Path) -> None:
+    found = json.loads((run / "summary.json").read_text())["parameters"]
+    assert set(FREE) == set(found)
+    for name, row in found.items():
+        assert_numbers(row, "mean", "sd", "median", "lower_95", "upper_95")
+        assert_numbers(row, "ess_bulk", "ess_tail", "rhat", "mcse_mean")
+        assert isinstance(row["unit"], str), name
+        assert row["lower_95"] < row["median"] < row["upper_95"]
+        assert row["lower_95"] < row["mean"] < row["upper_95"]
+        assert min(row["ess_bulk"], row["ess_tail"]) >= 200
+        assert row["rhat"] < 1.01
+        assert 0 < row["mcse_mean"] < row["sd"]
+    assert ("um/V", "1/V", "s") == tuple(found[n]["unit"] for n in ("d", "beta", "lag"))
+
+
+def test_summary_judges_every_prediction(run: Path) -> None:
+    found = json.loads((run / "summary.json").read_text())["validation"]
+    assert {"held-out", "sine"} <= set(found)
+    for row in found.values():
+        assert_numbers(row, "nrmse", "max_error_um", "crps_um", "width_95_um")
+        assert 0 < row["nrmse"] < 0.1
+        for kind in ("sensor", "displacement"):
+            assert LEVELS == set(row["coverage"][kind])
+            assert all(0 <= part <= 1 for part in row["coverage"][kind].values())
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_coverage_of_the_displacement_needs_a_truth(copy: RunFolder) -> None:
+    path = copy.path / "records/sine.h5"
+    write_record(replace(read_record(path), truth=None), path)
+    carry_on(copy, small.quiet(), workers=1)
+    found = small.numbers(copy.path)["validation"]
+    assert found["sine"]["coverage"]["displacement"] is None
+    assert set(found["sine"]["coverage"]["sensor"]) == LEVELS
+    assert found["held-out"]["coverage"]["displacement"] is not None
+
+
+def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
+    tree = xarray.open_datatree(run / "posterior.nc", engine="h5netcdf")
+    assert {"posterior", "sample_stats", "observed_data", "constant_data"} <= set(tree.children)
+    posterior = tree["posterior"].to_dataset()
+    assert set(FREE) == set(posterior.data_vars)
+    assert ("chain", "draw") == posterior["alpha"].dims
+    assert 4 * 18 == posterior.sizes["chain"]
+    assert [0, 1, 2, 3] == sorted(set(posterior["ensemble"].values))
+    assert list(range(18)) == sorted(set(posterior["walker"].values))
+    assert "um/V" == posterior["alpha"].attrs["units"]
+
+
+def test_posterior_is_the_chain(run: Path) -> None:
+    problem = module.load_run(RunFolder(run))
+    chain = ChainFile.read(run / "chain.h5")
+    draws = sampling.draws(problem.posterior, chain)
+    density = chain.log_density("sampling")
+    with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
+        posterior = tree["posterior"].to_dataset()
+        lp = tree["sample_stats"].to_dataset()["lp"].values
+        for number in (0, 17, 18, 71):
+            e, w = posterior["ensemble"].values[number], posterior["walker"].values[number]
+            np.testing.assert_array_equal(density[:, e, w], lp[number])
+            for i, name in enumerate(problem.posterior.names):
+                np.testing.assert_array_equal(draws[:, e, w, i], posterior[name].values[number])
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_bands_have_every_window_and_kind(run: Path) -> None:
+    found = rows(run / "bands.csv")
+    kinds = ("parameter", "displacement", "sensor")
+    edges = {f"{k}_{e}_{n}_um" for k in kinds for e in ("lower", "upper") for n in LEVELS}
+    names = {"set", "time_s", "voltage_V", "displacement_um", "mean_um"}
+    assert names | edges == set(found[0])
+    counts = {n: sum(row["set"] == n for row in found) for n in ("training", "held-out", "sine")}
+    assert {"training": 250, "held-out": 50, "sine": 200} == counts
+    assert all(np.isfinite(float(v)) for row in found for n, v in row.items() if n != "set")
+
+
+def test_report_needs_nothing_but_itself(run: Path) -> None:
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
+    assert "url(http" not in page
+    assert "@import" not in page
+
+
+def test_resolved_config_runs_by_itself(run: Path) -> None:
+    problem = module.load_run(RunFolder(run))
+    assert problem.config == load(run / "config.toml")
+
+
+def test_chain_says_what_was_run(run: Path) -> None:
+    attributes = ChainFile.read(run / "chain.h5").attributes()
+    assert load(run / "config.toml") == parse(str(attributes["config"]), "")
+    assert 3 == attributes["seed"]
+    assert small.numbers(run)["data_sha256"] == attributes["data_sha256"]
+    assert "numpy" in json.loads(str(attributes["versions"]))
+    assert attributes["platform"]
+
+
+# The same bits, in however many pieces
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_two_workers_give_the_same_bits_as_one(run: Path, tmp_path: Path) -> None:
+    made = small.begun(tmp_path / "small")
+    carry_on(made, small.quiet(), workers=2)
+    small.assert_same_end(run, made.path)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_interrupted_run_goes_on_to_the_same_bits(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupted in its pilot, its tuning, twice in its sampling, and while it writes files."""
+    made = small.begun(tmp_path / "small")
+    for phase, blocks in (("pilot", 2), ("tuning", 1), ("sampling", 1), ("sampling", 2)):
+        watch_until(monkeypatch, phase, 4 * blocks + 1)  # in the middle of a block
+        with pytest.raises(KeyboardInterrupt):
+            carry_on(made, small.quiet(), workers=1)
+        assert not made.summary.exists()
+    monkeypatch.undo()
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "write_bands", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            carry_on(made, small.quiet(), workers=1)
+    assert not made.summary.exists()
+    monkeypatch.setattr(module, "draw_all", lambda _: {})
+    carry_on(made, small.quiet(), workers=1)
+    small.assert_same_end(run, made.path)
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def watch_until(monkeypatch: pytest.MonkeyPatch, last: str, count: int) -> None:
+    """Interrupt the next run after so many blocks of single ensembles in a phase."""
+    seen = 0
+
+    def watched(_: Progress, phase: Phase, found: Check | None) -> None:
+        nonlocal seen
+        seen += phase == last and found is None
+        if seen == count:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Progress, "__call__", watched)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_finished_run_goes_on_to_itself(run: Path, copy: RunFolder) -> None:
+    carry_on(copy, small.quiet(), workers=1)
+    small.assert_same_end(run, copy.path)
+
+
+def test_interrupted_command_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = small.begun(tmp_path / "a")
+    watch_until(monkeypatch, "pilot", 5)
+    assert 130 == _finish(made.path, 1, quiet=True)
+    printed = capsys.readouterr()
+    assert f"interrupted; go on with `bwbayes resume {made.path}`\n" == printed.err
+    assert "" == printed.out
+    assert 1 == ChainFile.read(made.chain).blocks("pilot")
+
+
+# Without convergence
+
+
+@pytest.fixture(scope="module")
+def cut_short(run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]:
+    """Return a run that used up its budget, and the exit status of its command."""
+    path = tmp_path_factory.mktemp("short") / "small"
+    made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
+    assert run.exists()
+    return made, _finish(made.path, 1, quiet=True)
+
+
+def test_run_without_convergence_speaks_of_no_interval(
+    cut_short: tuple[RunFolder, int],
+) -> None:
+    made, status = cut_short
+    assert 4 == status
+    found = small.numbers(made.path)
+    assert (False, None, None) == (found["converged"], found["parameters"], found["validation"])
+    assert found["stop_reason"].startswith("budget of 25 steps used up: ")
+    bands = made.path / "bands.csv"
+    assert not bands.exists() or not bands.read_text().strip()
+    page = (made.path / "report.html").read_text(encoding="utf-8")
+    assert "95 %" not in re.sub(r"<style.*?</style>|src=\"data:[^\"]*\"", "", page, flags=re.S)
+    assert not list((made.path / "figures").glob("bands*"))
+    assert not list((made.path / "figures").glob("co*"))  # corner, coverage
+
+
+def test_run_without_convergence_keeps_its_draws(cut_short: tuple[RunFolder, int]) -> None:
+    made, _ = cut_short
+    assert 25 == ChainFile.read(made.chain).steps("sampling")
+
+
+def test_line_on_the_screen_says_what_to_do(
+    cut_short: tuple[RunFolder, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(cut_short[0].path, tmp_path / "a")
+    assert 4 == _finish(tmp_path / "a", 1, quiet=True)
+    printed = capsys.readouterr()
+    assert "" == printed.out
+    assert 1 == printed.err.count("\n")
+    assert printed.err.startswith("NOT CONVERGED: budget of 25 steps used up: ")
+    assert f"`bwbayes resume {tmp_path / 'a'} --steps N`" in printed.err
+
+
+def test_prediction_from_it_is_refused(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:
+    made, _ = cut_short
+    out = tmp_path / "bands.csv"
+    start = Start(from_rest=True)
+    assert 4 == predict(made.path, None, "step10", start, out, small.quiet())
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_larger_budget_converges_to_what_it_would_have_been(
+    run: Path, cut_short: tuple[RunFolder, int], tmp_path: Path
+) -> None:
+    shutil.copytree(cut_short[0].path, tmp_path / "small")
+    made = RunFolder.open(tmp_path / "small")
+    result = carry_on(made, small.quiet(), workers=1, steps=20_000)
+    assert result.outcome.converged
+    assert 20_000 == load(made.config).sampling.steps
+    small.assert_same_end(run, made.path)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: RunFolder) -> None:
+    before = small.numbers(run)["parameters"]
+    fewest = min(min(row["ess_bulk"], row["ess_tail"]) for row in before.values())
+    wanted = float(np.ceil(1.3 * fewest))
+    result = carry_on(copy, small.quiet(), workers=1, ess=wanted)
+    assert result.outcome.converged
+    first, longer = ChainFile.read(run / "chain.h5"), ChainFile.read(copy.chain)
+    steps = first.steps("sampling")
+    assert steps < longer.steps("sampling")
+    np.testing.assert_array_equal(
+        first.coordinates("sampling"), longer.coordinates("sampling")[:steps]
+    )
+    found = small.numbers(copy.path)["parameters"]
+    assert all(min(row["ess_bulk"], row["ess_tail"]) >= wanted for row in found.values())
+
+
+# Files that do not fit together
+
+
+def test_chain_of_another_record_is_refused(copy: RunFolder) -> None:
+    path = copy.path / "records/record.h5"
+    record = read_record(path)
+    write_record(replace(record, voltage=record.voltage + 1e-9), path)
+    before = copy.chain.read_bytes()
+    with pytest.raises(InputError, match="belongs to another record"):
+        carry_on(copy, small.quiet(), workers=1)
+    assert copy.summary.exists()
+    assert len(before) == len(copy.chain.read_bytes())
+
+
+def test_running_run_has_one_writer(copy: RunFolder) -> None:
+    with copy.locked(), pytest.raises(InputError, match="another process is writing this run"):
+        carry_on(copy, small.quiet(), workers=1)
+
+
+# Drawing again
+
+
+def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder) -> None:
+    for name in ("report.html", "bands.csv", "posterior.nc"):
+        (copy.path / name).unlink()
+    shutil.rmtree(copy.path / "figures")
+    redraw(copy)
+    assert json.loads((run / "summary.json").read_text()) == json.loads(copy.summary.read_text())
+    small.assert_same_end(run, copy.path)
+    assert (copy.path / "report.html").stat().st_size > 100_000
+    names = {path.name for path in (run / "figures").iterdir()}
+    assert names == {path.name for path in (copy.path / "figures").iterdir()}
+
+
+def test_unfinished_run_is_not_drawn(copy: RunFolder) -> None:
+    copy.summary.unlink()
+    with pytest.raises(InputError, match="not finished; go on with `bwbayes resume"):
+        redraw(copy)
+
+
+def test_chain_without_draws_predicts_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = small.begun(tmp_path / "a")
+    with pytest.raises(InputError, match="does not exist"):
+        module.finished(made)
+    watch_until(monkeypatch, "pilot", 5)
+    with pytest.raises(KeyboardInterrupt):
+        carry_on(made, small.quiet(), workers=1)
+    with pytest.raises(InputError, match="no draws yet; go on with `bwbayes resume"):
+        module.finished(made)
+
+
+def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:
+    """A target that is missed takes back the intervals that a lower one had given."""
+    steps = ChainFile.read(copy.chain).steps("sampling")
+    result = carry_on(copy, small.quiet(), workers=1, ess=1e6, steps=steps)
+    assert not result.outcome.converged
+    assert {"trace.png", "ranks.png"} == {p.name for p in (copy.path / "figures").iterdir()}
+    assert small.numbers(copy.path)["validation"] is None
+    assert not (copy.path / "bands.csv").read_text()
