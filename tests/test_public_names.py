@@ -37,9 +37,9 @@ PUBLIC = {
 HOMES = {
     text.split(" as ")[-1]: (module, text.split(" as ")[0])
     for module, texts in PUBLIC.items()
-    for text in texts
+    for text in sorted(texts)
 }
-every_name = pytest.mark.parametrize("name", HOMES)
+every_name = pytest.mark.parametrize("name", sorted(HOMES))
 
 
 def test_the_public_names_are_these() -> None:

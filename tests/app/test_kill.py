@@ -93,15 +93,24 @@ def appears(name: str) -> Moment:
     return lambda folder: (folder / name).exists()
 
 
+def soon_after(moment: Moment) -> Moment:
+    def reached(folder: Path) -> bool:
+        if not moment(folder):
+            return False
+        time.sleep(0.3)
+        return True
+
+    return reached
+
+
 # In the order in which a run comes by them: each is reached after going on from the one before.
 MOMENTS: dict[str, Moment] = {
     "start": appears("config.toml"),
-    "point fit": appears(".lock"),
-    "chain": appears("chain.h5"),
+    "point fit": soon_after(appears(".lock")),
     "pilot": blocks("pilot", 3),
-    "copy": appears("chain.fresh"),
     "tuning": blocks("tuning", 2),
     "sampling": blocks("sampling", 3),
+    "later": blocks("sampling", 6),
     "final outputs": appears("bands.csv"),
 }
 
@@ -114,6 +123,7 @@ def test_killed_at_every_stage_it_resumes_to_the_same_bits(run: Path, tmp_path: 
         new = not folder.exists()
         command = ["run", "small.toml"] if new else ["resume", "results/small"]
         workers = "2" if name == "sampling" else "1"
+        (folder / ".lock").unlink(missing_ok=True)
         with started(tmp_path, small.command(*command, "--quiet", "--workers", workers)) as process:
             wait(process, moment, folder)
             if process.poll() is None:
@@ -128,8 +138,16 @@ def test_killed_at_every_stage_it_resumes_to_the_same_bits(run: Path, tmp_path: 
     small.assert_same_end(run, folder)
 
 
-@pytest.mark.parametrize(("asked", "everyone"), [(signal.SIGTERM, False), (signal.SIGINT, True)])
-@pytest.mark.parametrize("moment", [appears(".lock"), blocks("pilot", 1)])
+@pytest.mark.parametrize(
+    ("asked", "everyone", "moment"),
+    [
+        (signal.SIGTERM, False, soon_after(appears(".lock"))),
+        (signal.SIGTERM, True, blocks("pilot", 1)),
+        (signal.SIGINT, True, soon_after(appears("chain.h5"))),
+        (signal.SIGINT, True, blocks("pilot", 1)),
+    ],
+    ids=["terminate point fit", "terminate pilot", "Ctrl-C starting workers", "Ctrl-C pilot"],
+)
 def test_request_to_stop_ends_in_order(
     tmp_path: Path, asked: signal.Signals, everyone: bool, moment: Moment
 ) -> None:
