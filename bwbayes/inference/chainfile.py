@@ -166,6 +166,8 @@ class ChainFile(Chain):
     def _load(cls, path: Path, file: Any) -> ChainFile:
         if file.attrs["format"] != FORMAT:
             raise ValueError(f"its format is {file.attrs['format']}, this version reads {FORMAT}")
+        # Read before anything that it counts: a dataset that is open already may have grown since.
+        committed = file["committed"][:]
         point = PointFit(
             **{name: file["point"][name][()] for name in _POINT[:-1]},
             log_density=float(file["point"]["log_density"][0]),
@@ -174,7 +176,6 @@ class ChainFile(Chain):
         states = zip(start["coordinates"], start["log_density"], start["random_state"], strict=True)
         block = int(file["pilot"]["coordinates"].chunks[0])
         loaded = cls(path, point, [EnsembleState(*state) for state in states], block)
-        committed = file["committed"][:]
         for place, phase in enumerate(PHASES):
             if committed[len(PHASES) + place]:
                 loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])

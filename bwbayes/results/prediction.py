@@ -34,8 +34,9 @@ __all__ = ["DRAWS", "Start", "predict_record", "predict_windows", "thinned"]
 # Posterior draws in the mixture.
 DRAWS = 1000
 
-# Samples that are simulated and summarised at once.
+# Samples that are simulated and summarised at once, and how many such pieces side by side.
 PIECE = 1024
+THREADS = 2
 
 # Earlier drives that a record's initial state may come from, and their most turning points.
 EARLIER_DRIVES = 16
@@ -254,11 +255,10 @@ def _informed(
 def _bands(name: str, actuator: Actuator, mixed: _Draws, record: Record, window: slice) -> Bands:
     """Walk through a record and summarise the mixture over a window."""
     pieces = _simulated(actuator, mixed.model, record.voltage, window)
-    workers = 2
     parts: list[dict[str, FloatArray]] = []
-    with ThreadPoolExecutor(workers) as executor:
+    with ThreadPoolExecutor(THREADS) as executor:
         # A few pieces at a time: all of them would not fit into memory.
-        while batch := [piece for _, piece in zip(range(workers), pieces, strict=False)]:
+        while batch := [piece for _, piece in zip(range(THREADS), pieces, strict=False)]:
             parts += executor.map(lambda piece: _summarised(mixed, record, *piece), batch)
     joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return Bands(

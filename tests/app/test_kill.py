@@ -110,7 +110,6 @@ MOMENTS: dict[str, Moment] = {
     "pilot": blocks("pilot", 3),
     "tuning": blocks("tuning", 2),
     "sampling": blocks("sampling", 3),
-    "later": blocks("sampling", 6),
     "final outputs": appears("bands.csv"),
 }
 

@@ -6,19 +6,21 @@ import csv
 import json
 import re
 import shutil
+import time
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray
+from rich.console import Console
 
 from bwbayes.app import run as module
 from bwbayes.app.cli import _finish
 from bwbayes.app.config import load, parse
 from bwbayes.app.folder import RunFolder
-from bwbayes.app.predict import predict
 from bwbayes.app.progress import Progress
 from bwbayes.app.run import carry_on, redraw
 from bwbayes.data import read_record, write_record
@@ -27,7 +29,6 @@ from bwbayes.inference import sampling
 from bwbayes.inference.chain import Phase
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.diagnostics import Check
-from bwbayes.results.prediction import Start
 from tests.app import small
 
 FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
@@ -266,69 +267,21 @@ def test_interrupted_command_says_how_to_go_on(
     assert 1 == ChainFile.read(made.chain).blocks("pilot")
 
 
-# Without convergence
+def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
+    problem = module.load_run(RunFolder(run))
+    _, _, outcome = module.finished(RunFolder(run))
+    said = StringIO()
+    progress = Progress(Console(file=said, width=40), problem.plan)
+    progress.begun = progress.printed = time.monotonic() - 60
+    progress("sampling", outcome.check)  # of a run that goes on: nothing was done yet
+    for _ in range(4):
+        progress("sampling", None)
+    assert re.search(r" 30 models/s   ETA 0:00   acceptance 0", progress.line("sampling"))
+    line = r"sampling +\d+ steps +0 models/s   ETA unknown   acceptance 0\.\d\d   R-hat 1\.\d{3}   "
+    assert re.fullmatch(line + r"ESS \d+ of 200\n", said.getvalue())
 
 
-@pytest.fixture(scope="module")
-def cut_short(run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]:
-    """Return a run that used up its budget, and the exit status of its command."""
-    path = tmp_path_factory.mktemp("short") / "small"
-    made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
-    assert run.exists()
-    return made, _finish(made.path, 1, quiet=True)
-
-
-def test_run_without_convergence_speaks_of_no_interval(
-    cut_short: tuple[RunFolder, int],
-) -> None:
-    made, status = cut_short
-    assert 4 == status
-    found = small.numbers(made.path)
-    assert (False, None, None) == (found["converged"], found["parameters"], found["validation"])
-    assert found["stop_reason"].startswith("budget of 25 steps used up: ")
-    bands = made.path / "bands.csv"
-    assert not bands.exists() or not bands.read_text().strip()
-    page = (made.path / "report.html").read_text(encoding="utf-8")
-    assert "95 %" not in re.sub(r"<style.*?</style>|src=\"data:[^\"]*\"", "", page, flags=re.S)
-    assert not list((made.path / "figures").glob("bands*"))
-    assert not list((made.path / "figures").glob("co*"))  # corner, coverage
-
-
-def test_run_without_convergence_keeps_its_draws(cut_short: tuple[RunFolder, int]) -> None:
-    made, _ = cut_short
-    assert 25 == ChainFile.read(made.chain).steps("sampling")
-
-
-def test_line_on_the_screen_says_what_to_do(
-    cut_short: tuple[RunFolder, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(cut_short[0].path, tmp_path / "a")
-    assert 4 == _finish(tmp_path / "a", 1, quiet=True)
-    printed = capsys.readouterr()
-    assert "" == printed.out
-    assert 1 == printed.err.count("\n")
-    assert printed.err.startswith("NOT CONVERGED: budget of 25 steps used up: ")
-    assert f"`bwbayes resume {tmp_path / 'a'} --steps N`" in printed.err
-
-
-def test_prediction_from_it_is_refused(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:
-    made, _ = cut_short
-    out = tmp_path / "bands.csv"
-    start = Start(from_rest=True)
-    assert 4 == predict(made.path, None, "step10", start, out, small.quiet())
-    assert not out.exists()
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_larger_budget_converges_to_what_it_would_have_been(
-    run: Path, cut_short: tuple[RunFolder, int], tmp_path: Path
-) -> None:
-    shutil.copytree(cut_short[0].path, tmp_path / "small")
-    made = RunFolder.open(tmp_path / "small")
-    result = carry_on(made, small.quiet(), workers=1, steps=20_000)
-    assert result.outcome.converged
-    assert 20_000 == load(made.config).sampling.steps
-    small.assert_same_end(run, made.path)
+# A larger target
 
 
 @pytest.mark.usefixtures("_without_pictures")
