@@ -10,12 +10,14 @@ import math
 import signal
 import sys
 from pathlib import Path
+from typing import get_args
 
 import click
 from rich.console import Console
 
 from bwbayes.app.config import LARGEST_SEED, load
 from bwbayes.errors import InputError
+from bwbayes.inference.engine import Engine
 
 __all__ = ["main"]
 
@@ -26,7 +28,7 @@ INTERRUPTED = 130
 # Options that several commands share.
 FILE = click.Path(path_type=Path)
 workers_option = click.option(
-    "--workers", type=click.IntRange(1), help="Processes for the ensembles; default: all cores."
+    "--workers", type=click.IntRange(1), help="Ensembles side by side; default: all cores."
 )
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
@@ -80,16 +82,26 @@ def run(
 @click.argument("folder", type=FILE)
 @click.option("--ess", type=click.FloatRange(1), help="A new target of effective draws.")
 @click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
+@click.option(
+    "--engine",
+    type=click.Choice(get_args(Engine)),
+    help="Go on with this engine, whatever the chain was begun with.",
+)
 @workers_option
 @quiet_option
 def resume(
-    folder: Path, ess: float | None, steps: int | None, workers: int | None, quiet: bool
+    folder: Path,
+    ess: float | None,
+    steps: int | None,
+    engine: Engine | None,
+    workers: int | None,
+    quiet: bool,
 ) -> int:
     """Go on with the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    return _finish(folder, workers, quiet, ess=ess, steps=steps)
+    return _finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine)
 
 
 @cli.command()
@@ -210,6 +222,7 @@ def _finish(
     *,
     ess: float | None = None,
     steps: int | None = None,
+    engine: Engine | None = None,
 ) -> int:
     from bwbayes.app.folder import RunFolder  # noqa: PLC0415
     from bwbayes.app.run import carry_on  # noqa: PLC0415
@@ -218,7 +231,7 @@ def _finish(
     folder = RunFolder.open(path)
     console = Console(stderr=True, quiet=quiet)
     try:
-        result = carry_on(folder, console, workers=workers, ess=ess, steps=steps)
+        result = carry_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine)
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
         return INTERRUPTED

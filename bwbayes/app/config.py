@@ -25,6 +25,7 @@ from pydantic import (
 )
 
 from bwbayes.errors import InputError
+from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
     "LARGEST_SEED",
@@ -41,6 +42,10 @@ __all__ = [
 
 # What files hold as a whole number.
 LARGEST_SEED = 2**63 - 1
+
+# Python's TOML reader takes time and memory by the square of what it reads, or worse.
+LARGEST_FILE = 1_000_000  # bytes
+MOST_KEY_PARTS = 100
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
@@ -125,6 +130,7 @@ class ParameterConfig(_Table):
 class SamplingConfig(_Table):
     """When to stop and how to sample; see :class:`bwbayes.inference.sampling.SamplingPlan`."""
 
+    engine: EngineChoice = "auto"
     ess: Positive = 2000.0
     ensembles: Annotated[int, Field(ge=4)] = 4
     walkers: Annotated[int, Field(ge=4, multiple_of=2)] | None = None
@@ -179,6 +185,10 @@ def load(path: Path) -> Config:
         The file cannot be read, is no TOML, or says something that no config can say.
     """
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: is not a regular file; give one")
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{path}: is larger than 1 MB; no config is; check the path")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "is not UTF-8 text"
@@ -189,13 +199,22 @@ def load(path: Path) -> Config:
 def parse(text: str, where: str) -> Config:
     """Read a config from TOML text; ``where`` names it in errors, which are as in :func:`load`."""
     try:
+        _check_keys(text)
         table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
+        # Besides its own error, a ValueError for a whole number that is too long for Python.
         raise InputError(f"{where}: is no TOML: {error}; mend the config") from None
     try:
         return Config.model_validate(table)
     except ValidationError as error:
         raise InputError(_one_line(where, error)) from None
+
+
+def _check_keys(text: str) -> None:
+    for line in text.splitlines():
+        parts = max(part.count(".") for part in re.split("[=,{]", line))
+        if parts > MOST_KEY_PARTS and not line.lstrip().startswith("#"):
+            raise ValueError("a key has too many parts")
 
 
 def dump(config: Config) -> str:
@@ -215,8 +234,15 @@ def _one_line(where: str, error: ValidationError) -> str:
         near = difflib.get_close_matches(place[-1], _keys_at(place[:-1]), n=1, cutoff=0.0)
         return f"{where}: {path}: unknown key; did you mean {near[0]}?"
     message = first["msg"].removeprefix("Value error, ")
-    got = "" if isinstance(first["input"], dict) else f", got {first['input']!r:.60}"
+    got = "" if isinstance(first["input"], dict) else f", got {_shown(first['input'])}"
     return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; mend the config"
+
+
+def _shown(value: object) -> str:
+    try:
+        return f"{value!r:.60}"
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return "a very long number"
 
 
 def _is_branch(part: str) -> bool:

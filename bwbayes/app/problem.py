@@ -30,6 +30,7 @@ from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
 from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.engine import choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
@@ -111,7 +112,13 @@ def resolve(config: Config, folder: Path) -> Problem:
     prior = JointPrior(_parameters(config, names, record, split.training))
     assert record.displacement is not None
     posterior = Posterior(
-        record.voltage, record.displacement, split.training, actuator, noise, prior
+        record.voltage,
+        record.displacement,
+        split.training,
+        actuator,
+        noise,
+        prior,
+        choose(config.sampling.engine),
     )
     windows = iter(split.held_out)
     validations = {
@@ -120,7 +127,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
         for name, v in config.validation.items()
     }
-    explicit = _explicit(config, prior, hold, truth)
+    explicit = _explicit(config, posterior, truth)
     plan = _plan(config, prior)
     return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
 
@@ -279,8 +286,9 @@ def _plan(config: Config, prior: JointPrior) -> SamplingPlan:
     )
 
 
-def _explicit(config: Config, prior: JointPrior, hold: str, truth: Mapping[str, float]) -> Config:
+def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) -> Config:
     """Return the config with every choice made, its records as files beside it."""
+    prior = posterior.prior
     validation = {
         name: v
         if v.window is not None
@@ -297,12 +305,12 @@ def _explicit(config: Config, prior: JointPrior, hold: str, truth: Mapping[str, 
             "record": RecordConfig(file="records/record.h5", train=config.record.train),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
-                hold="zero" if hold == "zero" else "first",
+                hold=posterior.actuator.hold,
                 noise=config.model.noise,
             ),
             "parameters": {p.name: _as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
-                update={"walkers": _plan(config, prior).walkers}
+                update={"walkers": _plan(config, prior).walkers, "engine": posterior.engine}
             ),
             "validation": validation,
             "truth": {n: v for n, v in truth.items() if n in prior.names},

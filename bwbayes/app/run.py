@@ -28,6 +28,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
+from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
 from bwbayes.results.bands import Bands
@@ -73,6 +74,7 @@ def carry_on(
     workers: int | None = None,
     ess: float | None = None,
     steps: int | None = None,
+    engine: Engine | None = None,
 ) -> Result:
     """Do what is left of a run and write its files.
 
@@ -86,6 +88,9 @@ def carry_on(
         Processes for the ensembles; by default one a core. The result does not depend on it.
     ess, steps
         A new target and budget, if given.
+    engine
+        Go on with this engine, whatever the chain was begun with: the same posterior, but from
+        here on not the same bits.
 
     Raises
     ------
@@ -94,12 +99,12 @@ def carry_on(
     """
     begun = time.monotonic()
     with folder.locked(), one_thread():
-        if ess is not None or steps is not None:
-            _retarget(folder, ess, steps)
+        if any(wanted is not None for wanted in (ess, steps, engine)):
+            _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
         with (
-            _chain(folder, problem, console) as chain,
-            executor(workers) as pool,
+            _chain(folder, problem, console, engine) as chain,
+            executor(workers, problem.posterior.engine) as pool,
             Progress(console, problem.plan) as progress,
         ):
             # It is written last, as the sign that all is there; now something is to come.
@@ -148,9 +153,10 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
         return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
 
 
-def versions() -> dict[str, str]:
+def versions(engine: Engine = "numpy") -> dict[str, str]:
     """Return the versions of what computed a result."""
-    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
 def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
@@ -173,7 +179,9 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
     return tuple(bands)
 
 
-def _chain(folder: RunFolder, problem: Problem, console: Console) -> ChainFile:
+def _chain(
+    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
     if folder.chain.exists():
@@ -181,13 +189,23 @@ def _chain(folder: RunFolder, problem: Problem, console: Console) -> ChainFile:
         if chain.attributes()["data_sha256"] != problem.record.sha256:
             chain.close()
             raise InputError(f"{folder.chain}: belongs to another record; run again")
+        begun, now = chain.attributes()["engine"], posterior.engine
+        if begun != now:
+            if wanted is None:
+                chain.close()
+                raise InputError(
+                    f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
+                    f'engine = "{begun}" in {folder.config}, or resume with --engine {now}'
+                )
+            console.print(f"going on with the {now} engine a chain begun with {begun}")
         return chain
     console.print("point fit ...", highlight=False)
     point = pointfit.fit(posterior, generator(config.seed, "point fit"))
     attributes: dict[str, str | int] = {
         "config": dump(config),
         "data_sha256": problem.record.sha256,
-        "versions": json.dumps(versions()),
+        "versions": json.dumps(versions(posterior.engine)),
+        "engine": posterior.engine,
         "platform": platform.platform(),
         "seed": config.seed,
         "parameters": json.dumps(posterior.names),
@@ -196,9 +214,11 @@ def _chain(folder: RunFolder, problem: Problem, console: Console) -> ChainFile:
     return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
 
 
-def _retarget(folder: RunFolder, ess: float | None, steps: int | None) -> None:
+def _retarget(
+    folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
+) -> None:
     config = load(folder.config)
-    wanted = {"ess": ess, "steps": steps}
+    wanted = {"ess": ess, "steps": steps, "engine": engine}
     sampling = config.sampling.model_copy(
         update={name: value for name, value in wanted.items() if value is not None}
     )
@@ -215,6 +235,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     left_open = identifiability.undetermined(posterior, chain.point)
     remarks = [
         *problem.remarks,
+        *outcome.remarks,
         *(f"the record does not determine {c}: the prior decides there" for c in left_open),
     ]
     result = Result(
@@ -223,6 +244,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         parameters=problem.parameters,
         draws=draws(posterior, chain),
         log_density=chain.log_density("sampling"),
+        moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),
         remarks=tuple(remarks),
         truth=problem.config.truth,
@@ -238,9 +260,12 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     windows = ", ".join(
         f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
     )
-    moves = "differential evolution alone"
-    if chain.proposals["sampling"] is not None:
-        moves = "Student-t mixture, differential evolution and snooker"
+    accepted = {
+        phase: ", ".join(
+            f"{n} {accepted / p:.0%}" for n, (p, accepted) in chain.moves(phase).items()
+        )
+        for phase in PHASES
+    }
     return {
         "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
         "data_sha256": record.sha256,
@@ -249,10 +274,12 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
         "noise": config.model.noise,
         "sampling": (
             f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
-            f"{', '.join(f'{chain.steps(phase)} steps of {phase}' for phase in PHASES)}; {moves}"
+            f"{', '.join(f'{chain.steps(phase)} steps of {phase}' for phase in PHASES)}"
         ),
+        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
+        "engine": posterior.engine,
         "seed": str(config.seed),
-    } | {f"version of {name}": text for name, text in versions().items()}
+    } | {f"version of {name}": text for name, text in versions(posterior.engine).items()}
 
 
 def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
@@ -269,7 +296,7 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
     numbers = summary(result) | {
         "seed": problem.config.seed,
         "wall_s": seconds,
-        "versions": versions(),
+        "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
     record = problem.record

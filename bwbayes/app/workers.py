@@ -16,18 +16,21 @@ from contextlib import AbstractContextManager, contextmanager
 
 from threadpoolctl import threadpool_limits
 
+from bwbayes.inference.engine import Engine
+
 __all__ = ["executor", "one_thread"]
 
 
 @contextmanager
-def executor(workers: int | None = None) -> Iterator[Executor]:
+def executor(workers: int | None = None, engine: Engine = "numpy") -> Iterator[Executor]:
     """Give an executor with that many workers, by default one a core.
 
-    Several are processes; a single one is this process itself.
+    Compiled code runs in threads of this process, side by side. Several workers with NumPy, which
+    does not, are processes; a single one is this process itself.
     """
     count = workers or os.cpu_count() or 1
-    pool: Executor = ThreadPoolExecutor(1)
-    if count > 1:
+    pool: Executor = ThreadPoolExecutor(count if engine == "numba" else 1)
+    if count > 1 and engine == "numpy":
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_settle)
         _start(pool, count)

@@ -14,18 +14,36 @@ filter is less sure than in the steady state.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["DiscrepancyNoise", "Noise", "NoiseKind", "WhiteNoise", "noise_model"]
+__all__ = ["DiscrepancyNoise", "Noise", "NoiseKind", "SteadyState", "WhiteNoise", "noise_model"]
 
 NoiseKind = Literal["white", "discrepancy"]
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
+
+
+class SteadyState(NamedTuple):
+    """The steady-state filter of a noise model; each (models,), names as in DiscrepancyNoise.
+
+    ``kept`` is φ, ``predicted`` p, ``variance`` S, ``surplus`` δ (um²) and ``log_decay`` log a.
+    """
+
+    kept: FloatArray
+    predicted: FloatArray
+    variance: FloatArray
+    surplus: FloatArray
+    log_decay: FloatArray
+
+    def start_gain(self, samples: int) -> FloatArray:
+        """Return 1 + δ A (models,): how much the start's surplus counts over that many samples."""
+        powers = np.expm1(2 * samples * self.log_decay) / np.expm1(2 * self.log_decay)
+        return 1 + self.surplus / self.variance * powers
 
 
 class Noise(Protocol):
@@ -37,6 +55,9 @@ class Noise(Protocol):
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
+
+    def steady_state(self, theta: FloatArray) -> SteadyState:
+        """Return the filter that turns residuals into independent innovations in the long run."""
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
@@ -63,6 +84,11 @@ class WhiteNoise:
         samples = residual.shape[1]
         density: FloatArray = -0.5 * squares - samples * (np.log(sensor) + 0.5 * LOG_TWO_PI)
         return density
+
+    def steady_state(self, theta: FloatArray) -> SteadyState:
+        """Nothing is remembered: innovations are the residuals."""
+        none = np.zeros(theta.shape[0])
+        return SteadyState(none, none, theta[:, 0] ** 2, none, none - np.inf)
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """No discrepancy; sd of the sensor."""
@@ -103,10 +129,10 @@ class DiscrepancyNoise:
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Return the exact log density; shapes as in :class:`Noise`."""
         samples = residual.shape[1]
-        phi, variance, surplus, log_a = self._steady_state(theta)
+        steady = self.steady_state(theta)
+        phi, variance, log_a = steady.kept, steady.variance, steady.log_decay
         a = np.exp(log_a)
-        unsure = surplus / variance
-        gain = 1 + unsure * np.expm1(2 * samples * log_a) / np.expm1(2 * log_a)
+        unsure, gain = steady.surplus / variance, steady.start_gain(samples)
         squares = np.empty_like(a)
         for row, values in enumerate(residual):
             eta = lfilter((1.0, -phi[row]), (1.0, -a[row]), values)
@@ -124,9 +150,9 @@ class DiscrepancyNoise:
 
     def whiten(self, theta: FloatArray, series: FloatArray) -> FloatArray:
         """Return steady-state innovations of series (rows, samples) over their sd, at one θ."""
-        phi, variance, _, log_a = (float(v[0]) for v in self._steady_state(theta))
-        innovations = lfilter((1.0, -phi), (1.0, -np.exp(log_a)), series, axis=1)
-        white: FloatArray = innovations / np.sqrt(variance)
+        steady = self.steady_state(theta)
+        filters = (1.0, -steady.kept[0]), (1.0, -np.exp(steady.log_decay[0]))
+        white: FloatArray = lfilter(*filters, series, axis=1) / np.sqrt(steady.variance[0])
         return white
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -137,10 +163,8 @@ class DiscrepancyNoise:
         """Return the same noise for samples ``interval`` seconds apart."""
         return DiscrepancyNoise(interval)
 
-    def _steady_state(
-        self, theta: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return φ, S, δ and log a, each (models,), without cancellation at either extreme."""
+    def steady_state(self, theta: FloatArray) -> SteadyState:
+        """Return the filter without cancellation at either extreme."""
         sensor, process = theta[:, 0] ** 2, theta[:, 1] ** 2
         log_phi = -self.interval / theta[:, 2]
         fresh = -np.expm1(2 * log_phi)
@@ -150,4 +174,5 @@ class DiscrepancyNoise:
         predicted = np.where(half > 0, half + root, fresh * process * sensor / apart)
         with np.errstate(divide="ignore", over="ignore"):
             log_a = np.minimum(log_phi - np.log1p(predicted / sensor), -1e-300)
-        return np.exp(log_phi), predicted + sensor, process - predicted, log_a
+        phi, variance = np.exp(log_phi), predicted + sensor
+        return SteadyState(phi, predicted, variance, process - predicted, log_a)

@@ -13,6 +13,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.model.actuator import Actuator
@@ -38,6 +39,8 @@ class Posterior:
         independent of that of the next, so windows should lie several correlation times apart.
     actuator, noise, prior
         The model; the prior's parameters are those of the actuator followed by those of the noise.
+    engine
+        What computes the likelihood; see :mod:`bwbayes.inference.engine`.
     """
 
     voltage: FloatArray
@@ -46,6 +49,7 @@ class Posterior:
     actuator: Actuator
     noise: Noise
     prior: JointPrior
+    engine: Engine = "numpy"
 
     def __post_init__(self) -> None:
         expected = (*self.actuator.parameters, *self.noise.parameters)
@@ -71,6 +75,13 @@ class Posterior:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters), fixed parameters included."""
+        if self.engine == "numba":
+            # Here, because numba may not be installed, and takes half a second to load.
+            from bwbayes.inference import compiled  # noqa: PLC0415
+
+            return compiled.log_likelihood(
+                theta, self.voltage, self.displacement, self.training, self.actuator, self.noise
+            )
         pieces = range(0, theta.shape[0], BATCH)
         return np.concatenate([self._piece(theta[i : i + BATCH]) for i in pieces])
 

@@ -10,6 +10,7 @@ as the columns of a matrix θ. A long record can be walked through in pieces: th
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -135,7 +136,7 @@ class Actuator:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
         column = dict(zip(self.parameters, models.T, strict=True))
         self._check_domain(column)
-        recursion = self._recursion(column)
+        recursion = self.recursion(column)
         h = self._hysteresis(column, path, state)
         drive = column["d"][:, np.newaxis] * path
         drive -= h
@@ -169,7 +170,8 @@ class Actuator:
                 row = int(np.argmin(allowed))
                 raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
 
-    def _recursion(self, column: dict[str, FloatArray]) -> Recursion:
+    def recursion(self, column: Mapping[str, FloatArray]) -> Recursion:
+        """Return the dynamics' recursion of models given by the columns (models,) of θ."""
         if self.dynamics == "second-order":
             return second_order(
                 column["mass"], column["damping"], column["stiffness"], self.interval, self.hold

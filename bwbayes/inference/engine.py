@@ -1,0 +1,42 @@
+"""Engines: what computes the likelihood.
+
+``"numpy"`` is the reference, always there and meant to be read. ``"numba"`` compiles the same
+computation, ten times faster, and is there if numba is (``pip install bwbayes[fast]``). Both give
+the same log density to rounding; ``"auto"`` takes the faster one that is there.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Literal
+
+from bwbayes.errors import InputError
+
+__all__ = ["Engine", "EngineChoice", "choose"]
+
+Engine = Literal["numpy", "numba"]
+EngineChoice = Literal["auto", "numpy", "numba"]
+
+
+def choose(wanted: EngineChoice = "auto") -> Engine:
+    """Return the engine to use.
+
+    Raises
+    ------
+    InputError
+        ``wanted`` is no engine, or is ``"numba"`` where numba is not installed.
+    """
+    there = find_spec("numba") is not None
+    match wanted:
+        case "auto":
+            return "numba" if there else "numpy"
+        case "numpy":
+            return "numpy"
+        case "numba":
+            if not there:
+                raise InputError(
+                    'engine: numba is not installed; pip install "bwbayes[fast]", or set '
+                    'engine = "auto"'
+                )
+            return "numba"
+    raise InputError(f"engine: {wanted!r} is unknown; write one of auto, numpy, numba")

@@ -1,0 +1,153 @@
+"""The compiled engine gives the reference's numbers, whatever the parameters.
+
+Both engines sum over the samples in another order, so they may differ by rounding: by 1e-10 of
+samples + |log density|.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference import engine, kernels
+from bwbayes.inference.engine import choose
+from bwbayes.inference.noise import NoiseKind
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Dynamics
+from bwbayes.model.linear import Hold
+from tests.inference.problems import posterior_of, ring_bender, short_posterior, truth
+
+MASS = {"mass": 0.00134, "stiffness": 4.1e5}
+
+
+def assert_engines_agree(posterior: Posterior, theta: FloatArray) -> None:
+    expected = replace(posterior, engine="numpy").log_likelihood(theta)
+    got = replace(posterior, engine="numba").log_likelihood(theta)
+    samples = sum(window.stop - window.start for window in posterior.training)
+    np.testing.assert_array_less(np.abs(got - expected), 1e-10 * (samples + np.abs(expected)))
+
+
+def prior_draws(posterior: Posterior, count: int, seed: int = 0) -> FloatArray:
+    prior = posterior.prior
+    return prior.theta(prior.draw(np.random.default_rng(seed), count))
+
+
+def changed(posterior: Posterior, **values: float) -> FloatArray:
+    """Return the truth (1, parameters) with some parameters at other values."""
+    theta = truth(posterior)
+    for name, value in values.items():
+        theta[:, posterior.prior.names.index(name)] = value
+    return theta
+
+
+@pytest.mark.parametrize("noise", ["white", "discrepancy"])
+@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
+def test_engines_agree_on_prior_draws(noise: NoiseKind, dynamics: Dynamics) -> None:
+    fixed = {} if dynamics != "second-order" else MASS
+    posterior = short_posterior(noise, 700, dynamics, fixed)
+    assert_engines_agree(posterior, prior_draws(posterior, 300))
+
+
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_engines_agree_on_either_hold(hold: Hold) -> None:
+    posterior = short_posterior(dynamics="lag")
+    posterior = replace(posterior, actuator=replace(posterior.actuator, hold=hold))
+    assert_engines_agree(posterior, prior_draws(posterior, 40))
+
+
+@pytest.mark.parametrize("count", [1, kernels.LANES - 1, kernels.LANES, kernels.LANES + 1, 100])
+def test_any_number_of_models_fits_the_lanes(count: int) -> None:
+    posterior = short_posterior(dynamics="lag")
+    assert_engines_agree(posterior, prior_draws(posterior, count))
+
+
+def test_windows_start_anywhere() -> None:
+    windows = (slice(3, 4), slice(10, 150), slice(150, 151), slice(190, 333))
+    posterior = short_posterior(dynamics="lag", training=windows)
+    assert_engines_agree(posterior, prior_draws(posterior, 40))
+
+
+def test_a_general_exponent_is_left_to_numpy() -> None:
+    posterior = short_posterior(dynamics="lag", fixed={"initial": 2.0})
+    theta = np.repeat(truth(posterior), 5, axis=0)
+    theta[:, posterior.prior.names.index("exponent")] = [1.0, 1.5, 1.0, 2.0, 3.0]
+    assert_engines_agree(posterior, theta)
+
+
+DEGENERATE = {
+    "beta = gamma": {"beta": 0.02, "gamma": 0.02},
+    "beta = -gamma": {"beta": 0.02, "gamma": -0.02},
+    "no softening": {"beta": 0.0, "gamma": 0.0},
+    "hardly any": {"beta": 1e-300, "gamma": 0.0},
+    "steep": {"beta": 50.0, "gamma": 10.0},
+    "gamma beyond beta": {"beta": 0.01, "gamma": 0.02},
+    "no lag": {"lag": 0.0},
+    "endless lag": {"lag": 1e6},
+    "start above the ceiling": {"initial": 400.0, "gamma": 0.0},
+    "start far below": {"initial": -400.0, "gamma": 0.0},
+    "start near zero": {"initial": -1e-13},
+    "no sensor noise to speak of": {"sensor_sd": 1e-7},
+    "no discrepancy": {"discrepancy_sd": 0.0},
+    "hardly a discrepancy": {"discrepancy_sd": 1e-9},
+    "huge discrepancy": {"discrepancy_sd": 1e4},
+    "constant discrepancy": {"discrepancy_time": 1e9},
+    "nearly white discrepancy": {"discrepancy_time": 1e-4},
+    "both huge": {"discrepancy_sd": 1e4, "discrepancy_time": 1e9, "sensor_sd": 1e-6},
+    "a bad fit": {"d": 30.0, "offset": 1e4},
+}
+
+
+@pytest.mark.parametrize("values", DEGENERATE.values(), ids=DEGENERATE.keys())
+def test_engines_agree_where_formulas_degenerate(values: dict[str, float]) -> None:
+    posterior = short_posterior(dynamics="lag", fixed={})
+    assert_engines_agree(posterior, changed(posterior, **values))
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0, 2 * (0.00134 * 4.1e5) ** 0.5, 1580.0, 1e7])
+def test_engines_agree_at_any_poles(damping: float) -> None:
+    posterior = short_posterior(dynamics="second-order", fixed=MASS)
+    assert_engines_agree(posterior, changed(posterior, damping=damping))
+
+
+VOLTAGES = st.lists(
+    st.one_of(st.sampled_from([0.0, 0.0, 100.0, -100.0, 1e-9]), st.floats(-200, 200)),
+    min_size=2,
+    max_size=150,
+).filter(lambda path: max(path) - min(path) > 1)
+
+
+@given(VOLTAGES, st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=60)
+def test_engines_agree_on_any_path(path: list[float], seed: int) -> None:
+    """Plateaus, steps, turns at every sample."""
+    reference = short_posterior(dynamics="lag", fixed={})
+    voltage = np.array(path)
+    measured = ring_bender(reference.actuator, "discrepancy", voltage, seed)
+    posterior = posterior_of(voltage, measured, reference.actuator, "discrepancy", {})
+    assert_engines_agree(posterior, prior_draws(reference, 5, seed))
+
+
+def test_twin_a_defect_of_a_millionth_is_found() -> None:
+    """α one part in a million off is far outside what rounding may do."""
+    posterior = short_posterior(dynamics="lag")
+    right, wrong = truth(posterior), truth(posterior)
+    wrong[:, posterior.prior.names.index("alpha")] *= 1 + 1e-6
+    expected = replace(posterior, engine="numpy").log_likelihood(right)
+    got = replace(posterior, engine="numba").log_likelihood(wrong)
+    assert np.abs(got - expected)[0] > 1e-10 * (400 + np.abs(expected)[0])
+
+
+def test_engine_is_chosen_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ("numba", "numpy", "numba") == (choose(), choose("numpy"), choose("numba"))
+    monkeypatch.setattr(engine, "find_spec", lambda _: None)
+    assert ("numpy", "numpy") == (choose("auto"), choose("numpy"))
+    with pytest.raises(InputError, match=r"numba is not installed; pip install \"bwbayes\[fast\]"):
+        choose("numba")
+    with pytest.raises(InputError, match="'fortran' is unknown; write one of auto, numpy, numba"):
+        choose("fortran")  # type: ignore[arg-type]
