@@ -107,7 +107,7 @@ class _LeastSquares:
     def residuals(self, coordinates: FloatArray) -> FloatArray:
         """Residuals (models, rows + physical) at coordinates (models, free)."""
         free, _ = self.posterior.prior.constrain(coordinates)
-        simulated = self.posterior.simulate(self.posterior.prior.theta(free))[:, self.rows]
+        simulated = self.posterior.simulate(self.posterior.prior.theta(free), self.rows)
         pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
         return np.concatenate([(simulated - self.target) / self.scale, 1e-2 * pull], axis=1)
 

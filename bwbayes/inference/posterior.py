@@ -7,11 +7,12 @@ simulated from the record's first sample; only the training windows enter the li
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import Noise
@@ -20,8 +21,9 @@ from bwbayes.model.actuator import Actuator
 
 __all__ = ["Posterior"]
 
-# Models simulated together: enough to share the loop over turns, few enough for the cache.
+# Models simulated together: enough to share the loop over turns, few enough for the memory.
 BATCH = 64
+ELEMENTS = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,26 @@ class Posterior:
             return compiled.log_likelihood(
                 theta, self.voltage, self.displacement, self.training, self.actuator, self.noise
             )
-        pieces = range(0, theta.shape[0], BATCH)
-        return np.concatenate([self._piece(theta[i : i + BATCH]) for i in pieces])
+        return np.concatenate([self._piece(theta[piece]) for piece in self._pieces(theta)])
 
-    def simulate(self, theta: FloatArray) -> FloatArray:
-        """Displacement (models, samples) up to the last training sample, um."""
+    def _pieces(self, theta: FloatArray) -> Iterator[slice]:
+        size = min(max(ELEMENTS // self.voltage.size, 1), BATCH)
+        return (slice(i, i + size) for i in range(0, theta.shape[0], size))
+
+    def simulate(self, theta: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Displacement (models, rows), um, at samples up to the last training sample."""
+        pieces = self._pieces(theta)
+        return np.concatenate([self._simulated(theta[piece])[:, rows] for piece in pieces])
+
+    def _simulated(self, theta: FloatArray) -> FloatArray:
+        """Displacement (models, samples) up to the last training sample."""
         end = max(window.stop for window in self.training)
         model = theta[:, : len(self.actuator.parameters)]
         return self.actuator.displacement(model, self.voltage[:end])
 
     def _piece(self, theta: FloatArray) -> FloatArray:
-        residual = self.displacement[: max(w.stop for w in self.training)] - self.simulate(theta)
+        simulated = self._simulated(theta)
+        residual = self.displacement[: simulated.shape[1]] - simulated
         noise = theta[:, len(self.actuator.parameters) :]
         parts = [self.noise.log_density(noise, residual[:, window]) for window in self.training]
         total: FloatArray = np.sum(parts, axis=0)

@@ -24,7 +24,7 @@ from bwbayes.model.exponent import ExponentFlow
 __all__ = ["Stretch", "ceiling", "hysteresis", "monotone_stretches"]
 
 # Elements (models x samples) that one array expression handles: small enough for the cache.
-PIECE = 32_768
+PIECE = 65_536
 
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
@@ -184,14 +184,21 @@ class _LinearFlow:
         crossing = np.where(
             start < 0, np.log1p(-np.minimum(start, 0) * self.against / self.alpha) / self.against, 0
         )[:, np.newaxis]
-        if (crossing >= travel[-1]).all():
-            return self._relax(start, self.against, travel)
-        if (start >= 0).all():
-            return self._relax(start, self.ahead, travel)
-        # A start below zero relaxes with one rate up to zero, and from there with the other.
-        below = self._relax(start, self.against, np.minimum(travel, crossing))
-        above = self._relax(np.maximum(start, 0), self.ahead, np.maximum(travel - crossing, 0))
-        return np.where(travel < crossing, below, above)
+        # A start below zero relaxes with one rate up to zero, and from there with the other. Models
+        # alike cross close together: only in between must both be known.
+        above = np.maximum(start, 0)
+        ends = np.min(crossing), np.max(crossing)
+        early, late = np.searchsorted(travel, ends, side="right").tolist()
+        before, between, after = np.split(travel, [early, late])
+        g = np.empty((start.size, travel.size))
+        g[:, :early] = self._relax(start, self.against, before)
+        g[:, early:late] = np.where(
+            between < crossing,
+            self._relax(start, self.against, np.minimum(between, crossing)),
+            self._relax(above, self.ahead, np.maximum(between - crossing, 0)),
+        )
+        g[:, late:] = self._relax(above, self.ahead, after - crossing)
+        return g
 
     def _relax(self, start: FloatArray, rate: FloatArray, travel: FloatArray) -> FloatArray:
         gone = -rate[:, np.newaxis] * travel
