@@ -35,8 +35,8 @@ def choose(wanted: EngineChoice = "auto") -> Engine:
         case "numba":
             if not there:
                 raise InputError(
-                    'engine: numba is not installed; pip install "bwbayes[fast]", or set '
-                    'engine = "auto"'
+                    'engine: numba is not installed; pip install "bwbayes[fast]", or take the '
+                    "numpy engine"
                 )
             return "numba"
     raise InputError(f"engine: {wanted!r} is unknown; write one of auto, numpy, numba")

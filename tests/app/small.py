@@ -28,6 +28,7 @@ __all__ = [
     "command",
     "config",
     "finished",
+    "lowest_ess",
     "numbers",
     "quiet",
 ]
@@ -115,6 +116,12 @@ def numbers(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     del found["wall_s"]
     return found
+
+
+def lowest_ess(folder: Path) -> float:
+    """Return the effective draws of the worst parameter."""
+    parameters = numbers(folder)["parameters"].values()
+    return float(min(min(one["ess_bulk"], one["ess_tail"]) for one in parameters))
 
 
 def assert_same_end(expected: Path, got: Path) -> None:
