@@ -2,8 +2,9 @@
 
 With Y half the range of the displacement, U half the range of the voltage and Δ the sampling
 interval, every scale of the model is known to within a factor of a few: d is near Y/U, α a part of
-it, β near 1/U, a lag some samples, and what the model leaves over about a hundredth of the range,
-correlated over some hundreds of samples. These priors never come from a fit, so the data are not
+it, β near 1/U, a lag some samples, the sensor's noise some thousandth of the range, and what the
+model leaves over anything from nothing to a tenth of it, correlated over some hundreds of samples.
+These priors never come from a fit, so the data are not
 used twice; they are resolved once to explicit numbers, which a run prints and stores.
 """
 
@@ -96,7 +97,9 @@ def default_prior(
             "normal", {"mean": _round(ranges.middle), "sd": _round(displacement)}
         ),
         "sensor_sd": _lognormal(0.006 * displacement, 1.5),
-        "discrepancy_sd": Distribution("halfnormal", {"scale": _round(0.02 * displacement)}),
+        # Not even its order of magnitude is known. A prior that is level down to zero would claim
+        # some discrepancy where there is none, and make the bands of a model that is right too wide.
+        "discrepancy_sd": _lognormal(1e-5 * displacement, 4.0),
         "discrepancy_time": _lognormal(250 * interval, 0.8),
     }
     if stiffness is not None:

@@ -65,12 +65,21 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     least_squares = _LeastSquares(posterior, centre, np.sqrt(np.diag(spread)))
     starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
     valleys = _valleys(least_squares, [least_squares.optimum(start) for start in starts])
-    modes = [_mode(posterior, valley, spread) for valley in valleys]
+    noise = draws[:DRAWS, ~least_squares.physical]
+    modes = [_mode(posterior, _with_noise(posterior, v, noise), spread) for v in valleys]
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
     worst = best.log_density - WORSE_PER_SAMPLE * least_squares.samples
     optima = _distinct([m.place for m in modes if m.log_density > worst], best.covariance)
     return PointFit(best.place, best.covariance, best.log_density, optima, spread)
+
+
+def _with_noise(posterior: Posterior, place: FloatArray, noise: FloatArray) -> FloatArray:
+    """Give a place (free,) the most probable of some noise parameters (draws, noise)."""
+    physical = place[: place.size - noise.shape[1]]
+    places = np.hstack([np.tile(physical, (len(noise), 1)), noise])
+    best: FloatArray = places[int(np.argmax(posterior.log_density(places)))]
+    return best
 
 
 def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:
