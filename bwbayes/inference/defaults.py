@@ -98,7 +98,7 @@ def default_prior(
         ),
         "sensor_sd": _lognormal(0.006 * displacement, 1.5),
         # Not even its order of magnitude is known. A prior that is level down to zero would claim
-        # some discrepancy where there is none, and make the bands of a model that is right too wide.
+        # some discrepancy where there is none, and make a right model's bands too wide.
         "discrepancy_sd": _lognormal(1e-5 * displacement, 4.0),
         "discrepancy_time": _lognormal(250 * interval, 0.8),
     }

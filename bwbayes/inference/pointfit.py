@@ -23,7 +23,7 @@ DRAWS = 128
 STARTS = 8
 
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
-RESIDUALS = 4000
+RESIDUALS = 1000
 
 # An optimum less probable than the best by this much (nats per sample) is no place to start from.
 WORSE_PER_SAMPLE = 0.5
@@ -165,7 +165,7 @@ class _Mode:
 
 def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     """Climb from a start (free,) to the mode it leads to, by Newton steps within a trust region."""
-    surface = _Surface(posterior, start, np.sqrt(np.diag(spread)))
+    surface = _Surface(posterior, start, _units(posterior, start, np.sqrt(np.diag(spread))))
     place, curvature = start, None
     for _ in range(4):
         # Each round measures in the units of the last curvature: finite differences need them.
@@ -186,6 +186,22 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     return _Mode(
         place, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(place)))
     )
+
+
+def _units(posterior: Posterior, place: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return the step (free,) of each coordinate that costs about a nat, ``spread`` at most.
+
+    The mean cost of a step either way: a slope at the place does not count.
+    """
+    parts = 10.0 ** np.arange(0, -5, -0.5)
+    steps = parts[:, np.newaxis, np.newaxis] * np.diag(spread)
+    both = np.concatenate([place + steps, place - steps]).reshape(-1, place.size)
+    forth, back = posterior.log_density(both).reshape(2, parts.size, place.size)
+    cost = posterior.log_density(place[np.newaxis]) - (forth + back) / 2
+    cheap = cost < 1
+    cheap[-1] = True
+    units: FloatArray = spread * parts[np.argmax(cheap, axis=0)]
+    return units
 
 
 class _Surface:
