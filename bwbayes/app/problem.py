@@ -25,12 +25,13 @@ from bwbayes.app.config import (
     ValidationConfig,
 )
 from bwbayes.data import Record, Split, read_record
+from bwbayes.data.checks import require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
 from bwbayes.inference.distributions import Distribution
-from bwbayes.inference.engine import choose
+from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
@@ -128,7 +129,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         for name, v in config.validation.items()
     }
     explicit = _explicit(config, posterior, truth)
-    plan = _plan(config, prior)
+    plan = _plan(config, posterior)
     return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
 
 
@@ -149,6 +150,7 @@ def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, fl
         record = record.window(start, end if source.stop is None else source.stop)
     if source.decimate > 1:
         record = record.decimate(source.decimate)
+    require_readable(record, "record")
     return record, truth
 
 
@@ -161,6 +163,7 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         waveform = sampled_waveform(source.signal)
         made = _stand(config).run(waveform, generator(config.seed, f"record {name}"))
         record = _named(made, source.signal)
+        require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
     if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
         raise InputError(
@@ -266,11 +269,15 @@ def _default(
     return (found, None) if isinstance(found, Distribution) else (None, found)
 
 
-def _plan(config: Config, prior: JointPrior) -> SamplingPlan:
-    given = config.sampling
+# Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
+WALKERS: Mapping[Engine, int] = {"numba": 64, "numpy": 32}
+
+
+def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
+    given, prior = config.sampling, posterior.prior
     # Six more than the least: complementary halves must span all directions.
     least = 2 * prior.dimensions
-    walkers = given.walkers or max(least + 6, 16)
+    walkers = given.walkers or max(least + 6, WALKERS[posterior.engine])
     if walkers < least:
         raise InputError(
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
@@ -310,7 +317,7 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
             ),
             "parameters": {p.name: _as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
-                update={"walkers": _plan(config, prior).walkers, "engine": posterior.engine}
+                update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}
             ),
             "validation": validation,
             "truth": {n: v for n, v in truth.items() if n in prior.names},

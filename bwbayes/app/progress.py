@@ -7,6 +7,7 @@ then. Quiet means nothing at all.
 from __future__ import annotations
 
 import time
+from typing import Self
 
 import numpy as np
 from rich.console import Console
@@ -17,23 +18,21 @@ from bwbayes.inference.chain import Phase
 from bwbayes.inference.diagnostics import LENGTH, Check
 from bwbayes.inference.sampling import SamplingPlan
 
-__all__ = ["Progress"]
+__all__ = ["Progress", "ReplicateProgress"]
 
 # Seconds between lines where there is no terminal.
 PAUSE = 10.0
 
 
-class Progress:
-    """Watches a sampling; use it as a context manager and as the sampler's watcher."""
+class _Line:
+    """A line that is kept up to date on a terminal, and printed now and then elsewhere."""
 
-    def __init__(self, console: Console, plan: SamplingPlan) -> None:
-        self.console, self.plan = console, plan
+    def __init__(self, console: Console) -> None:
+        self.console = console
         self.begun = self.printed = time.monotonic()
-        self.done = 0
-        self.check: Check | None = None
         self.live = Live(console=console, transient=True) if console.is_terminal else None
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
         if self.live:
             self.live.start()
         return self
@@ -42,17 +41,51 @@ class Progress:
         if self.live:
             self.live.stop()
 
+    def show(self, line: str, *, printed: bool = True) -> None:
+        """Show a line; without a terminal only if it may be ``printed`` and the time has come."""
+        now = time.monotonic()
+        if self.live:
+            self.live.update(Text(line))
+        elif printed and now - self.printed >= PAUSE:
+            self.printed = now
+            self.console.print(line, highlight=False, soft_wrap=True)
+
+
+class ReplicateProgress(_Line):
+    """Watches the replicates of a calibration, ``done`` of ``wanted`` so far."""
+
+    def __init__(self, console: Console, done: int, wanted: int) -> None:
+        super().__init__(console)
+        self.before = self.done = done
+        self.wanted = wanted
+        self.unconverged = 0
+
+    def __call__(self, converged: bool) -> None:
+        """Take note of a finished replicate."""
+        self.done += 1
+        self.unconverged += not converged
+        rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
+        self.show(
+            f"replicate {self.done} of {self.wanted}   {60 * rate:.1f} a minute   "
+            f"ETA {_minutes((self.wanted - self.done) / rate)}   "
+            f"not converged {self.unconverged}"
+        )
+
+
+class Progress(_Line):
+    """Watches a sampling; use it as a context manager and as the sampler's watcher."""
+
+    def __init__(self, console: Console, plan: SamplingPlan) -> None:
+        super().__init__(console)
+        self.plan = plan
+        self.done = 0
+        self.check: Check | None = None
+
     def __call__(self, phase: Phase, found: Check | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
         self.check = found or self.check
         self.done += found is None
-        line = self.line(phase)
-        now = time.monotonic()
-        if self.live:
-            self.live.update(Text(line))
-        elif found is not None and now - self.printed >= PAUSE:
-            self.printed = now
-            self.console.print(line, highlight=False, soft_wrap=True)
+        self.show(self.line(phase), printed=found is not None)
 
     def line(self, phase: Phase) -> str:
         """Return the line that is shown."""
@@ -63,10 +96,12 @@ class Progress:
             return f"{phase:9} {steps:6.0f} steps   {rate:6.0f} models/s   ensembles are converging"
         check = self.check
         fewest = float(np.min([check.ess_bulk, check.ess_tail]))
+        cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
             f"sampling  {check.steps:6d} steps   {rate:6.0f} models/s   "
             f"ETA {self._remaining(steps / elapsed)}   acceptance {check.acceptance:.2f}   "
-            f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}"
+            f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}   "
+            f"{cover}"
         )
 
     def _remaining(self, steps_per_second: float) -> str:
@@ -79,6 +114,9 @@ class Progress:
         # A run that goes on is judged before its first step.
         if not (np.isfinite(left) and steps_per_second > 0):
             return "unknown"
-        seconds = left / steps_per_second
-        minutes, rest = divmod(max(round(seconds), 0), 60)
-        return f"{minutes}:{rest:02d}"
+        return _minutes(left / steps_per_second)
+
+
+def _minutes(seconds: float) -> str:
+    minutes, rest = divmod(max(round(seconds), 0), 60)
+    return f"{minutes}:{rest:02d}"

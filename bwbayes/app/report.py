@@ -14,7 +14,7 @@ from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from bwbayes.app.figures.style import title, unit_text
 from bwbayes.inference.parameters import Parameter
@@ -22,7 +22,7 @@ from bwbayes.results.bands import LEVELS
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
 
-__all__ = ["Symbol", "digits", "render", "symbol"]
+__all__ = ["Symbol", "digits", "picture", "render", "symbol", "template"]
 
 UNKNOWN = "–"
 
@@ -88,6 +88,33 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
     pictures
         PNG files by the name of their figure, in their order.
     """
+    check = result.outcome.check
+    return template("report.html.j2").render(
+        name=result.name,
+        converged=result.outcome.converged,
+        stop_reason=result.outcome.stop_reason,
+        sampling=f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted.",
+        moves=[
+            {"name": name, "proposed": str(proposed), "accepted": f"{100 * kept / proposed:.1f} %"}
+            for name, (proposed, kept) in result.moves.items()
+        ],
+        pareto_k=None if check.pareto_k is None else f"{check.pareto_k:.2f}",
+        remarks=result.remarks,
+        free=list(_free(result, summary)),
+        truth_known=any(p.name in result.truth for p in result.free),
+        assumed=[_assumed(p) for p in result.parameters],
+        validation=_validation(result) if result.outcome.converged and result.scores else None,
+        pictures=[
+            picture(png, name, *_caption(name))
+            for name, png in pictures.items()
+            if result.outcome.converged or name in OF_THE_CHAIN
+        ],
+        facts=[*result.facts.items(), *_circumstances(summary)],
+    )
+
+
+def template(name: str) -> Template:
+    """Return a template of the package; what it is filled with comes out escaped."""
     environment = Environment(
         loader=PackageLoader("bwbayes.app"),
         autoescape=True,
@@ -95,24 +122,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    check = result.outcome.check
-    return environment.get_template("report.html.j2").render(
-        name=result.name,
-        converged=result.outcome.converged,
-        stop_reason=result.outcome.stop_reason,
-        sampling=f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted.",
-        remarks=result.remarks,
-        free=list(_free(result, summary)),
-        truth_known=any(p.name in result.truth for p in result.free),
-        assumed=[_assumed(p) for p in result.parameters],
-        validation=_validation(result) if result.outcome.converged and result.scores else None,
-        pictures=[
-            _picture(name, png)
-            for name, png in pictures.items()
-            if result.outcome.converged or name in OF_THE_CHAIN
-        ],
-        facts=[*result.facts.items(), *_circumstances(summary)],
-    )
+    return environment.get_template(name)
 
 
 def symbol(parameter: Parameter) -> Symbol:
@@ -241,13 +251,17 @@ def _covered(scores: Scores, kind: str, level: int) -> str:
     return f"{text} %" if error is None else f"{text} ± {100 * error[level]:.1f} %"
 
 
-def _picture(name: str, png: bytes) -> dict[str, str]:
+def picture(png: bytes, name: str, title: str, caption: str) -> dict[str, str]:
+    """Return a picture as the templates show it, its file inside the page."""
+    source = "data:image/png;base64," + b64encode(png).decode("ascii")
+    return {"name": name, "title": title, "caption": caption, "source": source}
+
+
+def _caption(name: str) -> tuple[str, str]:
+    """Return title and caption of a run's figure."""
     kind, _, rest = name.partition("_")
     heading, text = CAPTIONS.get(kind, (kind, ""))
-    if rest:
-        heading += f": {rest}"
-    source = "data:image/png;base64," + b64encode(png).decode("ascii")
-    return {"name": name, "title": heading, "caption": text, "source": source}
+    return (f"{heading}: {rest}" if rest else heading), text
 
 
 def _circumstances(summary: Mapping[str, object]) -> Iterator[tuple[str, str]]:

@@ -10,14 +10,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.config import Config
-from bwbayes.app.folder import RunFolder
+from bwbayes.app.folder import CalibrationFolder, RunFolder
 from bwbayes.app.problem import generator, resolve
 from bwbayes.inference import identifiability, pointfit
 from bwbayes.inference.parameters import Parameter
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.calibration import Calibration
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 
-__all__ = ["show_check", "show_priors", "show_result", "show_scores"]
+__all__ = ["show_calibration", "show_check", "show_priors", "show_result", "show_scores"]
 
 
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
@@ -32,15 +34,24 @@ def show_result(result: Result, folder: RunFolder, console: Console) -> None:
                 f"{row['mean']:.5g}",
                 f"{row['sd']:.2g}",
                 f"{row['lower_95']:.5g} to {row['upper_95']:.5g}",
-                row["unit"],
+                escape(row["unit"]),
                 f"{ess:.0f}",
                 f"{row['rhat']:.3f}",
             )
         console.print(table)
         show_scores(result.scores, console)
+    console.print(_sampling(result), highlight=False, soft_wrap=True)
     for remark in result.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
     console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _sampling(result: Result) -> str:
+    """Say in one line how the moves did."""
+    check = result.outcome.check
+    accepted = ", ".join(f"{n} {kept / tried:.0%}" for n, (tried, kept) in result.moves.items())
+    cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
+    return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
 
 
 def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
@@ -58,6 +69,32 @@ def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
             ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
         )
     console.print(table)
+
+
+def show_calibration(calibration: Calibration, folder: CalibrationFolder, console: Console) -> None:
+    """Show how even the ranks are, and what intervals and bands cover."""
+    table = Table("statistic", "p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS))
+    for name, one in calibration.statistics.items():
+        ecdf = "leaves band" if one.outside else "inside"
+        covered = (f"{one.covered[level]:.1%}" for level in LEVELS)
+        table.add_row(name, f"{one.p:.2g}", f"{one.adjusted:.2g}", ecdf, *covered)
+    console.print(table)
+    if calibration.bands:
+        table = Table("held-out band", *(f"{level} %" for level in LEVELS))
+        for kind in KINDS:
+            found = (calibration.bands[f"{kind} {level}"] for level in LEVELS)
+            table.add_row(kind, *(f"{one.mean:.1%} ± {one.error:.1%}" for one in found))
+        console.print(table)
+    for text, power in calibration.power.items():
+        console.print(f"power of a smooth test against sds {text}: {power:.2f}", highlight=False)
+    for remark in calibration.shortcomings:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    console.print(
+        f"{calibration.replicates} replicates, {len(calibration.unconverged)} not converged\n"
+        f"report: {folder.path / 'calibration.html'}",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def show_check(config: Config, folder: Path, console: Console) -> None:
@@ -101,5 +138,5 @@ def show_priors(
         row = [parameter.name, known]
         if fitted:
             row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
-        table.add_row(*row, parameter.unit)
+        table.add_row(*row, escape(parameter.unit))
     console.print(table)

@@ -2,13 +2,15 @@
 
 An HDF5 file in single-writer mode, whose datasets all exist from the start: a block is written and
 flushed, then the number of blocks that count, and only what is counted is ever read. A process
-killed in between loses the block in hand and nothing else. All numbers carry checksums. Going on
-from such a file first copies what counts into a fresh one. This module alone knows the layout:
+killed in between loses the block in hand and nothing else. All numbers carry checksums: of a file
+that was cut or changed on the disk the blocks before the damage are read. Going on from a file
+first copies what counts into a fresh one. This module alone knows the layout:
 
-    /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, random_state
+    /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
     /proposal/PHASE                      weights, centres, factors of that phase's proposal
     /point                               the point fit
-    /committed                           blocks of each phase; proposals of each phase (0 or 1)
+    /committed                           blocks of each phase; proposals of each phase (0 or 1);
+                                         blocks of the sampling that were set aside
 
 and what was run (config, versions, seed, hash of the data) as the file's attributes.
 """
@@ -16,7 +18,10 @@ and what was run (config, versions, seed, hash of the data) as the file's attrib
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +29,21 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.errors import InputError
+from bwbayes.arrays import IntArray
+from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.chain import PHASES, Chain, Phase
 from bwbayes.inference.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
+from bwbayes.inference.hdf5 import DAMAGE, Image, reserve
+from bwbayes.inference.moves import MOVES
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.proposals import COMPONENTS, StudentMixture, StudentProposal
 
 __all__ = ["ChainFile"]
 
-FORMAT = 1
+FORMAT = 2
+
+# Where /committed says how many blocks were set aside.
+SET_ASIDE = 2 * len(PHASES)
 
 
 class ChainFile(Chain):
@@ -43,10 +54,16 @@ class ChainFile(Chain):
     """
 
     def __init__(
-        self, path: Path, point: PointFit, starts: Sequence[EnsembleState], block: int
+        self,
+        path: Path,
+        point: PointFit,
+        starts: Sequence[EnsembleState],
+        block: int,
+        attributes: Mapping[str, str | int],
     ) -> None:
         super().__init__(starts)
         self.path, self.point, self.block = path, point, block
+        self._attributes = dict(attributes)
         self._file: Any = None
 
     @classmethod
@@ -58,20 +75,33 @@ class ChainFile(Chain):
         block: int,
         attributes: Mapping[str, str | int],
     ) -> ChainFile:
-        """Write a chain, blocks of ``block`` steps or none yet, as a new file and open it."""
-        made = cls(path, point, chain.starts, block)
+        """Write a chain, blocks of ``block`` steps or none yet, as a new file and open it.
+
+        Raises
+        ------
+        InputError
+            There is no room for it.
+        """
+        made = cls(path, point, chain.starts, block, attributes)
         temporary = path.with_suffix(".partial")
-        with h5py.File(temporary, "w", libver="latest") as file:
+        # Laid out in memory: HDF5 does not survive a disk that is full.
+        layout = BytesIO()
+        with h5py.File(layout, "w", libver="latest") as file:
             _lay_out(file, point, chain.starts, block)
             file.attrs["format"] = FORMAT
             for name, value in attributes.items():
                 file.attrs[name] = value
-        _replace(temporary, path)
-        made._open()
-        for phase in PHASES:
-            made.freeze(phase, chain.proposals[phase])
-            for number in range(chain.blocks(phase)):
-                made.append(phase, chain.block_of(phase, number))
+        with _told(path), made._or_nothing(temporary):
+            temporary.write_bytes(layout.getbuffer())
+            _replace(temporary, path)
+        with made._or_nothing(path):
+            made._open()
+            for phase in PHASES:
+                made.freeze(phase, chain.proposals[phase])
+                for blocks in chain.history(phase):
+                    made.append(phase, blocks)
+            if chain.set_aside:
+                made.fall_back(chain.set_aside)
         return made
 
     @classmethod
@@ -81,14 +111,37 @@ class ChainFile(Chain):
         Raises
         ------
         InputError
-            The file is missing, not a chain, or damaged before the last block that counts.
+            The file is missing, not a chain, or damaged where it says what it is.
+
+        Warns
+        -----
+        InputWarning
+            It is damaged further on; the blocks before that are read.
         """
-        try:
-            with _reading(path) as file:
-                return cls._load(path, file)
-        except (OSError, KeyError, ValueError, RuntimeError) as error:
-            why = "does not exist" if not path.exists() else f"cannot be read ({error})"
-            raise InputError(f"{path}: the chain {why}; run again") from None
+        before = None
+        while True:
+            try:
+                content = path.read_bytes()
+            except FileNotFoundError:
+                raise InputError(f"{path}: the chain does not exist; run again") from None
+            except OSError as error:
+                raise InputError(f"{path}: {error.strerror}; make it readable") from None
+            chain, damage = cls._load(path, content)
+            # One that was written while it was read may look damaged; at rest it does not.
+            if not damage or content == before:
+                break
+            before = content
+        if chain is None:
+            raise InputError(f"{path}: the chain cannot be read ({damage}); run again")
+        if damage:
+            whole = sum(len(chain.history(phase)) for phase in PHASES)
+            warnings.warn(
+                f"{path}: damaged ({damage}); the {whole} whole blocks before that are used, and "
+                "`bwbayes resume` makes the others again",
+                InputWarning,
+                stacklevel=2,
+            )
+        return chain
 
     @classmethod
     def resume(cls, path: Path) -> ChainFile:
@@ -97,6 +150,11 @@ class ChainFile(Chain):
         Raises
         ------
         InputError
+            As :meth:`read`, or there is no room for the copy that it makes.
+
+        Warns
+        -----
+        InputWarning
             As :meth:`read`.
         """
         old = cls.read(path)
@@ -109,24 +167,28 @@ class ChainFile(Chain):
 
     def attributes(self) -> dict[str, str | int]:
         """Return what was run: config, versions, platform, seed, hash of the data."""
-        with _reading(self.path) as file:
-            return {
-                name: value if isinstance(value, str) else int(value)
-                for name, value in file.attrs.items()
-                if name != "format"
-            }
+        return dict(self._attributes)
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
-        """Add the next block of every ensemble; when this returns it is in the file."""
-        number = self.blocks(phase)
-        group = self._file[phase]
-        steps = slice(number * self.block, (number + 1) * self.block)
-        _put(group["coordinates"], steps, np.stack([b.coordinates for b in blocks], axis=1))
-        _put(group["log_density"], steps, np.stack([b.log_density for b in blocks], axis=1))
-        one = slice(number, number + 1)
-        _put(group["accepted"], one, np.stack([b.accepted for b in blocks])[np.newaxis])
-        states = np.stack([b.end.random_state for b in blocks])
-        _put(group["random_state"], one, states[np.newaxis])
+        """Add the next block of every ensemble; when this returns it is in the file.
+
+        Raises
+        ------
+        InputError
+            There is no room for it; the file is whole without it.
+        """
+        rows: dict[str, NDArray[Any]] = {
+            "coordinates": np.stack([b.coordinates for b in blocks], axis=1),
+            "log_density": np.stack([b.log_density for b in blocks], axis=1),
+            "accepted": np.stack([b.accepted for b in blocks])[np.newaxis],
+            "moves": np.stack([_padded(b.moves) for b in blocks])[np.newaxis],
+            "random_state": np.stack([b.end.random_state for b in blocks])[np.newaxis],
+        }
+        with _told(self.path):
+            reserve(self._file, sum(values.nbytes for values in rows.values()))
+        number = len(self.history(phase))
+        for name, values in rows.items():
+            _put(self._file[phase][name], number * len(values), values)
         self._commit(PHASES.index(phase), number + 1)
         super().append(phase, blocks)
 
@@ -139,6 +201,11 @@ class ChainFile(Chain):
             group["factors"][:] = np.stack([c.factor for c in proposal.components])
             self._commit(len(PHASES) + PHASES.index(phase), 1)
         super().freeze(phase, proposal)
+
+    def fall_back(self, blocks: int) -> None:
+        """Set the first blocks of the sampling aside, in the file too."""
+        self._commit(SET_ASIDE, blocks)
+        super().fall_back(blocks)
 
     def close(self) -> None:
         """Close the file."""
@@ -156,45 +223,66 @@ class ChainFile(Chain):
         self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
         self._file.swmr_mode = True
 
+    @contextmanager
+    def _or_nothing(self, path: Path) -> Iterator[None]:
+        """Leave nothing of a file that could not be written to its end."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            path.unlink(missing_ok=True)
+            raise
+
     def _commit(self, place: int, count: int) -> None:
         """Let ``count`` count, once everything before has reached the file."""
         self._file.flush()
-        self._file["committed"][place] = count
+        self._file["committed"][:, place] = count
         self._file.flush()
 
     @classmethod
-    def _load(cls, path: Path, file: Any) -> ChainFile:
-        if file.attrs["format"] != FORMAT:
-            raise ValueError(f"its format is {file.attrs['format']}, this version reads {FORMAT}")
-        # Read before anything that it counts: a dataset that is open already may have grown since.
-        committed = file["committed"][:]
+    def _load(cls, path: Path, content: bytes) -> tuple[ChainFile | None, str]:
+        """Return what can be read of a file's content, and what ails the rest, if anything."""
+        loaded, damage, set_aside = None, "", 0
+        try:
+            with h5py.File(Image(content), "r") as file:
+                loaded = cls._begun(path, file)
+                committed = _either(file["committed"])
+                set_aside = int(committed[SET_ASIDE])
+                for place, phase in enumerate(PHASES):
+                    if committed[len(PHASES) + place]:
+                        loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
+                    for number in range(committed[place]):
+                        Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
+        except DAMAGE as error:
+            damage = " ".join(str(error.args[-1] if error.args else error).split())
+        if loaded is not None and set_aside <= len(loaded.history("sampling")):
+            loaded.set_aside = set_aside
+        return loaded, damage
+
+    @classmethod
+    def _begun(cls, path: Path, file: Any) -> ChainFile:
+        """Return the chain of a file without its blocks."""
+        attributes = {n: v if isinstance(v, str) else int(v) for n, v in file.attrs.items()}
+        number = attributes.pop("format")
+        if number != FORMAT:
+            raise ValueError(f"its format is {number}, this version reads {FORMAT}")
         point = PointFit(
-            **{name: file["point"][name][()] for name in _POINT[:-1]},
-            log_density=float(file["point"]["log_density"][0]),
+            **{name: _either(file["point"][name]) for name in _POINT[:-1]},
+            log_density=float(_either(file["point"]["log_density"])),
         )
-        start = file["start"]
-        states = zip(start["coordinates"], start["log_density"], start["random_state"], strict=True)
+        parts = [_either(file["start"][n]) for n in ("coordinates", "log_density", "random_state")]
         block = int(file["pilot"]["coordinates"].chunks[0])
-        loaded = cls(path, point, [EnsembleState(*state) for state in states], block)
-        for place, phase in enumerate(PHASES):
-            if committed[len(PHASES) + place]:
-                loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
-            for number in range(committed[place]):
-                Chain.append(loaded, phase, _blocks(file[phase], number, block))
-        return loaded
+        return cls(
+            path, point, [EnsembleState(*s) for s in zip(*parts, strict=True)], block, attributes
+        )
 
 
-def _reading(path: Path) -> Any:
-    """Open a file to read it, also while it is written.
-
-    HDF5's own locks stay off here as in the writer: readers need none, the writer's is its
-    folder's, and a process may not open a file with and without them.
-    """
-    # A file whose writer has not closed it is marked so, and opens in this mode only. For others
-    # it must be off: it waits for a writer to mend what is damaged, which may be for ever.
-    with path.open("rb") as file:
-        marked = file.read(12)[11:] == b"\5"
-    return h5py.File(path, "r", libver="latest", swmr=marked, locking=False)
+def _either(dataset: Any) -> Any:
+    """Read what is written twice: the first copy that is whole."""
+    try:
+        return dataset[0]
+    except DAMAGE:
+        return dataset[1]
 
 
 _POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
@@ -211,15 +299,16 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
         whole[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
         whole[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
         whole[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
-    whole["committed"] = np.zeros(2 * len(PHASES), dtype=np.int64)
+    whole["committed"] = np.zeros(SET_ASIDE + 1, dtype=np.int64)
     for name, values in whole.items():
-        data = np.atleast_1d(values)
-        # Only chunks carry checksums.
-        file.create_dataset(name, data=data, chunks=data.shape, fletcher32=True)
+        # Twice, since nothing else could stand in for it; only chunks carry checksums.
+        data = np.stack([values, values])
+        file.create_dataset(name, data=data, chunks=(1, *np.shape(values)), fletcher32=True)
     shapes: dict[str, tuple[tuple[int, ...], Any]] = {
         "coordinates": ((block, ensembles, walkers, free), np.float64),
         "log_density": ((block, ensembles, walkers), np.float64),
         "accepted": ((1, ensembles, walkers), np.int64),
+        "moves": ((1, ensembles, len(MOVES), 2), np.int64),
         "random_state": ((1, ensembles, RANDOM_STATE_WORDS), np.uint32),
     }
     for phase in PHASES:
@@ -234,15 +323,25 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
             )
 
 
-def _put(dataset: Any, rows: slice, values: NDArray[Any]) -> None:
-    dataset.resize(rows.stop, axis=0)
-    dataset[rows] = values
+def _put(dataset: Any, first: int, values: NDArray[Any]) -> None:
+    """Write values (rows, ...) to the end of a dataset, from row ``first`` on."""
+    dataset.resize(first + len(values), axis=0)
+    dataset[first:] = values
+
+
+def _padded(counts: IntArray) -> IntArray:
+    """Return the counts of a block's moves with a row for each of MOVES."""
+    padded = np.zeros((len(MOVES), 2), dtype=np.int64)
+    padded[: len(counts)] = counts
+    return padded
 
 
 def _proposal(group: Any) -> StudentMixture:
     """Read a frozen proposal."""
-    pairs = zip(group["centres"][:], group["factors"][:], strict=True)
-    return StudentMixture(group["weights"][:], tuple(StudentProposal(*pair) for pair in pairs))
+    pairs = zip(_either(group["centres"]), _either(group["factors"]), strict=True)
+    return StudentMixture(
+        _either(group["weights"]), tuple(StudentProposal(*pair) for pair in pairs)
+    )
 
 
 def _blocks(group: Any, number: int, block: int) -> list[Block]:
@@ -250,15 +349,32 @@ def _blocks(group: Any, number: int, block: int) -> list[Block]:
     steps = slice(number * block, (number + 1) * block)
     coordinates, log_density = group["coordinates"][steps], group["log_density"][steps]
     accepted, states = group["accepted"][number], group["random_state"][number]
+    moves = group["moves"][number]
+    # Where a disk lost what it was given there are zeros, which pass the checksum.
+    if not all(part.any() for part in (coordinates, log_density, states)):
+        raise ValueError("a block is empty")
     return [
         Block(
             coordinates[:, e],
             log_density[:, e],
             accepted[e],
+            moves[e],
             EnsembleState(coordinates[-1, e], log_density[-1, e], states[e]),
         )
         for e in range(len(states))
     ]
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say in one line that a chain cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: mend "
+            "that, then go on with `bwbayes resume`"
+        ) from None
 
 
 def _replace(temporary: Path, path: Path) -> None:

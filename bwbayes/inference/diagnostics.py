@@ -2,10 +2,11 @@
 
 Ensembles are independent and start far apart; the walkers of one ensemble are not independent at
 the start and hardly so later. So R-hat is the nested one, with an ensemble as the superchain, and
-once more with the halves of each ensemble apart, which shows drift. Effective draws are counted
-with walkers as chains, capped by what the means of whole ensembles show, which also sees
-correlation between walkers. A walker that does not move blocks convergence by itself, and what is
-not a number never passes. This module alone knows arviz's statistics.
+once more with the halves of each ensemble apart, which shows drift. That of single walkers, much
+more lenient, shows those that never leave their mode. Effective draws are counted with walkers as
+chains, capped by what the means of whole ensembles show, which also sees correlation between
+walkers. A walker that does not move blocks convergence by itself, and what is not a number never
+passes. This module alone knows arviz's statistics.
 """
 
 # mypy: allow-untyped-calls
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.ensemble import autocorrelation_time
@@ -25,8 +27,18 @@ __all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat", "par
 
 LARGEST_RHAT = 1.01
 
+# Of walkers that mix it is 1.01 after 50 autocorrelation times: √(1 + 1/50).
+LARGEST_WALKER_RHAT = 1.05
+
+# Above this a proposal does not cover the draws.
+LARGEST_PARETO_K = 0.7
+
 # Steps in autocorrelation times, before which no estimate of it can be trusted.
 LENGTH = 50
+
+# Autocorrelation times without a move after which a walker is stuck. The longest of an independence
+# sampler's rests at a place where its proposal hardly goes are a third of that.
+STILL = 25
 
 TAIL = (0.05, 0.95)
 
@@ -37,7 +49,9 @@ class Check:
 
     ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk`` and ``ess_tail`` are
     totals; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
-    ``stuck`` counts the walkers without an accepted move in the last block.
+    ``stuck`` counts the walkers that have not moved for the last ``STILL`` autocorrelation times;
+    ``pareto_k`` is that of the proposal at these draws, None if there is no proposal;
+    ``walker_rhat`` is the largest R-hat with each walker a chain.
     """
 
     steps: int
@@ -47,6 +61,13 @@ class Check:
     autocorrelation: FloatArray
     acceptance: float
     stuck: int
+    pareto_k: float | None = None
+    walker_rhat: float = 1.0
+
+    @property
+    def covered(self) -> bool:
+        """Whether the proposal, if there is one, covers the draws."""
+        return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
     def shortcomings(self, ess: float) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
@@ -56,6 +77,10 @@ class Check:
         found = []
         if not (self.rhat < LARGEST_RHAT).all():
             found.append(f"R-hat {np.max(self.rhat):.3f} is not below {LARGEST_RHAT}")
+        if not self.walker_rhat < LARGEST_WALKER_RHAT:
+            found.append(
+                f"R-hat {self.walker_rhat:.3g} of walkers is not below {LARGEST_WALKER_RHAT}"
+            )
         fewest = np.min([self.ess_bulk, self.ess_tail])
         if not fewest >= ess:
             found.append(f"ESS {fewest:.0f} has not reached {ess:.0f}")
@@ -64,6 +89,8 @@ class Check:
             found.append(f"{times:.0f} autocorrelation times are fewer than {LENGTH}")
         if self.stuck:
             found.append(f"{self.stuck} walkers are stuck")
+        if not self.covered:
+            found.append(f"Pareto k {self.pareto_k:.2f} is not below {LARGEST_PARETO_K}")
         return found
 
 
@@ -80,19 +107,32 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
         Steps in a block.
     """
     steps, ensembles, walkers, free = draws.shape
-    bulk, tail = effective_draws(draws)
+    scores, folded = _scores(draws), _folded_scores(draws)
+    bulk, tail = _effective_draws(draws, scores)
+    autocorrelation = autocorrelation_time(draws.reshape(steps, ensembles * walkers, free))
     half = steps // 2
-    halves = np.concatenate([draws[:half], draws[steps - half :]], axis=1)
+    halves, folded_halves = (
+        np.concatenate([s[..., :half], s[..., steps - half :]], axis=1) for s in (scores, folded)
+    )
     return Check(
         steps=steps,
         # np.maximum keeps a nan of either.
-        rhat=np.maximum(nested_rhat(draws), nested_rhat(halves)),
+        rhat=np.maximum(
+            _rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles)
+        ),
         ess_bulk=bulk,
         ess_tail=tail,
-        autocorrelation=autocorrelation_time(draws.reshape(steps, ensembles * walkers, free)),
+        autocorrelation=autocorrelation,
         acceptance=float(accepted.sum() / (accepted.size * block)),
-        stuck=int(np.sum(accepted[-1] == 0)),
+        walker_rhat=_walker_rhat(scores),
+        stuck=_stuck(accepted, STILL * np.max(autocorrelation) / block),
     )
+
+
+def _stuck(accepted: IntArray, blocks: float) -> int:
+    """Count walkers without a move in the last so many blocks, if that is a number, or in all."""
+    last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
+    return int(np.sum(~accepted[-last:].any(axis=0)))
 
 
 def pareto_k(log_weights: FloatArray) -> float:
@@ -100,12 +140,12 @@ def pareto_k(log_weights: FloatArray) -> float:
 
     Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
     draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
-    k' = k / (1 − k), so k = k' / (1 + k'). It is infinite where the largest weights are all equal,
-    as those of a walker that stays where the proposal hardly goes.
+    k' = k / (1 − k), so k = k' / (1 + k'). Places count once, however long a walker stayed: else
+    one walker at a large weight would make the tail by itself. It is infinite without a tail.
     """
     try:
-        shape = float(array_stats.psislw(-log_weights)[1])
-    except ValueError:
+        shape = float(array_stats.psislw(-np.unique(log_weights))[1])
+    except (ValueError, IndexError):  # nothing, or a single place
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
 
@@ -122,13 +162,7 @@ def as_chains(draws: FloatArray) -> FloatArray:
 
 def nested_rhat(draws: FloatArray) -> FloatArray:
     """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
-    _, ensembles, walkers, _ = draws.shape
-    superchain = np.repeat(np.arange(ensembles), walkers)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rhat = array_stats.rhat_nested(
-            as_chains(draws), superchain_ids=superchain, chain_axis=0, draw_axis=1, method="rank"
-        )
-    return np.atleast_1d(rhat)
+    return _rhat(_scores(draws), _folded_scores(draws), draws.shape[1])
 
 
 def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,12 +172,79 @@ def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     W independent walkers has a W-th of the variance, so n effective means are worth n times the
     ratio of the variances.
     """
-    chains = as_chains(draws)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    return _effective_draws(draws, _scores(draws))
+
+
+def _effective_draws(draws: FloatArray, scores: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Effective draws, given the normal scores of the draws too."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = _ensemble_mean_ess(draws)
-        bulk = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="bulk")
-        tail = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="tail", prob=TAIL)
+        # Of the mean of the scores: what arviz calls bulk, which would rank the draws once more.
+        bulk = array_stats.ess(scores, method="mean")
+        tail = array_stats.ess(_series(draws), method="tail", prob=TAIL)
     return np.minimum(np.atleast_1d(bulk), cap), np.minimum(np.atleast_1d(tail), cap)
+
+
+def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> FloatArray:
+    """Nested R-hat (free,) of scores (free, chains, steps), an ensemble's chains in a row.
+
+    Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
+    calls rank, which would rank the draws once more.
+    """
+    superchain = np.repeat(np.arange(ensembles), scores.shape[1] // ensembles)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        both = [
+            array_stats.rhat_nested(each, superchain_ids=superchain, method="split")
+            for each in (scores, folded)
+        ]
+    # np.maximum keeps a nan of either.
+    return np.atleast_1d(np.maximum(*both))
+
+
+def _walker_rhat(scores: FloatArray) -> float:
+    """Largest R-hat, √(1 + variance of the walkers' means / mean of their variances).
+
+    Walkers that share modes between them in the same way in each ensemble, and never change, look
+    alike to the nested R-hat, and are worth as many effective draws as they are.
+    """
+    between = np.var(np.mean(scores, axis=-1), axis=-1)
+    within = np.mean(np.var(scores, axis=-1), axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return float(np.max(np.sqrt(1 + between / within)))
+
+
+def _series(draws: FloatArray) -> FloatArray:
+    """Return chains (free, chains, steps), each parameter's together in memory."""
+    return np.ascontiguousarray(np.moveaxis(as_chains(draws), -1, 0))
+
+
+def _scores(draws: FloatArray) -> FloatArray:
+    """Rank draws (steps, ensembles, walkers, free) into normal scores (free, chains, steps).
+
+    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)).
+    """
+    return np.stack([_normal_scores(one) for one in _series(draws)])
+
+
+def _folded_scores(draws: FloatArray) -> FloatArray:
+    """Return the normal scores of the draws' distances from their median."""
+    with np.errstate(invalid="ignore"):
+        return np.stack([_normal_scores(np.abs(s - np.median(s))) for s in _series(draws)])
+
+
+def _normal_scores(draws: FloatArray) -> FloatArray:
+    """Rank one parameter's draws; nan for all if any of them is."""
+    values = draws.ravel()
+    if np.isnan(values).any():
+        return np.full(draws.shape, np.nan)
+    order = np.argsort(values)
+    ordered = values[order]
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    equal = np.diff(first, append=values.size)
+    rank = first + 0.5 * (equal + 1)
+    scores = np.empty(values.size)
+    scores[order] = np.repeat(ndtri((rank - 3 / 8) / (values.size + 1 / 4)), equal)
+    return scores.reshape(draws.shape)
 
 
 def _ensemble_mean_ess(draws: FloatArray) -> FloatArray:

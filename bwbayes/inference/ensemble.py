@@ -10,13 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import emcee
 import numpy as np
+from emcee.autocorr import auto_window
 from emcee.moves import Move
 from numpy.typing import NDArray
+from scipy import fft
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 
@@ -35,6 +39,10 @@ RANDOM_STATE_WORDS = 628
 # Starts lie this many posterior sds from an optimum, in a cluster of a fraction of one.
 FAR = 10.0
 TIGHT = 0.2
+TRIALS = 100
+
+# Sokal's window for an autocorrelation time: the first lag of so many times that time.
+WINDOW = 5
 
 
 @dataclass(frozen=True)
@@ -55,13 +63,44 @@ class Block:
     """What an ensemble did.
 
     ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
-    (walkers,) moves, and the ``end`` it goes on from.
+    (walkers,) moves, ``moves`` (kinds, 2) how often each kind of move was proposed to a walker and
+    accepted, and the ``end`` it goes on from.
     """
 
     coordinates: FloatArray
     log_density: FloatArray
     accepted: IntArray
+    moves: IntArray
     end: EnsembleState
+
+
+class _Counted(Move):  # type: ignore[misc]  # emcee has no types
+    """A move that counts what it proposes to walkers and what they accept."""
+
+    def __init__(self, move: Move) -> None:
+        self.move = move
+        self.counts = np.zeros(2, dtype=np.int64)
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, NDArray[np.bool_]]:
+        """Let the move propose to every walker."""
+        state, accepted = self.move.propose(model, state)
+        self.counts += accepted.size, np.count_nonzero(accepted)
+        return state, accepted
+
+
+class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]  # emcee has no types
+    """emcee's sampler, in which a place that is not finite has no density.
+
+    Without a proper posterior walkers go there sooner or later, which emcee does not survive.
+    """
+
+    def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:
+        """Return the log density (models,) at coordinates (models, free), and nothing else."""
+        finite = np.isfinite(coords).all(axis=1)
+        density: FloatArray = np.full(len(coords), -np.inf)
+        if finite.any():
+            density[finite], _ = super().compute_log_prob(coords[finite])
+        return density, None
 
 
 def start(
@@ -76,18 +115,28 @@ def start(
     The optima of the point fit take turns; from there the point lies ten posterior sds off in a
     random direction (nearer where the density is zero), so that ensembles agree only after they
     have found the same posterior.
+
+    Raises
+    ------
+    InputError
+        There is no place for a cluster, however near.
     """
     axes = np.linalg.cholesky(point.covariance)
     optimum = point.optima[number % len(point.optima)]
     direction = generator.standard_normal(optimum.size)
     direction *= FAR / np.linalg.norm(direction)
-    while True:
+    for _ in range(TRIALS):
         cluster = direction + TIGHT * generator.standard_normal((walkers, optimum.size))
         coordinates = optimum + cluster @ axes.T
         log_density = posterior.log_density(coordinates)
         if np.isfinite(log_density).all():
             break
         direction /= 2
+    else:
+        raise InputError(
+            "sampling: no place for walkers around the point fit, where the posterior density must "
+            "be finite; check priors and record"
+        )
     random = np.random.RandomState(np.random.MT19937(generator.integers(2**63)))
     return EnsembleState(coordinates, log_density, _pack(random.get_state()))
 
@@ -95,11 +144,13 @@ def start(
 def advance(
     posterior: Posterior, moves: Sequence[tuple[Move, float]], state: EnsembleState, steps: int
 ) -> Block:
-    """Move an ensemble ``steps`` steps on, by emcee's ``moves`` with their weights."""
+    """Move an ensemble ``steps`` steps on, by emcee's ``moves`` with their weights.
+
+    Each step takes one of the moves at random, for all walkers.
+    """
     walkers, free = state.coordinates.shape
-    sampler = emcee.EnsembleSampler(
-        walkers, free, posterior.log_density, vectorize=True, moves=list(moves)
-    )
+    counted = [(_Counted(move), weight) for move, weight in moves]
+    sampler = _Sampler(walkers, free, posterior.log_density, vectorize=True, moves=counted)
     begin = emcee.State(
         state.coordinates,
         log_prob=state.log_density,
@@ -107,11 +158,13 @@ def advance(
         copy=True,
     )
     # Clusters are tight at first: emcee's check of their spread would refuse them.
-    last = sampler.run_mcmc(begin, steps, skip_initial_state_check=True)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        last = sampler.run_mcmc(begin, steps, skip_initial_state_check=True)
     return Block(
         sampler.get_chain(),
         sampler.get_log_prob(),
         sampler.backend.accepted.astype(np.int64),
+        np.stack([move.counts for move, _ in counted]),
         EnsembleState(last.coords, last.log_prob, _pack(last.random_state)),
     )
 
@@ -119,11 +172,20 @@ def advance(
 def autocorrelation_time(draws: FloatArray) -> FloatArray:
     """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
 
-    It is nan where it cannot be told, for instance where nothing moves.
+    As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
+    but for all walkers at once. It is nan where it cannot be told, for instance where nothing
+    moves.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        time: FloatArray = emcee.autocorr.integrated_time(draws, tol=0, quiet=True)
-    return time
+    steps = draws.shape[0]
+    padded = fft.next_fast_len(2 * steps, real=True)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        away = np.moveaxis(draws - np.mean(draws, axis=0), 0, -1)
+        spectrum = fft.rfft(away, padded)
+        covariance = fft.irfft(spectrum.real**2 + spectrum.imag**2, padded)[..., :steps]
+        correlation = np.mean(covariance / covariance[..., :1], axis=0)
+    times = 2 * np.cumsum(correlation, axis=1) - 1
+    found = np.array([time[auto_window(time, WINDOW)] for time in times])
+    return np.where(found > 0, found, np.nan)
 
 
 def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:

@@ -16,7 +16,10 @@ from emcee import moves
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.proposals import Proposal
 
-__all__ = ["SnookerMove", "pilot_moves", "sampling_moves"]
+__all__ = ["MOVES", "SnookerMove", "pilot_moves", "sampling_moves"]
+
+# Names of the moves, in the order in which the functions below return them.
+MOVES = ("differential evolution", "snooker", "mixture")
 
 Weighted = list[tuple[moves.Move, float]]
 
@@ -61,4 +64,4 @@ def sampling_moves(proposal: Proposal | None) -> Weighted:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()
-    return [(moves.MHMove(proposal), 0.75), (moves.DEMove(), 0.2), (SnookerMove(), 0.05)]
+    return [(moves.DEMove(), 0.2), (SnookerMove(), 0.05), (moves.MHMove(proposal), 0.75)]

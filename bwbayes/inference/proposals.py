@@ -8,6 +8,7 @@ maximisation. Heavy tails on every component keep the ratio of posterior to prop
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -80,12 +81,26 @@ class StudentProposal:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (count,) at coordinates (count, free), up to one constant for every fit."""
-        white = np.linalg.solve(self.factor, (coordinates - self.centre).T)
-        size = self.centre.size
-        squares = np.sum(white * white, axis=0)
-        tails = 0.5 * (self.freedom + size) * np.log1p(squares / self.freedom)
-        density: FloatArray = -tails - np.sum(np.log(np.diag(self.factor)))
+        power = 0.5 * (self.freedom + self.centre.size)
+        tails = power * np.log1p(self.squares(coordinates) / self.freedom)
+        density: FloatArray = -tails - self.log_volume
         return density
+
+    def squares(self, coordinates: FloatArray) -> FloatArray:
+        """Squared distances |L⁻¹(x − μ)|² (count,) of coordinates (count, free) from the centre."""
+        white = (coordinates - self.centre) @ self._whitening
+        distances: FloatArray = np.einsum("ij,ij->i", white, white)
+        return distances
+
+    @cached_property
+    def log_volume(self) -> float:
+        """The log determinant of L."""
+        return float(np.sum(np.log(np.diag(self.factor))))
+
+    @cached_property
+    def _whitening(self) -> FloatArray:
+        # Its transpose times a row is one product for all coordinates.
+        return np.ascontiguousarray(np.linalg.inv(self.factor).T)
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
@@ -132,12 +147,13 @@ class StudentMixture:
         # Ranks from the body of the distribution to its longer tail.
         along = draws[:, most] * (1 if shape[most] >= 0 else -1)
         start = np.searchsorted(np.quantile(along, CUTS), along)
-        share = _kept_alive(np.eye(COMPONENTS)[start])
+        share = _kept_alive(np.equal.outer(np.arange(COMPONENTS), start))
         for _ in range(ROUNDS):
-            mixture = cls(share.mean(axis=0), tuple(_components(draws, share, whole)))
+            mixture = cls(share.mean(axis=1), tuple(_components(draws, share, whole)))
             parts = [_gaussian(component, draws) for component in mixture.components]
             logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
-            share = _kept_alive(np.exp(logs - np.logaddexp.reduce(logs)).T)
+            density = np.exp(logs - np.max(logs, axis=0))
+            share = _kept_alive(density / np.sum(density, axis=0))
         return mixture
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
@@ -159,7 +175,8 @@ class StudentMixture:
     ) -> tuple[FloatArray, FloatArray]:
         """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
         proposed = self.draw(random, coordinates.shape[0])
-        return proposed, self.log_density(coordinates) - self.log_density(proposed)
+        old, new = np.split(self.log_density(np.concatenate([coordinates, proposed])), 2)
+        return proposed, old - new
 
 
 def _covariance(draws: FloatArray) -> FloatArray:
@@ -174,24 +191,22 @@ def _covariance(draws: FloatArray) -> FloatArray:
 
 def _kept_alive(share: FloatArray) -> FloatArray:
     """Give every component something of each draw; its weight says how little it matters."""
-    kept: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * share.shape[1])
+    kept: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * len(share))
     return kept
 
 
 def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list[StudentProposal]:
-    """Weighted means and covariances, one component for each column of ``share``."""
+    """Weighted means and covariances, one component for each row of ``share``."""
     found = []
-    for part in (share / share.sum(axis=0)).T:
+    for part in share / share.sum(axis=1, keepdims=True):
         centre = part @ draws
-        away = draws - centre
-        covariance = (1 - SHRINKAGE) * (part[:, np.newaxis] * away).T @ away + SHRINKAGE * whole
+        away = (draws - centre).T
+        covariance = (1 - SHRINKAGE) * (part * away) @ away.T + SHRINKAGE * whole
         found.append(StudentProposal(centre, np.linalg.cholesky(covariance)))
     return found
 
 
 def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:
     """Log density of the normal distribution with a component's centre and scale."""
-    white = np.linalg.solve(component.factor, (draws - component.centre).T)
-    squares = np.sum(white * white, axis=0)
-    density: FloatArray = -0.5 * squares - np.sum(np.log(np.diag(component.factor)))
+    density: FloatArray = -0.5 * component.squares(draws) - component.log_volume
     return density

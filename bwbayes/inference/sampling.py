@@ -2,24 +2,41 @@
 
 The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
 short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
-away. Then draws count, and after each block of steps the chain is judged
-(:mod:`bwbayes.inference.diagnostics`), until two judgements in a row find nothing missing, or the
-budget of steps is used up. All decisions are functions of the chain alone, so a run that was
-interrupted goes on to the same end.
+away. Then draws count, and the chain is judged (:mod:`bwbayes.inference.diagnostics`), until two
+judgements in a row find nothing missing, or the budget of steps is used up. To judge costs as much
+as some steps, so each judgement predicts how long the chain must become, and the next one waits
+until then.
+
+A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
+from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
+differential evolution starts the sampling again from where the ensembles are: so all draws that
+count come from one kernel, fixed before the first of them. To keep the early draws would save
+little, because differential evolution alone needs about ten times the steps, and they are the very
+draws that are not to be trusted.
+
+All decisions are functions of the chain alone, and are taken again from its beginning when a run
+that was interrupted goes on: it comes to the same end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.chain import Chain, Phase
-from bwbayes.inference.diagnostics import Check, check, nested_rhat, pareto_k
+from bwbayes.inference.diagnostics import (
+    LARGEST_PARETO_K,
+    LENGTH,
+    Check,
+    check,
+    nested_rhat,
+    pareto_k,
+)
 from bwbayes.inference.ensemble import Block, advance, start
 from bwbayes.inference.moves import sampling_moves
 from bwbayes.inference.pointfit import PointFit
@@ -31,10 +48,13 @@ __all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample
 # Nested R-hat of the pilot's second half below which its ensembles have found each other.
 PILOT_RHAT = 1.1
 
-# Above this the proposal does not cover the draws, and differential evolution goes on alone.
-LARGEST_PARETO_K = 0.7
+TUNING_BLOCKS = 2
 
-TUNING_BLOCKS = 4
+# Blocks before the first check, and how much longer the chain is at the next one at most, or at
+# least if it is not draws that are missing.
+FIRST_CHECK = 2
+LARGEST_STRETCH = 3.0
+LEAST_STRETCH = 1.2
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -69,7 +89,7 @@ class SamplingPlan:
     walkers: int = 24
     block: int = 50
     most_steps: int = 20_000
-    least_pilot_steps: int = 200
+    least_pilot_steps: int = 100
     most_pilot_steps: int = 3_000
 
     def __post_init__(self) -> None:
@@ -81,11 +101,12 @@ class SamplingPlan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a sampling ended: ``converged`` or not, why, and the last check."""
+    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
 
     converged: bool
     stop_reason: str
     check: Check
+    remarks: tuple[str, ...] = ()
 
 
 def first_chain(
@@ -125,27 +146,117 @@ def sample(
         if not chain.blocks("tuning"):
             chain.freeze("tuning", _fitted(chain, "pilot"))
         _extend(posterior, plan, chain, "tuning", executor, watcher)
-    if not chain.blocks("sampling"):
-        chain.freeze("sampling", _trusted(chain, _fitted(chain, "tuning")))
-        _extend(posterior, plan, chain, "sampling", executor, watcher)
-    before = _check(posterior, plan, chain, chain.blocks("sampling") - 1)
-    while True:
-        now = _check(posterior, plan, chain, chain.blocks("sampling"))
-        assert now is not None
-        watcher("sampling", now)
-        missing = now.shortcomings(plan.ess)
-        if not missing and before is not None and not before.shortcomings(plan.ess):
-            return Outcome(True, "converged on two checks in a row", now)
-        if chain.steps("sampling") >= plan.most_steps:
-            why = "; ".join(missing) or "only the last check passed"
-            return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
-        before = now
-        _extend(posterior, plan, chain, "sampling", executor, watcher)
+    if not chain.history("sampling"):
+        chain.freeze("sampling", _fitted(chain, "tuning"))
+    while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
+        chain.fall_back(chain.blocks("sampling"))
+    return replace(outcome, remarks=_remarks(chain))
 
 
 def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
     """Return a chain's draws in their own units, (steps, ensembles, walkers, free)."""
-    coordinates = chain.coordinates(phase)
+    return _constrained(posterior, chain.coordinates(phase))
+
+
+def _sampled(
+    posterior: Posterior, plan: SamplingPlan, chain: Chain, executor: Executor, watcher: Watcher
+) -> Outcome | None:
+    """Sample to the end, or until the proposal turns out not to cover the draws: then None.
+
+    A chain that has blocks already is judged where it was, or would have been, on its way.
+    """
+    judge = _Judge(posterior, plan, chain)
+    # A chain may be longer than its budget, if that was made smaller.
+    most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+    blocks, passed = FIRST_CHECK, False
+    while True:
+        blocks = min(blocks, most)
+        while chain.blocks("sampling") < blocks:
+            _extend(posterior, plan, chain, "sampling", executor, watcher)
+        now = judge(blocks)
+        watcher("sampling", now)
+        missing = now.shortcomings(plan.ess)
+        at_end = blocks == chain.blocks("sampling")
+        if not missing and passed and at_end:
+            return Outcome(True, "converged on two checks in a row", now)
+        if blocks == most:
+            why = "; ".join(missing) or "only the last check passed"
+            return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
+        if not now.covered and at_end:
+            return None
+        # One whose target was made smaller has converged before its end.
+        done = not missing and passed
+        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, now)
+        passed = not missing
+
+
+def _next_check(plan: SamplingPlan, blocks: int, found: Check) -> int:
+    """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
+
+    Effective draws grow with the steps. Once there are enough by that, a fifth more may mend what
+    else is missing; and after a check that found nothing missing comes another at once.
+    """
+    if not found.shortcomings(plan.ess):
+        return blocks + 1
+    fewest = np.min([found.ess_bulk, found.ess_tail])
+    with np.errstate(divide="ignore"):
+        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
+    wanted = steps / plan.block
+    if not wanted > blocks:  # nan too
+        wanted = LEAST_STRETCH * blocks
+    return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
+
+
+class _Judge:
+    """Judges the first blocks that count, each of which it prepares once."""
+
+    def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain) -> None:
+        self.posterior, self.plan, self.chain = posterior, plan, chain
+        self.proposal = chain.proposal_in_use("sampling")
+        self.draws: list[FloatArray] = []
+        self.log_weights: list[FloatArray] = []
+
+    def __call__(self, blocks: int) -> Check:
+        """Judge the first ``blocks`` blocks."""
+        for number in range(len(self.draws), blocks):
+            self._prepare(self.chain.block_of("sampling", number))
+        accepted = self.chain.accepted("sampling")[:blocks]
+        found = check(np.concatenate(self.draws[:blocks]), accepted, self.plan.block)
+        if self.proposal is None:
+            return found
+        return replace(found, pareto_k=pareto_k(np.concatenate(self.log_weights[:blocks])))
+
+    def _prepare(self, blocks: tuple[Block, ...]) -> None:
+        coordinates = np.stack([block.coordinates for block in blocks], axis=1)
+        self.draws.append(_constrained(self.posterior, coordinates))
+        if self.proposal is not None:
+            flat = coordinates.reshape(-1, coordinates.shape[-1])
+            density = np.stack([block.log_density for block in blocks], axis=1).ravel()
+            self.log_weights.append(density - self.proposal.log_density(flat))
+
+
+def _remarks(chain: Chain) -> tuple[str, ...]:
+    """Say what a user should know of the moves."""
+    alone = "differential evolution and snooker moves alone made the draws that count"
+    proposal = chain.proposals["sampling"]
+    if proposal is None:
+        return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
+    if not chain.set_aside:
+        return ()
+    aside = chain.history("sampling")[: chain.set_aside]
+    each = [block for blocks in aside for block in blocks]
+    coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in each])
+    density = np.concatenate([b.log_density.ravel() for b in each])
+    shape = pareto_k(density - proposal.log_density(coordinates))
+    steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
+    return (
+        f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
+        f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
+    )
+
+
+def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
+    """Return coordinates (steps, ensembles, walkers, free) in their own units."""
     flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
     return flat.reshape(coordinates.shape)
 
@@ -159,8 +270,12 @@ def _extend(
     watcher: Watcher,
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
-    moves = sampling_moves(chain.proposals[phase])
-    futures = [executor.submit(advance, posterior, moves, end, plan.block) for end in chain.ends]
+    proposal = chain.proposal_in_use(phase)
+    # Moves of its own for each: some of emcee's write to themselves.
+    futures = [
+        executor.submit(advance, posterior, sampling_moves(proposal), end, plan.block)
+        for end in chain.ends
+    ]
     blocks: list[Block] = []
     for future in futures:
         blocks.append(future.result())
@@ -172,37 +287,14 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     steps = chain.steps("pilot")
     if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
-    second_half = draws(posterior, chain, "pilot")[steps // 2 :]
+    second_half = _constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
     return bool((nested_rhat(second_half) < PILOT_RHAT).all())
 
 
-def _second_half(chain: Chain, phase: Phase) -> tuple[FloatArray, FloatArray]:
-    """Return coordinates (draws, free) and log density (draws,) of the later half of a phase."""
-    first = chain.steps(phase) // 2
-    kept = chain.coordinates(phase)[first:]
-    return kept.reshape(-1, kept.shape[-1]), chain.log_density(phase)[first:].ravel()
-
-
 def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:
-    """Fit a proposal to a phase's draws, if they span the space."""
+    """Fit a proposal to the later half of a phase's draws, if they span the space."""
+    later = chain.coordinates(phase)[chain.steps(phase) // 2 :]
     try:
-        return StudentMixture.fitted(_second_half(chain, phase)[0])
+        return StudentMixture.fitted(later.reshape(-1, later.shape[-1]))
     except np.linalg.LinAlgError:
         return None
-
-
-def _trusted(chain: Chain, proposal: StudentMixture | None) -> StudentMixture | None:
-    """Keep a proposal only if it covers the tuning's draws."""
-    if proposal is None:
-        return None
-    coordinates, log_density = _second_half(chain, "tuning")
-    shape = pareto_k(log_density - proposal.log_density(coordinates))
-    return proposal if shape < LARGEST_PARETO_K else None
-
-
-def _check(posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> Check | None:
-    """Judge the first ``blocks`` blocks."""
-    if blocks < 1:
-        return None
-    kept = draws(posterior, chain)[: blocks * plan.block]
-    return check(kept, chain.accepted("sampling")[:blocks], plan.block)

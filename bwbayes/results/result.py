@@ -38,6 +38,9 @@ class Result:
         (steps, ensembles, walkers, free), parameters in their own units.
     log_density
         (steps, ensembles, walkers), nats.
+    moves
+        How often each kind of move was proposed to a walker on the way to these draws, and
+        accepted.
     bands, scores
         Of every window and record that was predicted; ``scores`` by the bands' name, for those
         with a measurement. Both empty unless converged.
@@ -54,6 +57,7 @@ class Result:
     parameters: tuple[Parameter, ...]
     draws: FloatArray
     log_density: FloatArray
+    moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     bands: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -82,6 +86,13 @@ def summary(result: Result) -> dict[str, object]:
         "stop_reason": outcome.stop_reason,
         "steps": outcome.check.steps,
         "acceptance": outcome.check.acceptance,
+        "sampling": {
+            "proposals": {move: proposed for move, (proposed, _) in result.moves.items()},
+            "acceptance": {
+                move: kept / proposed for move, (proposed, kept) in result.moves.items()
+            },
+            "pareto_k": outcome.check.pareto_k,
+        },
         "remarks": list(result.remarks),
         "parameters": None,
         "validation": None,

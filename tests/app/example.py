@@ -96,6 +96,7 @@ def check(steps: int) -> Check:
         autocorrelation=np.ones(4),
         acceptance=0.28,
         stuck=0,
+        pareto_k=0.314,
     )
 
 
@@ -120,6 +121,7 @@ def run(
         parameters=parameters,
         draws=values,
         log_density=np.zeros(values.shape[:3]),
+        moves={"differential evolution": (1000, 123), "mixture": (3800, 1221)},
         bands=every,
         scores={b.name: scores() for b in every if b.measured is not None},
         facts={"record": "made up"},

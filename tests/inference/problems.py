@@ -218,7 +218,7 @@ def gaussian(free: int, correlation: float = 0.5) -> tuple[Posterior, PointFit]:
 class Known:
     """A target of which log density, exact draws and moments are known.
 
-    ``moments`` are the means and mean squares (2, free).
+    ``moments`` are the means and mean squares (2, free) of what ``view`` makes of the coordinates.
     """
 
     free: int
@@ -226,6 +226,7 @@ class Known:
     draw: Callable[[np.random.Generator, int], FloatArray]
     proposal: StudentProposal
     moments: FloatArray
+    view: Callable[[FloatArray], FloatArray] = lambda x: x
 
 
 def nine_dimensional_gaussian() -> Known:
@@ -286,28 +287,73 @@ def bimodal() -> Known:
     return Known(3, log_density, draw, proposal, np.array([[0.8, 0.0, 0.0], [4.49, 1.0, 1.0]]))
 
 
+def wedge() -> Known:
+    """Return a coordinate near one, and another just below it, as gamma near beta: a wall askew."""
+
+    def log_density(x: FloatArray) -> FloatArray:
+        gap = x[:, 0] - x[:, 1]
+        inside = (gap > 0) & (gap < 2 * x[:, 0])
+        return np.where(inside, -0.5 * ((x[:, 0] - 1) / 0.1) ** 2 - gap / 0.02, -np.inf)
+
+    def draw(generator: np.random.Generator, count: int) -> FloatArray:
+        first = generator.normal(1, 0.1, count)
+        return np.stack([first, first - generator.exponential(0.02, count)], axis=1)
+
+    # Shaped as the ridge: the second coordinate follows the first.
+    proposal = StudentProposal(np.array([1.0, 0.98]), np.array([[0.1, 0.0], [0.1, 0.02]]))
+    moments = np.array([[1.0, 0.02], [1.01, 8e-4]])
+    return Known(2, log_density, draw, proposal, moments, _with_gap)
+
+
+def _with_gap(x: FloatArray) -> FloatArray:
+    """Return the first coordinate and its gap to the second, (..., 2)."""
+    return np.stack([x[..., 0], x[..., 0] - x[..., 1]], axis=-1)
+
+
+def far_modes() -> Known:
+    """Two modes twenty sds apart, weighing 0.3 and 0.7: no step that is local goes across."""
+
+    def log_density(x: FloatArray) -> FloatArray:
+        rest = -0.5 * np.sum(x[:, 1:] ** 2, axis=1)
+        modes = np.stack([-0.5 * (x[:, 0] - m) ** 2 for m in (-10, 10)])
+        density: FloatArray = rest + np.logaddexp(np.log(0.3) + modes[0], np.log(0.7) + modes[1])
+        return density
+
+    def draw(generator: np.random.Generator, count: int) -> FloatArray:
+        x = generator.standard_normal((count, 3))
+        x[:, 0] += np.where(generator.uniform(size=count) < 0.3, -10, 10)
+        return x
+
+    proposal = StudentProposal(np.zeros(3), np.diag([10.0, 1.0, 1.0]))
+    return Known(3, log_density, draw, proposal, np.array([[4.0, 0.0, 0.0], [101.0, 1.0, 1.0]]))
+
+
 TARGETS = {
     "gaussian": nine_dimensional_gaussian(),
     "banana": banana(),
     "bounded": bounded(),
+    "wedge": wedge(),
     "bimodal": bimodal(),
+    "far modes": far_modes(),
 }
 
 
-def worst_score(known: Known, moves: list[tuple[Move, float]], steps: int = 120) -> float:
+def worst_score(
+    known: Known, moves: list[tuple[Move, float]], steps: int = 120, seed: int = 1
+) -> float:
     """Largest |t| of means and mean squares over the replicates."""
     walkers = 200
     posterior = target(known.log_density, known.free)
     origin = np.zeros(known.free)
     _, point = gaussian(known.free)
     found = []
-    for seed in np.random.SeedSequence(1).spawn(REPLICATES):
-        generator = np.random.default_rng(seed)
+    for child in np.random.SeedSequence(seed).spawn(REPLICATES):
+        generator = np.random.default_rng(child)
         draws = known.draw(generator, walkers)
         flat = target(lambda x: np.zeros(len(x)), known.free)
         state = start(flat, replace(point, mode=origin), 0, walkers, generator)
         state = replace(state, coordinates=draws, log_density=known.log_density(draws))
-        chain = advance(posterior, moves, state, steps).coordinates
+        chain = known.view(advance(posterior, moves, state, steps).coordinates)
         found.append([np.mean(chain**power, axis=(0, 1)) for power in (1, 2)])
     means = np.array(found)
     error = np.std(means, axis=0, ddof=1) / np.sqrt(REPLICATES)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import multiprocessing
 import os
 import signal
 import time
@@ -15,103 +14,22 @@ import h5py
 import numpy as np
 import pytest
 
-from bwbayes.errors import InputError
-from bwbayes.inference.chain import PHASES, Chain, Phase
+from bwbayes.inference.chain import PHASES, Phase
 from bwbayes.inference.chainfile import ChainFile
-from bwbayes.inference.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
-from bwbayes.inference.pointfit import PointFit
-from bwbayes.inference.proposals import COMPONENTS, StudentMixture, StudentProposal
-
-ENSEMBLES, WALKERS, FREE, STEPS = 4, 16, 8, 50
-ATTRIBUTES: dict[str, str | int] = {
-    "config": '[record]\nfile = "µm.csv"\n',
-    "data_sha256": "94fd",
-    "versions": '{"numpy": "2.0"}',
-    "platform": "Linux",
-    "seed": 7,
-}
-# What a writer does, in order, and where it may be interrupted.
-PLAN: tuple[tuple[Phase, int], ...] = (("pilot", 2), ("tuning", 2), ("sampling", 10))
-
-# Processes that start in milliseconds, from one that has all imported already.
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload([__name__])
-
-
-def state(generator: np.random.Generator) -> EnsembleState:
-    words = generator.integers(2**32, size=RANDOM_STATE_WORDS, dtype=np.uint32)
-    coordinates = generator.standard_normal((WALKERS, FREE))
-    return EnsembleState(coordinates, generator.standard_normal(WALKERS), words)
-
-
-def blocks(phase: Phase, number: int) -> list[Block]:
-    """Make up the block of every ensemble: always the same one."""
-    generator = np.random.default_rng([PHASES.index(phase), number])
-    made = []
-    for _ in range(ENSEMBLES):
-        end = state(generator)
-        coordinates = generator.standard_normal((STEPS, WALKERS, FREE))
-        density = generator.standard_normal((STEPS, WALKERS))
-        coordinates[-1], density[-1] = end.coordinates, end.log_density
-        made.append(Block(coordinates, density, generator.integers(STEPS, size=WALKERS), end))
-    return made
-
-
-def proposal(phase: Phase) -> StudentMixture:
-    generator = np.random.default_rng(PHASES.index(phase))
-    factors = np.tril(generator.standard_normal((COMPONENTS, FREE, FREE)))
-    centres = generator.standard_normal((COMPONENTS, FREE))
-    parts = tuple(StudentProposal(*pair) for pair in zip(centres, factors, strict=True))
-    return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts)
-
-
-def new(path: Path, blocks_before: int = 0) -> ChainFile:
-    generator = np.random.default_rng(0)
-    mode = generator.standard_normal(FREE)
-    point = PointFit(mode, np.eye(FREE), -3.5, np.stack([mode, -mode]), 4 * np.eye(FREE))
-    chain = Chain([state(generator) for _ in range(ENSEMBLES)])
-    for number in range(blocks_before):
-        chain.append("pilot", blocks("pilot", number))
-    return ChainFile.create(path, chain, point, STEPS, ATTRIBUTES)
-
-
-def finish(chain: Chain) -> None:
-    """Do what is left of the plan, as a sampling does."""
-    for phase, count in PLAN:
-        if phase != "pilot" and not chain.blocks(phase):
-            chain.freeze(phase, proposal(phase))
-        while chain.blocks(phase) < count:
-            chain.append(phase, blocks(phase, chain.blocks(phase)))
-
-
-def arrays(chain: ChainFile) -> dict[str, Any]:
-    """Return all that a chain holds, by name."""
-    held: dict[str, Any] = {"point density": np.array(chain.point.log_density)}
-    for name in ("mode", "covariance", "optima", "prior_covariance"):
-        held[f"point {name}"] = getattr(chain.point, name)
-    for phase in PHASES:
-        held[f"{phase} blocks"] = np.array(chain.blocks(phase))
-        if chain.blocks(phase):
-            for name in ("coordinates", "log_density", "accepted"):
-                held[f"{phase} {name}"] = getattr(chain, name)(phase)
-        for number in range(chain.blocks(phase)):
-            ends = [block.end.random_state for block in chain.block_of(phase, number)]
-            held[f"{phase} {number} random states"] = np.stack(ends)
-        mixture = chain.proposals[phase]
-        if mixture is not None:
-            held[f"{phase} weights"] = mixture.weights
-            held[f"{phase} centres"] = np.stack([c.centre for c in mixture.components])
-            held[f"{phase} factors"] = np.stack([c.factor for c in mixture.components])
-    for kind, states in (("start", chain.starts), ("end", chain.ends)):
-        for name in ("coordinates", "log_density", "random_state"):
-            held[f"{kind} {name}"] = np.stack([getattr(one, name) for one in states])
-    return held
-
-
-def assert_same(expected: dict[str, Any], got: dict[str, Any]) -> None:
-    assert expected.keys() == got.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(value, got[name], err_msg=name)
+from bwbayes.inference.ensemble import Block
+from tests.forks import FORKS
+from tests.inference.chains import (
+    ATTRIBUTES,
+    ENSEMBLES,
+    PLAN,
+    arrays,
+    assert_same,
+    blocks,
+    committed,
+    finish,
+    new,
+    proposal,
+)
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +77,36 @@ def test_chain_that_has_blocks_already_is_written_with_them(tmp_path: Path) -> N
         finish(chain)
         memory = arrays(chain)
     assert_same(memory, arrays(ChainFile.read(tmp_path / "chain.h5")))
+
+
+def test_blocks_that_were_set_aside_stay_so_and_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    with new(path) as chain:
+        chain.freeze("sampling", proposal("sampling"))
+        for number in range(3):
+            chain.append("sampling", blocks("sampling", number))
+        chain.fall_back(2)
+        chain.append("sampling", blocks("sampling", 3))
+        expected = arrays(chain)
+    read = ChainFile.read(path)
+    with ChainFile.resume(path) as resumed:
+        resumed.append("sampling", blocks("sampling", 4))
+    longer = ChainFile.read(path)
+    assert_same(expected, arrays(read))
+    assert (2, 2, 4) == (read.set_aside, read.blocks("sampling"), len(read.history("sampling")))
+    assert (2, 3, 5) == (
+        longer.set_aside,
+        longer.blocks("sampling"),
+        len(longer.history("sampling")),
+    )
+    assert longer.proposals["sampling"] is not None
+    assert longer.proposal_in_use("sampling") is None
+    for number in range(5):
+        for mine, yours in zip(
+            blocks("sampling", number), longer.history("sampling")[number], strict=True
+        ):
+            np.testing.assert_array_equal(mine.coordinates, yours.coordinates)
+            np.testing.assert_array_equal(mine.moves, yours.moves)
 
 
 def test_chain_without_blocks_goes_on_from_its_starts(
@@ -271,13 +219,6 @@ def test_killed_anywhere_it_goes_on_to_the_same_bits(
     assert_same(expected, arrays(ChainFile.read(path)))
 
 
-def committed(path: Path) -> list[int]:
-    if not path.exists():
-        return [0] * len(PHASES)
-    chain = ChainFile.read(path)
-    return [chain.blocks(phase) for phase in PHASES]
-
-
 def write_and_tell(path: Path, told: Any) -> None:
     """Finish the chain block by block, and tell of each that should now be safe."""
     with ChainFile.resume(path) if path.exists() else new(path) as chain:
@@ -314,76 +255,3 @@ def test_killed_at_any_time_no_block_that_was_told_of_is_lost(
     assert unfinished > 0
     assert written(path) == 0
     assert_same(expected, arrays(ChainFile.read(path)))
-
-
-# Damage
-
-
-def assert_one_line(error: pytest.ExceptionInfo[InputError], path: Path) -> None:
-    assert "\n" not in str(error.value)
-    assert str(error.value).startswith(f"{path}: ")
-
-
-def test_missing_file_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist") as error:
-        ChainFile.read(tmp_path / "chain.h5")
-    assert_one_line(error, tmp_path / "chain.h5")
-
-
-@pytest.mark.parametrize("content", [b"", b"no chain", b"\x89HDF\r\n\x1a\n" + bytes(600)])
-def test_other_file_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "chain.h5"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="cannot be read") as error:
-        ChainFile.read(path)
-    assert_one_line(error, path)
-
-
-def test_hdf5_file_that_is_no_chain_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "chain.h5"
-    with h5py.File(path, "w") as file:
-        file["voltage"] = np.zeros(3)
-    with pytest.raises(InputError, match="cannot be read") as error:
-        ChainFile.read(path)
-    assert_one_line(error, path)
-
-
-def test_chain_of_another_format_is_refused(whole: Path, tmp_path: Path) -> None:
-    path = tmp_path / "chain.h5"
-    path.write_bytes(whole.read_bytes())
-    with h5py.File(path, "r+") as file:
-        file.attrs["format"] = 99
-    with pytest.raises(InputError, match="format is 99"):
-        ChainFile.read(path)
-
-
-@pytest.mark.parametrize("kept", [0.999, 0.9, 0.5, 0.1, 0.01])
-def test_cut_file_is_refused(whole: Path, tmp_path: Path, kept: float) -> None:
-    path, content = tmp_path / "chain.h5", whole.read_bytes()
-    path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(InputError) as error:
-        ChainFile.read(path)
-    assert_one_line(error, path)
-
-
-def test_flipped_bit_is_noticed_or_harmless(
-    whole: Path, tmp_path: Path, expected: dict[str, Any]
-) -> None:
-    """A bit in each of many places, most of them where the numbers are few and all matter."""
-    content = whole.read_bytes()
-    generator = np.random.default_rng(5)
-    head = min(60_000, len(content))
-    places = [*generator.integers(head, size=150), *generator.integers(len(content), size=30)]
-    refused = 0
-    path = tmp_path / "chain.h5"
-    for place in places:
-        damaged = bytearray(content)
-        damaged[place] ^= 1 << int(generator.integers(8))
-        path.write_bytes(damaged)
-        try:
-            found = arrays(ChainFile.read(path))
-        except InputError:
-            refused += 1
-            continue
-        assert_same(expected, found)
-    assert refused > len(places) / 10

@@ -1,11 +1,15 @@
 """The statistics against what they stand for, and everything that must not count as converged."""
 
+# mypy: allow-untyped-calls
+# arviz_stats says that it has types, but its functions have none.
+
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 from emcee.moves import DEMove
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -135,6 +139,36 @@ def test_every_walker_is_a_chain() -> None:
             np.testing.assert_array_equal(draws[:, ensemble, walker], chains[3 * ensemble + walker])
 
 
+def test_rhat_and_effective_draws_are_arvizs() -> None:
+    """Draws that repeat, as those of walkers that stay where they are, have equal ranks."""
+    draws = np.round(autoregressive(0.5, 200, (4, 6, 3), np.random.default_rng(15)), 1)
+    draws[:, 1, :, 2] += 1
+    chains = as_chains(draws)
+    superchain = np.repeat(np.arange(4), 6)
+    axes: dict[str, int] = {"chain_axis": 0, "draw_axis": 1}
+    rhat = array_stats.rhat_nested(chains, superchain_ids=superchain, method="rank", **axes)
+    np.testing.assert_allclose(rhat, nested_rhat(draws), rtol=1e-12)
+    bulk, _ = effective_draws(draws)
+    arvizs = array_stats.ess(chains, method="bulk", **axes)
+    assert (bulk <= arvizs * (1 + 1e-12)).all()
+    # The third series, whose ensembles disagree, is capped by their means.
+    np.testing.assert_allclose(arvizs[:2], bulk[:2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [201, 202, 203])
+def test_rhat_of_halves_that_are_not_even_is_arvizs_within_rounding(steps: int) -> None:
+    """There arviz leaves out the middle draw before it ranks, and not after."""
+    draws = autoregressive(0.5, steps, (4, 6, 2), np.random.default_rng(16))
+    half = steps // 2
+    halves = np.concatenate([draws[:half], draws[steps - half :]], axis=1)
+    ids = np.repeat(np.arange(8), 6)
+    axes: dict[str, int] = {"chain_axis": 0, "draw_axis": 1}
+    whole = array_stats.rhat_nested(as_chains(draws), superchain_ids=ids[:24], **axes)
+    apart = array_stats.rhat_nested(as_chains(halves), superchain_ids=ids, **axes)
+    found = check(draws, moving(6)[:8], 25).rhat
+    np.testing.assert_allclose(np.maximum(whole, apart), found, atol=2e-4)
+
+
 def test_nested_rhat_of_agreeing_ensembles_is_one() -> None:
     np.testing.assert_allclose(1.0, nested_rhat(good_draws()), atol=0.005)
 
@@ -187,7 +221,7 @@ def test_one_stuck_walker_of_256_blocks() -> None:
     accepted = moving(64)
     assert [] == check(draws, accepted, BLOCK).shortcomings(1000)
     draws[:, 1, 7] = 0.3
-    accepted[-1, 1, 7] = 0
+    accepted[:, 1, 7] = 0
     assert ["1 walkers are stuck"] == check(draws, accepted, BLOCK).shortcomings(1000)
 
 
@@ -246,6 +280,15 @@ def test_acceptance_is_the_mean_fraction_of_moves() -> None:
     assert expected == pytest.approx(check(good_draws(), accepted, BLOCK).acceptance)
 
 
+def test_a_proposal_that_does_not_cover_the_draws_is_a_shortcoming() -> None:
+    good = Check(1000, np.ones(2), np.full(2, 3e3), np.full(2, 3e3), np.full(2, 4.0), 0.4, 0)
+    for shape in (None, -0.2, 0.69):
+        assert [] == replace(good, pareto_k=shape).shortcomings(2000)
+    for shape in (0.7, np.inf, np.nan):
+        expected = [f"Pareto k {shape:.2f} is not below 0.7"]
+        assert expected == replace(good, pareto_k=shape).shortcomings(2000)
+
+
 def test_a_chain_too_short_to_judge_has_not_converged() -> None:
     draws = good_draws()[:3]
     assert [] != check(draws, moving()[:1], 3).shortcomings(1)
@@ -273,12 +316,25 @@ def test_pareto_k_trusts_a_fitted_student_and_not_one_that_misses_a_mode() -> No
     assert pareto_k(density - fitted.log_density(draws)) > 0.7
 
 
-def test_pareto_k_does_not_trust_walkers_that_stay_where_the_proposal_hardly_goes() -> None:
-    """The largest weights are all one walker's, so their tail has no shape."""
+@pytest.mark.parametrize("variance", [0.3, 0.5, 0.8])
+def test_pareto_k_of_a_chain_that_repeats_itself(variance: float) -> None:
+    """A walker repeats places of large weight; three steps in four are proposed independently."""
     generator = np.random.default_rng(13)
-    log_weights = generator.standard_normal(10_000)
-    log_weights[:1500] = 30.0
-    assert not pareto_k(log_weights) < 0.7
+    walkers, log_weight = generator.standard_normal(400), -0.5 * (1 - 1 / variance)
+    log_weights = []
+    for _ in range(400):
+        independent = generator.random(400) < 0.75
+        afar = generator.standard_normal(400) * variance**0.5
+        nearby = walkers + 1.5 * generator.standard_normal(400)
+        proposed = np.where(independent, afar, nearby)
+        factor = np.where(independent, log_weight, -0.5) * (proposed**2 - walkers**2)
+        walkers = np.where(np.log(generator.random(400)) < factor, proposed, walkers)
+        log_weights.append(log_weight * walkers**2)
+    assert 1 - variance == pytest.approx(pareto_k(np.array(log_weights).ravel()), abs=0.12)
+
+
+def test_pareto_k_does_not_trust_a_single_place() -> None:
+    assert np.inf == pareto_k(np.full(1000, 30.0))
 
 
 def test_pareto_k_of_what_is_not_a_number_is_not_trusted() -> None:

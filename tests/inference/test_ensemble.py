@@ -5,8 +5,10 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
+import emcee
 import numpy as np
 import pytest
+from emcee.moves import DEMove, MHMove
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.ensemble import (
@@ -42,6 +44,7 @@ def test_the_same_input_gives_the_same_bits(phase: str) -> None:
     np.testing.assert_array_equal(one.coordinates, two.coordinates)
     np.testing.assert_array_equal(one.log_density, two.log_density)
     np.testing.assert_array_equal(one.accepted, two.accepted)
+    np.testing.assert_array_equal(one.moves, two.moves)
     assert_same_state(one.end, two.end)
 
 
@@ -75,6 +78,7 @@ def test_blocks_in_a_row_are_one_long_block(phase: str, cuts: tuple[int, ...]) -
         whole.log_density, np.concatenate([block.log_density for block in blocks])
     )
     np.testing.assert_array_equal(whole.accepted, np.sum([b.accepted for b in blocks], axis=0))
+    np.testing.assert_array_equal(whole.moves, np.sum([b.moves for b in blocks], axis=0))
     assert_same_state(whole.end, state)
 
 
@@ -95,6 +99,49 @@ def test_accepted_counts_the_moves_of_each_walker() -> None:
     path = np.concatenate([state.coordinates[np.newaxis], block.coordinates])
     moved = np.any(path[1:] != path[:-1], axis=2)
     np.testing.assert_array_equal(np.sum(moved, axis=0), block.accepted)
+
+
+@pytest.mark.parametrize("phase", MOVES)
+def test_every_step_and_every_acceptance_is_one_moves(phase: str) -> None:
+    block = advance(POSTERIOR, MOVES[phase], begin(), 60)
+    assert (len(MOVES[phase]), 2) == block.moves.shape
+    proposed, accepted = np.sum(block.moves, axis=0)
+    assert 60 * WALKERS == proposed
+    assert np.sum(block.accepted) == accepted
+    assert (block.moves[:, 0] > 0).all()
+    assert (block.moves[:, 0] % WALKERS == 0).all()
+
+
+def test_acceptance_is_told_of_each_move_by_itself() -> None:
+    """A move that is never accepted between one that always is and one in between."""
+
+    def nowhere(x: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+        return x + random.standard_normal(x.shape), np.full(len(x), -np.inf)
+
+    def stay(x: FloatArray, _: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+        return x, np.zeros(len(x))
+
+    moves = [(MHMove(stay), 0.3), (MHMove(nowhere), 0.4), (DEMove(), 0.3)]
+    counts = advance(POSTERIOR, moves, begin(), 60).moves
+    assert counts[0, 0] == counts[0, 1] > 0
+    assert 0 == counts[1, 1] < counts[1, 0]
+    assert 0 < counts[2, 1] < counts[2, 0]
+
+
+def test_counting_does_not_change_a_step() -> None:
+    """The same steps as emcee's own, from the same random state."""
+    state = begin()
+    random = np.random.RandomState()
+    words = state.random_state
+    normal = float(words[626:].view(np.float64)[0])
+    random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
+    sampler = emcee.EnsembleSampler(
+        WALKERS, FREE, POSTERIOR.log_density, vectorize=True, moves=sampling_moves(PROPOSAL)
+    )
+    begun = emcee.State(state.coordinates, random_state=random.get_state())
+    sampler.run_mcmc(begun, 30, skip_initial_state_check=True)
+    block = advance(POSTERIOR, MOVES["sampling"], state, 30)
+    np.testing.assert_array_equal(sampler.get_chain(), block.coordinates)
 
 
 def test_the_random_state_survives_a_round_trip() -> None:
@@ -169,6 +216,13 @@ def test_the_autocorrelation_time_is_that_of_a_known_process() -> None:
         kept = np.array([0.8, 0.0])
         draws[step] = kept * draws[step - 1] + np.sqrt(1 - kept**2) * shocks
     np.testing.assert_allclose([9.0, 1.0], autocorrelation_time(draws), rtol=0.1)
+
+
+@pytest.mark.parametrize(("steps", "walkers"), [(50, 8), (301, 5)])
+def test_the_autocorrelation_time_is_emcees(steps: int, walkers: int) -> None:
+    series = np.cumsum(np.random.default_rng(6).standard_normal((steps, walkers, 3)), axis=0)
+    expected = emcee.autocorr.integrated_time(series, tol=0, quiet=True)
+    np.testing.assert_allclose(expected, autocorrelation_time(series), rtol=1e-9)
 
 
 def test_the_autocorrelation_time_of_what_does_not_move_is_nan() -> None:

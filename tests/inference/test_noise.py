@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import kstest, multivariate_normal
+from scipy.linalg import block_diag
+from scipy.stats import kstest, multivariate_normal, norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
+from bwbayes.inference.noise import DiscrepancyNoise, NoiseKind, WhiteNoise, noise_model
+from tests.inference.problems import INTERVAL, short_posterior
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
 
@@ -91,6 +93,54 @@ def test_discrepancy_noise_is_a_multivariate_normal(seed: int, samples: int) -> 
     dense = multivariate_normal(np.zeros(samples), covariance(theta, samples))
     got = DiscrepancyNoise(1.0).log_density(theta[np.newaxis], residual[np.newaxis])[0]
     assert_same(float(dense.logpdf(residual)), got, samples)
+
+
+@pytest.mark.parametrize("sensor", SCALES)
+def test_white_noise_is_exact_at_extreme_values(sensor: float) -> None:
+    residual = sensor * np.random.default_rng(10).standard_normal((1, 1000))
+    expected = float(np.sum(norm.logpdf(residual / sensor) - np.log(sensor)))
+    assert_same(expected, WhiteNoise().log_density(np.array([[sensor]]), residual)[0], 1000)
+
+
+@pytest.mark.parametrize("kind", ["white", "discrepancy"])
+def test_windows_of_a_record_are_one_multivariate_normal(kind: NoiseKind) -> None:
+    """Its covariance has a block for each window: what lies between is independent and unseen."""
+    windows = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 150))
+    posterior = short_posterior(kind, 150, "lag", {}, training=windows)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(11), 20))
+    rows = np.concatenate([np.arange(window.start, window.stop) for window in windows])
+    residual = posterior.displacement[rows] - posterior.simulate(theta)[:, rows]
+    got = posterior.log_likelihood(theta)
+    for row, values in enumerate(residual):
+        named = dict(zip(posterior.prior.names, theta[row].tolist(), strict=True))
+        scale = [named["sensor_sd"], named.get("discrepancy_sd", 0.0)]
+        scaled = np.array([*scale, named.get("discrepancy_time", 1.0) / INTERVAL])
+        blocks = [covariance(scaled, window.stop - window.start) for window in windows]
+        dense = multivariate_normal(np.zeros(rows.size), block_diag(*blocks))
+        assert_same(float(dense.logpdf(values)), got[row], rows.size)
+
+
+def steady(theta: FloatArray, residual: FloatArray) -> float:
+    """Log density by the steady-state innovations alone, as if the filter had always run."""
+    sensor, process, time = theta
+    decay = 1 - np.exp(-2 / time)
+    half = decay * (process**2 - sensor**2) / 2
+    spread = half + np.sqrt(half**2 + decay * (process * sensor) ** 2) + sensor**2
+    white = DiscrepancyNoise(1.0).whiten(theta[np.newaxis], residual[np.newaxis])[0]
+    return float(np.sum(norm.logpdf(white) - np.log(spread) / 2))
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 10, 100])
+@pytest.mark.parametrize("theta", [(0.5, 1.0, 20.0), (0.3, 3.0, 100.0), (1.0, 0.5, 5.0)])
+def test_the_start_is_exact(theta: tuple[float, float, float], samples: int) -> None:
+    """The twin: innovations of the steady state, without the correction for the start, fail."""
+    values = np.array(theta)
+    residual = simulated(values, samples, np.random.default_rng(12))
+    dense = multivariate_normal(np.zeros(samples), covariance(values, samples))
+    expected = float(dense.logpdf(residual))
+    got = DiscrepancyNoise(1.0).log_density(values[np.newaxis], residual[np.newaxis])[0]
+    assert_same(expected, got, samples)
+    assert abs(steady(values, residual) - expected) > 1e-3
 
 
 def test_exact_at_extreme_values() -> None:

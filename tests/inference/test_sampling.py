@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import copy
 import itertools
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,52 +15,29 @@ from scipy import stats
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.chain import PHASES, Chain, Phase
-from bwbayes.inference.diagnostics import Check
+from bwbayes.inference.diagnostics import pareto_k
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentMixture
-from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
-from tests.inference.problems import gaussian, short_posterior, target
-
-PLAN = SamplingPlan(
-    ess=400,
-    walkers=12,
-    block=20,
-    least_pilot_steps=100,
-    most_pilot_steps=400,
-    most_steps=1000,
+from bwbayes.inference.sampling import TUNING_BLOCKS, Outcome, draws, first_chain, sample
+from tests.inference.problems import short_posterior, target
+from tests.inference.samplings import (
+    LONG,
+    PLAN,
+    POSTERIOR,
+    InterruptedRunError,
+    PluggedExecutor,
+    Watched,
+    assert_same_chain,
+    assert_same_outcome,
+    assert_same_proposal,
+    new_chain,
+    run,
 )
-POSTERIOR, POINT = gaussian(3)
 
 # Calls of the executor, four a block: in the first block of the pilot, later there and at its end,
 # in the tuning and at its end, and in the sampling.
-INTERRUPTIONS = (0, 9, 20, 26, 36, 42)
-
-
-def new_chain(plan: SamplingPlan = PLAN, seed: int = 1) -> Chain:
-    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(seed))
-
-
-def run(plan: SamplingPlan = PLAN, seed: int = 1, workers: int = 1) -> tuple[Chain, Outcome]:
-    chain = new_chain(plan, seed)
-    with ThreadPoolExecutor(workers) as executor:
-        return chain, sample(POSTERIOR, plan, chain, executor)
-
-
-class Watched:
-    """What a watcher hears."""
-
-    def __init__(self) -> None:
-        self.blocks: list[Phase] = []
-        self.checks: list[Check] = []
-
-    def __call__(self, phase: Phase, found: Check | None) -> None:
-        """Hear of a block, or of a check."""
-        if found is None:
-            self.blocks.append(phase)
-        else:
-            assert "sampling" == phase
-            self.checks.append(found)
+INTERRUPTIONS = (0, 9, 20, 24, 28, 34)
 
 
 @pytest.fixture(scope="module")
@@ -74,33 +50,6 @@ def finished(watched: Watched) -> tuple[Chain, Outcome]:
     chain = new_chain()
     with ThreadPoolExecutor(1) as executor:
         return chain, sample(POSTERIOR, PLAN, chain, executor, watched)
-
-
-def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None) -> None:
-    if one is None or two is None:
-        assert one is two
-        return
-    np.testing.assert_array_equal(one.weights, two.weights)
-    for mine, yours in zip(one.components, two.components, strict=True):
-        assert mine.freedom == yours.freedom
-        np.testing.assert_array_equal(mine.centre, yours.centre)
-        np.testing.assert_array_equal(mine.factor, yours.factor)
-
-
-def assert_same_chain(one: Chain, two: Chain) -> None:
-    for phase in PHASES:
-        assert one.blocks(phase) == two.blocks(phase)
-        for name in ("coordinates", "log_density", "accepted"):
-            np.testing.assert_array_equal(getattr(one, name)(phase), getattr(two, name)(phase))
-    for mine, yours in zip(one.ends, two.ends, strict=True):
-        np.testing.assert_array_equal(mine.random_state, yours.random_state)
-        assert_same_proposal(one.proposals[phase], two.proposals[phase])
-
-
-def assert_same_outcome(one: Outcome, two: Outcome) -> None:
-    assert (one.converged, one.stop_reason) == (two.converged, two.stop_reason)
-    np.testing.assert_array_equal(one.check.rhat, two.check.rhat)
-    np.testing.assert_array_equal(one.check.ess_bulk, two.check.ess_bulk)
 
 
 def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
@@ -124,7 +73,7 @@ def test_a_proposal_is_fitted_to_the_later_half_of_the_phase_before(
 
 
 def test_the_tuning_has_its_length(finished: tuple[Chain, Outcome]) -> None:
-    assert 4 == finished[0].blocks("tuning")
+    assert TUNING_BLOCKS == finished[0].blocks("tuning")
 
 
 def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
@@ -207,26 +156,6 @@ def test_the_pilot_has_a_budget_of_its_own() -> None:
     assert "R-hat" in outcome.stop_reason
 
 
-class InterruptedRunError(Exception):
-    """Somebody pulled the plug."""
-
-
-class PluggedExecutor(Executor):
-    """Runs calls at once, a given number of them, and then fails."""
-
-    def __init__(self, calls: int) -> None:
-        self.left = calls
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run, or fail."""
-        if self.left == 0:
-            raise InterruptedRunError
-        self.left -= 1
-        future: Future[Any] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-
 @pytest.mark.parametrize("calls", INTERRUPTIONS)
 def test_an_interrupted_chain_goes_on_to_the_same_end(
     finished: tuple[Chain, Outcome], calls: int
@@ -249,15 +178,70 @@ def test_the_interruptions_meet_every_phase(finished: tuple[Chain, Outcome]) -> 
     assert {*ends[:2].tolist()} <= set(INTERRUPTIONS)
 
 
-def test_a_proposal_that_does_not_cover_the_tuning_is_not_used(
-    monkeypatch: pytest.MonkeyPatch,
+def test_pareto_k_is_that_of_the_draws_that_count(finished: tuple[Chain, Outcome]) -> None:
+    chain, outcome = finished
+    proposal = chain.proposals["sampling"]
+    assert proposal is not None
+    density = proposal.log_density(chain.coordinates("sampling").reshape(-1, 3))
+    expected = pareto_k(chain.log_density("sampling").ravel() - density)
+    assert expected == outcome.check.pareto_k
+    assert expected < 0.7
+    assert () == outcome.remarks
+
+
+def test_every_move_is_counted_in_every_phase(finished: tuple[Chain, Outcome]) -> None:
+    chain, _ = finished
+    names = ["differential evolution", "snooker", "mixture"]
+    for phase in PHASES:
+        moves = chain.moves(phase)
+        assert names[: 2 if phase == "pilot" else 3] == list(moves)
+        proposed, accepted = np.sum(list(moves.values()), axis=0)
+        assert chain.steps(phase) * PLAN.ensembles * PLAN.walkers == proposed
+        assert np.sum(chain.accepted(phase)) == accepted
+
+
+def checked(watched: Watched) -> list[int]:
+    return [found.steps for found in watched.checks]
+
+
+@pytest.mark.usefixtures("finished")
+def test_checks_wait_until_the_chain_is_predicted_to_be_long_enough(watched: Watched) -> None:
+    """Each is at the steps that the one before needs, or right after one that passed."""
+    assert 40 == checked(watched)[0]
+    for before, after in itertools.pairwise(watched.checks):
+        fewest = np.min([before.ess_bulk, before.ess_tail])
+        wanted = max(before.steps * PLAN.ess / fewest, 50 * np.max(before.autocorrelation))
+        if before.shortcomings(PLAN.ess) and wanted > before.steps:
+            steps = min(wanted, 3 * before.steps)
+            assert PLAN.block * np.ceil(steps / PLAN.block) == after.steps
+        elif not before.shortcomings(PLAN.ess):
+            assert before.steps + PLAN.block == after.steps
+
+
+def test_a_long_sampling_is_checked_rarely() -> None:
+    """After a fifth of its blocks at most."""
+    watched, chain = Watched(), new_chain(LONG)
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(POSTERIOR, replace(LONG, ess=20_000), chain, executor, watched)
+    assert outcome.converged
+    assert 5 * len(watched.checks) <= chain.blocks("sampling")
+
+
+def test_a_chain_whose_target_is_made_smaller_is_judged_at_its_end(
+    finished: tuple[Chain, Outcome],
 ) -> None:
-    """Nothing covers it when no Pareto k is small enough; differential evolution goes on alone."""
-    monkeypatch.setattr("bwbayes.inference.sampling.LARGEST_PARETO_K", -np.inf)
-    chain, outcome = run(replace(PLAN, most_steps=20))
-    assert chain.proposals["tuning"] is not None
-    assert chain.proposals["sampling"] is None
-    assert 20 == outcome.check.steps
+    chain = copy.deepcopy(finished[0])
+    outcome = sample(POSTERIOR, replace(PLAN, ess=50), chain, PluggedExecutor(0))
+    assert outcome.converged
+    assert chain.steps("sampling") == outcome.check.steps
+
+
+def test_a_chain_whose_budget_is_made_smaller_is_judged_at_its_end(
+    finished: tuple[Chain, Outcome],
+) -> None:
+    chain = copy.deepcopy(finished[0])
+    outcome = sample(POSTERIOR, replace(PLAN, most_steps=40), chain, PluggedExecutor(0))
+    assert chain.steps("sampling") == outcome.check.steps
 
 
 def test_without_any_proposal_differential_evolution_goes_on(
@@ -270,6 +254,9 @@ def test_without_any_proposal_differential_evolution_goes_on(
     chain, outcome = run(replace(PLAN, most_steps=20))
     assert dict.fromkeys(PHASES) == chain.proposals
     assert 20 == outcome.check.steps
+    assert outcome.check.pareto_k is None
+    (remark,) = outcome.remarks
+    assert remark.startswith("no proposal could be fitted to the draws of the tuning: ")
 
 
 def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
