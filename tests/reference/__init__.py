@@ -1,0 +1,1 @@
+"""Posteriors made once by an independent route, and that route."""

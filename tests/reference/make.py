@@ -1,0 +1,172 @@
+"""Make the reference posteriors: nested sampling of the plain posterior, by dynesty.
+
+From the repository's root, ``python -m tests.reference.make virtual measured``. It needs dynesty
+and numba, which the package and its tests do not; numba compiles the plain loops as they stand.
+Independent runs of dynamic nested sampling, aimed at the posterior, are pooled; the errors that
+their spread shows are stored with the result. It takes five and ten minutes on one core.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib import import_module
+from importlib.metadata import version
+from itertools import starmap
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from tests.reference.plain import (
+    FOLDER,
+    PLAIN,
+    Case,
+    Floats,
+    Loops,
+    inside,
+    load_case,
+    log_likelihood,
+)
+
+__all__ = ["digest", "from_cube", "main", "statistics"]
+
+# The measured record leaves the discrepancy's time a long tail, which takes more.
+RUNS = MappingProxyType({"virtual": 2, "measured": 4})
+LIVE = 500
+WALKS = 60
+# Of each run.
+EFFECTIVE = 10_000
+MOST_CALLS = 12_000_000
+
+
+def compiled() -> Loops:
+    """Return the plain loops, compiled."""
+    compiler: Callable[[Any], Any] = import_module("numba").njit
+    return Loops(*(compiler(loop) for loop in (PLAIN.hysteresis, PLAIN.dynamics, PLAIN.kalman)))
+
+
+def from_cube(case: Case, cube: Floats) -> Floats:
+    """Map a point of the unit cube (free,) to independent draws from the priors (free,)."""
+
+    def quantile(p: float, distribution: str, arguments: tuple[float, ...]) -> float:
+        match distribution:
+            case "normal":
+                return arguments[0] + arguments[1] * float(ndtri(p))
+            case "lognormal":
+                return arguments[0] * math.exp(arguments[1] * float(ndtri(p)))
+        assert distribution == "halfnormal"
+        return arguments[0] * float(ndtri((1 + p) / 2))
+
+    rows = ((p, *case.priors[name]) for p, name in zip(cube.tolist(), case.free, strict=True))
+    return np.array(list(starmap(quantile, rows)))
+
+
+def nested(case: Case, seed: int) -> Any:
+    """Run dynesty once. The physical constraints are where the likelihood is zero."""
+    loops = compiled()
+
+    def likelihood(free: Floats) -> float:
+        theta = {**case.fixed, **dict(zip(case.free, free.tolist(), strict=True))}
+        return log_likelihood(case, theta, loops) if inside(theta) else -math.inf
+
+    sampler = import_module("dynesty").DynamicNestedSampler(
+        likelihood,
+        lambda cube: from_cube(case, cube),
+        len(case.free),
+        nlive=LIVE,
+        sample="rwalk",
+        walks=WALKS,
+        rstate=np.random.default_rng(seed),
+    )
+    sampler.run_nested(
+        wt_kwargs={"pfrac": 1.0},
+        n_effective=EFFECTIVE,
+        maxcall=MOST_CALLS,
+        print_progress=sys.stderr.isatty(),
+    )
+    return sampler.results
+
+
+def statistics(draws: Floats, weights: Floats) -> dict[str, Floats]:
+    """Return mean, sd and quantiles, (free,) each, of draws (draws, free) with weights (draws,)."""
+    mean = np.average(draws, axis=0, weights=weights)
+    found = {"mean": mean, "sd": np.sqrt(np.average((draws - mean) ** 2, axis=0, weights=weights))}
+    for level in (5, 50, 95):
+        found[f"quantile_{level}"] = np.array(
+            [
+                np.quantile(column, level / 100, weights=weights, method="inverted_cdf")
+                for column in draws.T
+            ]
+        )
+    return found
+
+
+def digest(case: Case) -> str:
+    """Hash of what a posterior depends on: the samples that enter, the model, the priors."""
+    said = (
+        case.interval,
+        [(part.start, part.stop) for part in case.training],
+        (case.dynamics, case.hold, case.names),
+        sorted(case.priors.items()),
+        sorted(case.fixed.items()),
+    )
+    data = case.voltage.tobytes() + case.displacement.tobytes()
+    return hashlib.sha256(data + repr(said).encode()).hexdigest()
+
+
+def reference(name: str) -> dict[str, object]:
+    """Make one reference."""
+    case = load_case(FOLDER / f"{name}.toml")
+    count = RUNS[name]
+    runs = [nested(case, seed) for seed in range(1, count + 1)]
+    weights = [run.importance_weights() for run in runs]
+    # Each run counts the same.
+    pooled = np.concatenate([w / (count * w.sum()) for w in weights])
+    result = statistics(np.concatenate([run.samples for run in runs]), pooled)
+    single = [statistics(run.samples, w) for run, w in zip(runs, weights, strict=True)]
+    # Kish's number of effective draws knows nothing of the noise in nested sampling's volumes.
+    error = {
+        key: np.std([s[key] for s in single], axis=0, ddof=1) / count**0.5 / result["sd"]
+        for key in result
+    }
+    packages = ("numpy", "scipy", "numba", "dynesty")
+    return {
+        "case": name,
+        "digest": digest(case),
+        "script": "tests/reference/make.py",
+        "made": datetime.now(UTC).date().isoformat(),
+        "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
+        "runs": count,
+        "live_points": LIVE,
+        "walks": WALKS,
+        "likelihoods": [int(np.sum(run.ncall)) for run in runs],
+        "ess": float(1 / np.sum(pooled**2)),
+        "log_evidence": [float(run.logz[-1]) for run in runs],
+        "log_evidence_error": [float(run.logzerr[-1]) for run in runs],
+        "parameters": {
+            parameter: {key: float(values[i]) for key, values in result.items()}
+            for i, parameter in enumerate(case.free)
+        },
+        "error_in_sd": {
+            parameter: {key: round(float(values[i]), 4) for key, values in error.items()}
+            for i, parameter in enumerate(case.free)
+        },
+    }
+
+
+def main(names: list[str]) -> None:
+    """Make the named references and write them beside this file."""
+    for name in names:
+        text = json.dumps(reference(name), indent=2) + "\n"
+        (FOLDER / f"{name}.json").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,179 @@
+"""The sampler finds the posteriors that an independent route found: long runs of nested sampling.
+
+``tests/reference`` holds two cases, a virtual record and a measured one: configs in which every
+prior is a number, the posterior written a second time, slowly and plainly, and what dynesty found
+of it (``make.py``, more than 20,000 effective draws). First both likelihoods and both priors must
+agree; then a run by the normal path, of 5,000 effective draws or more of every parameter, must give
+means within 0.1 sd, sds within 5 %, and 5 and 95 % quantiles within 0.15 sd.
+
+These limits are 3.3 or more standard errors of the difference, most of them above five: over seeds,
+a right sampler would fail once in some 200 runs. A wrong one does not pass with sds that are 10 %
+off, nor with a noise whose correlation is half as long again, as the twins show.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.app.config import load
+from bwbayes.app.problem import Problem, generator, resolve
+from bwbayes.app.workers import one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.inference import pointfit
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from tests.reference.make import digest, from_cube
+from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
+
+# What a run may be off by: in sds, in parts, in sds.
+LIMITS = {"mean": 0.1, "sd": 0.05, "quantile_5": 0.15, "quantile_95": 0.15}
+
+ESS = 5000
+
+absent = pytest.mark.skipif(
+    not MEASURED.is_file(), reason="the measured record is not part of the project, and not here"
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A case twice, as the package and as the plain code read it, and what dynesty found."""
+
+    problem: Problem
+    case: Case
+    found: Mapping[str, Any]
+
+
+@pytest.fixture(
+    scope="module",
+    # Each worker of a parallel run makes one case only.
+    params=[
+        pytest.param("virtual", marks=pytest.mark.xdist_group("virtual reference")),
+        pytest.param("measured", marks=[pytest.mark.xdist_group("measured reference"), absent]),
+    ],
+)
+def reference(request: pytest.FixtureRequest) -> Reference:
+    config = FOLDER / f"{request.param}.toml"
+    found = json.loads(config.with_suffix(".json").read_text(encoding="utf-8"))
+    return Reference(resolve(load(config), FOLDER), load_case(config), found)
+
+
+@pytest.fixture(scope="module")
+def sampled(reference: Reference) -> FloatArray:
+    """Draws of the case by the normal path, (draws, free)."""
+    outcome, found = run(reference.problem)
+    check = outcome.check
+    assert outcome.converged, outcome.stop_reason
+    assert min(check.ess_bulk.min(), check.ess_tail.min()) >= ESS
+    return found
+
+
+def run(problem: Problem) -> tuple[Outcome, FloatArray]:
+    """Sample a problem as a run does; draws (draws, free)."""
+    posterior, seed = problem.posterior, problem.config.seed
+    with ThreadPoolExecutor(1) as executor, one_thread():
+        point = pointfit.fit(posterior, generator(seed, "point fit"))
+        chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
+        outcome = sample(posterior, problem.plan, chain, executor)
+    return outcome, draws(posterior, chain).reshape(-1, len(posterior.names))
+
+
+def deviations(found: Mapping[str, Any], names: tuple[str, ...], got: FloatArray) -> dict[str, Any]:
+    """Distance of draws (draws, free) from a reference, in parts of what is allowed."""
+    off = {}
+    for name, column in zip(names, got.T, strict=True):
+        known = found["parameters"][name]
+        low, high = np.quantile(column, [0.05, 0.95])
+        values = {"mean": np.mean(column), "sd": np.std(column, ddof=1)}
+        values |= {"quantile_5": low, "quantile_95": high}
+        for key, limit in LIMITS.items():
+            off[f"{name} {key}"] = abs(float(values[key]) - known[key]) / (limit * known["sd"])
+    return off
+
+
+def drawn(case: Case, size: int) -> list[dict[str, float]]:
+    """Draw from the single priors, with the fixed parameters, outside the constraints too."""
+    cubes = np.random.default_rng(1).uniform(size=(size, len(case.free)))
+    return [
+        {**case.fixed, **dict(zip(case.free, from_cube(case, cube).tolist(), strict=True))}
+        for cube in cubes
+    ]
+
+
+def test_both_read_the_same_case(reference: Reference) -> None:
+    posterior, case = reference.problem.posterior, reference.case
+    assert case.names == posterior.prior.names
+    assert case.training == posterior.training
+    assert case.hold == posterior.actuator.hold
+    np.testing.assert_allclose(case.interval, posterior.actuator.interval, rtol=1e-9)
+    np.testing.assert_array_equal(case.voltage, posterior.voltage)
+    np.testing.assert_array_equal(case.displacement, posterior.displacement)
+
+
+def test_the_reference_is_of_this_case(reference: Reference) -> None:
+    """If not, config or record have changed: make the reference again."""
+    assert digest(reference.case) == reference.found["digest"]
+
+
+def test_the_reference_is_precise(reference: Reference) -> None:
+    """Its error, from the spread of its runs, is small against what is allowed."""
+    assert reference.found["ess"] > 4 * ESS
+    for error in reference.found["error_in_sd"].values():
+        assert error["mean"] < 0.03
+        assert all(error[key] < limit / 3 for key, limit in LIMITS.items())
+
+
+def test_the_likelihood_is_the_plain_one(reference: Reference) -> None:
+    posterior, case = reference.problem.posterior, reference.case
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
+    rows = [dict(zip(case.names, row, strict=True)) for row in theta.tolist()]
+    expected = np.array([log_likelihood(case, row) for row in rows])
+    np.testing.assert_allclose(expected, posterior.log_likelihood(theta), rtol=1e-8)
+
+
+def test_the_prior_is_the_plain_one(reference: Reference) -> None:
+    """But for a constant; and zero at the same places."""
+    prior, case = reference.problem.posterior.prior, reference.case
+    rows = drawn(case, 100)
+    expected = np.array([log_prior(case, row) for row in rows])
+    got = prior.log_density(np.array([[row[name] for name in case.free] for row in rows]))
+    inside = np.isfinite(expected)
+    assert 10 < np.sum(inside) < 90
+    np.testing.assert_array_equal(inside, np.isfinite(got))
+    assert np.ptp(expected[inside] - got[inside]) < 1e-9
+
+
+def test_a_run_gives_the_reference(reference: Reference, sampled: FloatArray) -> None:
+    off = deviations(reference.found, reference.case.free, sampled)
+    assert max(off.values()) < 1, off
+
+
+def test_twin_draws_that_are_too_narrow_are_found(
+    reference: Reference, sampled: FloatArray
+) -> None:
+    """Ten per cent, in every parameter."""
+    middle = np.mean(sampled, axis=0)
+    off = deviations(reference.found, reference.case.free, middle + 0.9 * (sampled - middle))
+    assert all(off[f"{name} sd"] > 1 for name in reference.case.free), off
+
+
+def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> None:
+    """Its correlation decays as if the samples were half as far apart again."""
+    problem = reference.problem
+    wrong = DiscrepancyNoise(1.5 * reference.case.interval)
+    planted = replace(
+        problem,
+        posterior=replace(problem.posterior, noise=wrong),
+        plan=replace(problem.plan, ess=1000.0, walkers=24),
+    )
+    outcome, got = run(planted)
+    assert outcome.converged, outcome.stop_reason
+    off = deviations(reference.found, reference.case.free, got)
+    assert max(off.values()) > 2, off
