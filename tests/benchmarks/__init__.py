@@ -1,0 +1,8 @@
+"""Benchmarks: what a sample costs, how fast effective draws come, how long a start takes.
+
+    python -m tests.benchmarks              # all of it: tables on the screen, and benchmarks.json
+    python -m tests.benchmarks --quick      # fewer rounds, shorter records, no NumPy run
+    pytest tests/benchmarks -m benchmark --benchmark-enable --dist=no    # with pytest-benchmark
+
+Timings depend on the machine and on what else it does; no test passes or fails by them.
+"""

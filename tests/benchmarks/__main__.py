@@ -1,0 +1,103 @@
+"""Measure everything, print tables, and write them as JSON: ``python -m tests.benchmarks``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from bwbayes.app.workers import one_thread
+from tests.benchmarks import effective, likelihood
+from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
+from tests.benchmarks.startup import startup
+from tests.benchmarks.tables import Cell, Table, machine, printed, written
+
+# Name, sign and number of each target; what was found is in `_found`.
+TARGETS: tuple[tuple[str, str, float], ...] = (
+    ("draws/s, ours compiled / stock", ">=", 300),
+    ("draws/s, ours compiled / stretch on NumPy", ">=", 100),
+    ("draws/s, ours compiled / stretch compiled", ">=", 12),
+    ("ns per sample and model, compiled, one core", "<=", 3),
+    ("speed-up of the likelihood in two threads", ">=", 1.8),
+    ("speed-up of ensembles in two threads", ">=", 1.8),
+    ("s from the point fit to an ESS of 4,000, compiled", "<=", 10),
+    ("part of a compiled run spent on checks", "<=", 0.05),
+)
+
+# Columns of the screen that the widest table takes.
+WIDTH = 110
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Fewer rounds, shorter records, no NumPy run.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("benchmarks.json"),
+    show_default=True,
+    help="Where the figures go.",
+)
+def main(*, quick: bool, out: Path) -> None:
+    """Measure what the likelihood, the sampling and a start cost on this machine."""
+    console = Console()
+    console.width = max(console.width, WIDTH)
+    before, tables = machine(), []
+    with one_thread():
+        for table in _measured(QUICK if quick else FULL):
+            printed(table, console)
+            tables.append(table)
+    tables.append(_targets({table.name: table for table in tables}))
+    printed(tables[-1], console)
+    written(tables, before | {"load_after": machine()["load"], "quick": quick}, out)
+    console.print(f"{out}: {before['processor']}, load {before['load']} before it began")
+
+
+def _measured(effort: Effort) -> Iterator[Table]:
+    posterior = problem("numba").posterior
+    yield likelihood.batches(posterior, effort)
+    yield likelihood.models(posterior, effort)
+    yield likelihood.lengths(posterior, effort)
+    yield likelihood.hysteresis_alone(posterior, effort)
+    yield likelihood.threads(posterior, effort)
+    yield from effective.sampling(effort)
+    yield startup(effort)
+
+
+def _targets(tables: dict[str, Table]) -> Table:
+    rows: list[dict[str, Cell]] = []
+    for (name, sign, wanted), found in zip(TARGETS, _found(tables), strict=True):
+        met = found >= wanted if sign == ">=" else found <= wanted
+        rows.append({"target": name, "wanted": f"{sign} {wanted:g}", "found": found, "met": met})
+    return Table("targets", "Targets", "for a quiet machine with two cores", rows)
+
+
+def _found(tables: dict[str, Table]) -> Iterator[float]:
+    """Pick what the targets are about, in their order."""
+    rate = {
+        (r["moves"], r["engine"]): _number(r["draws/s"]) for r in _rows(tables, "effective_draws")
+    }
+    ours = rate["ours", "numba"]
+    yield ours / rate["stretch", "stock"]
+    yield ours / rate["stretch", "numpy"]
+    yield ours / rate["stretch", "numba"]
+    yield from (_number(r["numba"]) for r in _rows(tables, "batches") if r["models"] == MODELS)
+    yield _number(_rows(tables, "threads")[0]["speed-up"])
+    yield _number(_rows(tables, "ensemble_threads")[0]["speed-up"])
+    run = next(row for row in _rows(tables, "runs") if row["engine"] == "numba")
+    yield _number(run["s"])
+    yield _number(run["checks"]) / sum(_number(run[part]) for part in effective.PARTS)
+
+
+def _rows(tables: dict[str, Table], name: str) -> list[dict[str, Cell]]:
+    return list(tables[name].rows)
+
+
+def _number(cell: Cell) -> float:
+    assert isinstance(cell, int | float)
+    return float(cell)
+
+
+if __name__ == "__main__":
+    main()

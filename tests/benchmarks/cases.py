@@ -1,0 +1,105 @@
+"""What is measured: the paper's record, other models and lengths of it, and models to try."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.app.config import Config, load
+from bwbayes.app.problem import Problem, resolve
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.noise import NoiseKind
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Dynamics
+from tests.benchmarks.stock import stock
+from tests.inference.problems import posterior_of, truth
+
+__all__ = [
+    "BATCHES",
+    "DYNAMICS",
+    "ENGINES",
+    "ESS",
+    "FULL",
+    "LENGTHS",
+    "MODELS",
+    "NOISES",
+    "QUICK",
+    "ROOT",
+    "Effort",
+    "config",
+    "on_engine",
+    "problem",
+    "trial",
+    "variant",
+]
+
+ROOT = Path(__file__).resolve().parents[2]
+ENGINES: tuple[Engine, ...] = ("numba", "numpy")
+BATCHES = (1, 8, 16, 32, 64, 256)
+DYNAMICS: tuple[Dynamics, ...] = ("none", "lag", "second-order")
+NOISES: tuple[NoiseKind, ...] = ("white", "discrepancy")
+LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
+
+# Models of a batch where nothing else is said.
+MODELS = 64
+
+# Effective draws that our runs go on to.
+ESS = 4000.0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much to measure: ``rounds``, the ``longest`` record, ``steps`` for an ESS, all runs."""
+
+    rounds: int
+    longest: int
+    steps: int
+    everything: bool
+
+
+FULL = Effort(rounds=7, longest=LENGTHS[-1], steps=3000, everything=True)
+QUICK = Effort(rounds=2, longest=100_000, steps=400, everything=False)
+
+
+def config(ess: float = ESS) -> Config:
+    """Return the config of the paper's record, with that target."""
+    read = load(ROOT / "runs" / "ring_bender.toml")
+    return read.model_copy(update={"sampling": read.sampling.model_copy(update={"ess": ess})})
+
+
+def problem(engine: Engine, ess: float = ESS) -> Problem:
+    """Return the paper's record as a run would see it on an engine."""
+    whole = config(ess)
+    sampling = whole.sampling.model_copy(update={"engine": engine})
+    return resolve(whole.model_copy(update={"sampling": sampling}), ROOT / "runs")
+
+
+def on_engine(posterior: Posterior, name: str) -> Posterior:
+    """Return the same posterior on an engine, or on the stock path."""
+    if name == "stock":
+        return stock(posterior)
+    return replace(posterior, engine=name)  # type: ignore[arg-type]  # one of the engines
+
+
+def variant(
+    posterior: Posterior, dynamics: Dynamics, noise: NoiseKind, samples: int | None = None
+) -> Posterior:
+    """Return a posterior of the same record with another model, repeated to so many samples."""
+    voltage, displacement = posterior.voltage, posterior.displacement
+    if samples is not None:
+        voltage, displacement = np.resize(voltage, samples), np.resize(displacement, samples)
+    actuator = replace(posterior.actuator, dynamics=dynamics)
+    known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
+    other = posterior_of(voltage, displacement, actuator, noise, known)
+    return replace(other, engine=posterior.engine)
+
+
+def trial(posterior: Posterior, count: int = MODELS) -> FloatArray:
+    """Return θ (count, parameters) near the truth, free parameters a few percent off."""
+    theta = np.repeat(truth(posterior), count, axis=0)
+    free = [posterior.prior.names.index(name) for name in posterior.names]
+    theta[:, free] *= 1 + 0.03 * np.random.default_rng(1).standard_normal((count, len(free)))
+    return theta

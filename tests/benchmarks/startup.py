@@ -1,0 +1,75 @@
+"""How long a start takes: in a process of its own, from the interpreter to what is named."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from bwbayes.app.config import dump
+from tests.benchmarks.cases import ROOT, Effort, config
+from tests.benchmarks.tables import Cell, Table
+from tests.benchmarks.timing import interleaved, timed
+
+__all__ = ["STARTS", "started", "startup"]
+
+MAIN = "import sys; from bwbayes.app.cli import main; sys.argv[0] = 'bwbayes'; main()"
+
+# One model through all that is compiled, with a record as a run has it: not to be written to.
+COMPILED = """
+import numpy as np
+from bwbayes.inference import kernels
+record = np.ones(9)
+record.flags.writeable = False
+one = np.ones((1, len(kernels.PARAMETERS)))
+kernels.sums(record, record, np.array([[0, 9]]), one, np.empty((1, 0)))
+"""
+
+STARTS: Mapping[str, list[str]] = {
+    "python alone": ["-c", ""],
+    "import numpy, scipy.signal, emcee": ["-c", "import numpy, scipy.signal, emcee"],
+    "import bwbayes": ["-c", "import bwbayes"],
+    "bwbayes --help": ["-c", MAIN, "--help"],
+    "import all of a run": ["-c", "import bwbayes.app.run"],
+    "import and load the compiled engine": ["-c", COMPILED],
+}
+
+
+def started(arguments: list[str], **environment: str) -> Callable[[], object]:
+    """Return a call that runs Python with these arguments from the checkout."""
+    return partial(
+        subprocess.run,
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        check=True,
+    )
+
+
+def startup(effort: Effort) -> Table:
+    """Measure starts, and with everything the first of all, which compiles, and a whole command."""
+    for arguments in STARTS.values():
+        started(arguments)()  # caches: Python's, numba's and the system's
+    calls = {name: started(arguments) for name, arguments in STARTS.items()}
+    cost = interleaved(calls, effort.rounds)
+    if effort.everything:
+        with TemporaryDirectory() as folder:
+            first = started(["-c", COMPILED], NUMBA_CACHE_DIR=folder)
+            cost["compile the engine, once"] = timed(first)
+            cost["bwbayes run, all of it"] = timed(started(_run(Path(folder))))
+    rows: list[dict[str, Cell]] = [
+        {"start": name, "s": found.wall, "core s": found.cpu} for name, found in cost.items()
+    ]
+    note = "a process each, best of several; compiling and the whole run are measured once"
+    return Table("startup", "Start-up", note, rows)
+
+
+def _run(folder: Path) -> list[str]:
+    file = folder / "ring_bender.toml"
+    file.write_text(dump(config()), encoding="utf-8")
+    return ["-c", MAIN, "run", str(file), "--out", str(folder / "out"), "--quiet"]
