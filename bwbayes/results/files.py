@@ -48,7 +48,8 @@ def write_posterior(path: Path, result: Result, voltage: FloatArray, reading: Fl
     for parameter in result.free:
         tree["posterior"][parameter.name].attrs["units"] = parameter.unit
     temporary = path.with_suffix(".partial")
-    tree.to_netcdf(temporary, engine="h5netcdf")
+    # From memory: HDF5 does not survive a disk that is full.
+    temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
     temporary.replace(path)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,12 @@ from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 
-__all__ = ["crps", "distribution", "quantiles"]
+__all__ = ["judged", "pieces", "quantiles_and_spread"]
 
 ComplexArray = NDArray[np.complex128]
 
-# Probability that the series may leave out, for quantiles and for the CRPS.
-FINE = 3e-9
-COARSE = 1e-6
+# Probability that the series may leave out.
+TOLERANCE = 3e-9
 
 # Terms after which the series is cut even if it has not converged.
 LARGEST_SERIES = 128
@@ -42,7 +42,7 @@ NODES_PER_TERM = 16
 ACCURACY = 5e-7
 LAST_STEP = 1e-7
 
-# Draws up to which the CRPS sums over all pairs.
+# Draws up to which the mean distance of two sums over all pairs.
 FEW_DRAWS = 64
 
 # Draws times samples of one piece: what stays in a core's own cache.
@@ -52,8 +52,10 @@ PIECE = 32_768
 LONGEST_SEARCH = 100
 
 
-def quantiles(means: FloatArray, sds: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Quantiles of the mixture at every sample: F(x) = p.
+def quantiles_and_spread(
+    means: FloatArray, sds: FloatArray, probabilities: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Quantiles of the mixture, F(x) = p, and half the mean distance of two draws from it.
 
     Parameters
     ----------
@@ -67,39 +69,44 @@ def quantiles(means: FloatArray, sds: FloatArray, probabilities: FloatArray) -> 
 
     Returns
     -------
-    FloatArray
+    tuple[FloatArray, FloatArray]
         (q, samples), um; the error is at most 1e-6 of the mixture's standard deviation at the
-        sample.
+        sample. And E|X - X'| / 2, (samples,), um: exact for up to 64 draws, as the mean of A over
+        all pairs (see :func:`judged`), and if all sds are zero. Otherwise it is the integral of
+        F (1 - F), taken from the Fourier series of F: the error is below 1e-6 of the mixture's
+        standard deviation where the series converges, mostly below 1e-4 where sds are too small
+        for that (a fiftieth and less), and some 1e-2 if one draw lies thousands of its sds away
+        from all others.
 
     Notes
     -----
     F is recovered from the characteristic function as by F. Fang and C. W. Oosterlee, SIAM J.
     Sci. Comput. 31 (2008) 826-848, here with the whole Fourier series.
     """
-    if not sds.any():
-        return np.quantile(means, probabilities, axis=0)
-    result = np.empty((probabilities.size, means.shape[1]))
-    for piece in _pieces(means):
+    quantiles = np.empty((probabilities.size, means.shape[1]))
+    spread = np.empty(means.shape[1])
+    for piece in pieces(means):
         part = np.ascontiguousarray(means[:, piece])
-        series = _Series.of(part, sds, FINE)
-        x, certain = series.quantiles(probabilities)
-        x = x + series.centre
-        rows, columns = np.nonzero(~certain)
-        for some in _pieces(part, rows.size):
-            row, column = rows[some], columns[some]
-            step = LAST_STEP * series.sd[column]
-            x[row, column] = _search(
-                part, sds, column, probabilities[row], guess=x[row, column], last_step=step
-            )
-        result[:, piece] = x
+        if sds.any():
+            series = _Series.of(part, sds)
+            quantiles[:, piece] = _quantiles(series, part, sds, probabilities)
+            spread[piece] = series.spread() if sds.size > FEW_DRAWS else _pairs_spread(part, sds)
+        else:
+            ranked = np.sort(part, axis=0)
+            quantiles[:, piece] = np.quantile(ranked, probabilities, axis=0)
+            spread[piece] = (2 * np.arange(sds.size) - sds.size + 1.0) / sds.size**2 @ ranked
     # Where F is level (a gap between modes) neighbours may swap within the accuracy.
     order = np.argsort(probabilities)
-    result[order] = np.maximum.accumulate(result[order], axis=0)
-    return result
+    quantiles[order] = np.maximum.accumulate(quantiles[order], axis=0)
+    return quantiles, spread
 
 
-def distribution(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
-    """Distribution function of the mixture: the probability integral transform of ``values``.
+def judged(means: FloatArray, sds: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distribution function of the mixture at ``values``, and its mean distance from them.
+
+    The first is the values' probability integral transform. The second, E|X - y|, is the mean
+    over draws of A(y - mean, sd) with A(m, s) = m (2 Phi(m/s) - 1) + 2 s phi(m/s); less half the
+    mean distance of two draws it is their continuous ranked probability score.
 
     Parameters
     ----------
@@ -107,56 +114,24 @@ def distribution(means: FloatArray, sds: FloatArray, values: FloatArray) -> Floa
         (draws, samples) mean given a draw, um.
     sds
         (draws,) standard deviation given a draw, um, zero or positive. A draw with zero counts
-        as a half where its mean is the value.
+        as a half of the distribution function where its mean is the value.
     values
-        (samples,) um.
+        (samples,) y, um.
 
     Returns
     -------
-    FloatArray
-        (samples,) the mean over draws of Phi((value - mean) / sd).
-    """
-    result = np.empty(values.size)
-    for piece in _pieces(means):
-        z = _standardised(values[piece], means[:, piece], sds)
-        result[piece] = ndtr(z, out=z).mean(axis=0)
-    return result
-
-
-def crps(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
-    """Continuous ranked probability score of the mixture: E|X - y| - E|X - X'| / 2.
-
-    The first term is exact: the mean over draws of A(y - mean, sd) with A(m, s) =
-    m (2 Phi(m/s) - 1) + 2 s phi(m/s). So is the second for up to 64 draws, as the mean of A over
-    all pairs, and if all sds are zero. Otherwise it is the integral of F (1 - F), taken from the
-    Fourier series of F: the error is below 1e-6 of the mixture's standard deviation where the
-    series converges, mostly below 1e-4 where sds are too small for that (a fiftieth and less),
-    and some 1e-2 if one draw lies thousands of its sds away from all others.
-
-    Parameters
-    ----------
-    means
-        (draws, samples) mean given a draw, um.
-    sds
-        (draws,) standard deviation given a draw, um, zero or positive.
-    values
-        (samples,) um.
-
-    Returns
-    -------
-    FloatArray
-        (samples,) um.
+    tuple[FloatArray, FloatArray]
+        (samples,) the mean over draws of Phi((value - mean) / sd), and E|X - y| (samples,), um.
 
     Notes
     -----
     T. Gneiting and A. E. Raftery, J. Am. Stat. Assoc. 102 (2007) 359-378, section 4.2;
     E. P. Grimit et al., Q. J. R. Meteorol. Soc. 132 (2006) 2925-2942, for A.
     """
-    result = np.empty(values.size)
-    for piece in _pieces(means):
-        part = np.ascontiguousarray(means[:, piece])
-        result[piece] = _distance(part, sds, values[piece]) - _spread(part, sds)
-    return result
+    probability, distance = np.empty((2, values.size))
+    for piece in pieces(means):
+        probability[piece], distance[piece] = _judged(means[:, piece], sds, values[piece])
+    return probability, distance
 
 
 @dataclass(frozen=True)
@@ -177,13 +152,13 @@ class _Series:
     remainder: float
 
     @classmethod
-    def of(cls, means: FloatArray, sds: FloatArray, tolerance: float) -> _Series:
-        """Take the series from the draws, to ``tolerance`` in probability where it converges."""
+    def of(cls, means: FloatArray, sds: FloatArray) -> _Series:
+        """Take the series from the draws."""
         centre = means.mean(axis=0)
         deviation = means - centre
         variances = sds**2
         sd = np.sqrt((deviation**2).mean(axis=0) + variances.mean())
-        reach = -ndtri(tolerance / 2) * sds[:, None]
+        reach = -ndtri(TOLERANCE / 2) * sds[:, None]
         farthest = np.abs(deviation)
         period = 2 * float(max((farthest + reach).max(), MARGIN * farthest.max()))
         frequency = 2 * np.pi / period
@@ -197,11 +172,12 @@ class _Series:
             weights = np.exp(-0.5 * (j * frequency) ** 2 * variances) / sds.size
             coefficients.append((weights @ power.view(np.float64)).view(np.complex128))
             remainder = float(weights.sum())
-            if remainder < tolerance:
+            if remainder < TOLERANCE:
                 break
             power *= phase
-        return cls(centre, sd, period, np.array(coefficients), max(remainder, tolerance))
+        return cls(centre, sd, period, np.array(coefficients), max(remainder, TOLERANCE))
 
+    @cached_property
     def table(self) -> FloatArray:
         """Tabulate F on equally spaced nodes from u = -period/2: (nodes, samples)."""
         terms = len(self.coefficients)
@@ -217,7 +193,7 @@ class _Series:
 
     def spread(self) -> FloatArray:
         """Half the mean distance of two draws, the integral of F (1 - F): (samples,)."""
-        table = self.table()
+        table = self.table
         return self.period * (table * (1 - table)).mean(axis=0)
 
     def quantiles(self, probabilities: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -225,7 +201,7 @@ class _Series:
 
         Linear interpolation of the table, then one step of Halley's method on the series.
         """
-        table = self.table()
+        table = self.table
         p = probabilities[:, None]
         upper = np.array([np.count_nonzero(table < one, axis=0) for one in probabilities])
         upper = np.clip(upper, 1, len(table) - 1)
@@ -262,6 +238,22 @@ class _Series:
             (1 + 2 * density) / self.period,
             2 * slope / self.period,
         )
+
+
+def _quantiles(
+    series: _Series, means: FloatArray, sds: FloatArray, probabilities: FloatArray
+) -> FloatArray:
+    """Quantiles (q, samples) from the series, or by a search where it is not sure of them."""
+    u, certain = series.quantiles(probabilities)
+    x = u + series.centre
+    rows, columns = np.nonzero(~certain)
+    for some in pieces(means, rows.size):
+        row, column = rows[some], columns[some]
+        step = LAST_STEP * series.sd[column]
+        x[row, column] = _search(
+            means, sds, column, probabilities[row], guess=x[row, column], last_step=step
+        )
+    return x
 
 
 def _search(
@@ -326,37 +318,37 @@ def _standardised(x: FloatArray, means: FloatArray, sds: FloatArray) -> FloatArr
     return z
 
 
-def _distance(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
-    """E|X - y| at every sample, (samples,)."""
+def _judged(
+    means: FloatArray, sds: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """F(y) and E|X - y| at every sample, both (samples,)."""
     z = _standardised(values, means, sds)
-    folded = (2 * ndtr(z) - 1) * (values - means)
+    below = ndtr(z)
     with np.errstate(over="ignore"):
         np.multiply(z, z, out=z)
     z *= -0.5
-    distance: FloatArray = folded.mean(axis=0)
-    distance += np.sqrt(2 / np.pi) / sds.size * (sds @ np.exp(z, out=z))
-    return distance
+    distance = np.sqrt(2 / np.pi) * sds @ np.exp(z, out=z)
+    away = values - means
+    equal = np.ones(sds.size)
+    probability = equal @ below
+    below -= 0.5
+    below *= away
+    distance += 2 * equal @ below
+    return probability / sds.size, distance / sds.size
 
 
-def _spread(means: FloatArray, sds: FloatArray) -> FloatArray:
-    """E|X - X'| / 2 at every sample, (samples,)."""
-    draws = sds.size
-    if not sds.any():
-        weights = (2 * np.arange(draws) - draws + 1.0) / draws**2
-        from_ranks: FloatArray = weights @ np.sort(means, axis=0)
-        return from_ranks
-    if draws > FEW_DRAWS:
-        return _Series.of(means, sds, COARSE).spread()
+def _pairs_spread(means: FloatArray, sds: FloatArray) -> FloatArray:
+    """E|X - X'| / 2 at every sample, (samples,), from all pairs of draws."""
     # Every shift pairs each draw with one other; without a shift it meets its like.
     total = np.zeros(means.shape[1])
-    for shift in range(draws):
+    for shift in range(sds.size):
         pair_sds = np.hypot(sds, np.roll(sds, shift))
-        total += _distance(means, pair_sds, np.roll(means, shift, axis=0))
-    return total / (2 * draws)
+        total += _judged(means, pair_sds, np.roll(means, shift, axis=0))[1]
+    return total / (2 * sds.size)
 
 
-def _pieces(means: FloatArray, columns: int | None = None) -> Iterator[slice]:
-    """Cut the columns (of ``means`` if not told) into pieces small enough for the cache."""
+def pieces(means: FloatArray, columns: int | None = None) -> Iterator[slice]:
+    """Cut the columns (of ``means`` if not told) into pieces small enough for a core's cache."""
     columns = means.shape[1] if columns is None else columns
     size = max(1, PIECE // len(means))
     for start in range(0, columns, size):

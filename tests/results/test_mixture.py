@@ -16,6 +16,19 @@ from bwbayes.results import mixture
 LEVELS = np.array([0.025, 0.05, 0.25, 0.75, 0.95, 0.975])
 
 
+def quantiles(means: FloatArray, sds: FloatArray, probabilities: FloatArray) -> FloatArray:
+    return mixture.quantiles_and_spread(means, sds, probabilities)[0]
+
+
+def distribution(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
+    return mixture.judged(means, sds, values)[0]
+
+
+def crps(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
+    spread = mixture.quantiles_and_spread(means, sds, LEVELS)[1]
+    return mixture.judged(means, sds, values)[1] - spread
+
+
 def mixture_sd(means: FloatArray, sds: FloatArray) -> FloatArray:
     sd: FloatArray = np.sqrt(means.var(axis=0) + (sds**2).mean())
     return sd
@@ -89,7 +102,7 @@ def test_quantiles_solve_the_distribution_to_1e_6_of_the_sd(kind: str) -> None:
     means, sds = draws(kind)
     margin = 1e-6 * mixture_sd(means, sds)
     probabilities = np.concatenate([LEVELS, [0.5, 1e-3, 0.999, 1e-7]])
-    for p, x in zip(probabilities, mixture.quantiles(means, sds, probabilities), strict=True):
+    for p, x in zip(probabilities, quantiles(means, sds, probabilities), strict=True):
         below = slow_distribution(means, sds, x - margin)
         above = slow_distribution(means, sds, x + margin)
         assert (below <= p + 1e-13).all()
@@ -99,41 +112,41 @@ def test_quantiles_solve_the_distribution_to_1e_6_of_the_sd(kind: str) -> None:
 def test_a_quantile_off_by_a_hundred_thousandth_of_the_sd_would_be_noticed() -> None:
     """The enclosure above is sharp: shifted quantiles fail it."""
     means, sds = draws("usual")
-    x = mixture.quantiles(means, sds, LEVELS)[5] + 1e-5 * mixture_sd(means, sds)
-    below = mixture.distribution(means, sds, x - 1e-6 * mixture_sd(means, sds))
+    x = quantiles(means, sds, LEVELS)[5] + 1e-5 * mixture_sd(means, sds)
+    below = distribution(means, sds, x - 1e-6 * mixture_sd(means, sds))
     assert (below > 0.975 + 1e-13).all()
 
 
 def test_quantiles_of_one_gaussian_are_scipys() -> None:
     means, sds = draws("one draw")
     expected = norm.ppf(LEVELS[:, None], means, sds)
-    assert expected == pytest.approx(mixture.quantiles(means, sds, LEVELS), abs=7e-7, rel=0)
+    assert expected == pytest.approx(quantiles(means, sds, LEVELS), abs=7e-7, rel=0)
 
 
 def test_without_sds_the_quantiles_are_those_of_the_draws() -> None:
     means, sds = draws("usual")
     expected = np.quantile(means, LEVELS, axis=0)
-    assert np.array_equal(expected, mixture.quantiles(means, 0 * sds, LEVELS))
+    assert np.array_equal(expected, quantiles(means, 0 * sds, LEVELS))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_quantiles_keep_the_order_of_the_probabilities(kind: str) -> None:
     probabilities = np.concatenate([np.linspace(0.995, 0.005, 41), 0.4 + np.arange(9) * 1e-9])
-    got = mixture.quantiles(*draws(kind), probabilities)
+    got = quantiles(*draws(kind), probabilities)
     assert (np.diff(got[np.argsort(probabilities)], axis=0) >= 0).all()
 
 
 def test_many_samples_and_strided_means_are_cut_into_the_same_pieces() -> None:
     means, sds = draws("usual", samples=300)
-    expected = mixture.quantiles(means, sds, LEVELS)
+    expected = quantiles(means, sds, LEVELS)
     wide = np.repeat(means, 2, axis=1)[:, ::2]
-    assert np.array_equal(expected, mixture.quantiles(wide, sds, LEVELS))
+    assert np.array_equal(expected, quantiles(wide, sds, LEVELS))
 
 
 def test_a_sample_does_not_depend_on_its_neighbours_beyond_the_accuracy() -> None:
     means, sds = draws("skewed", samples=300)
-    alone = np.hstack([mixture.quantiles(means[:, [t]], sds, LEVELS) for t in range(0, 300, 50)])
-    together = mixture.quantiles(means, sds, LEVELS)[:, ::50]
+    alone = np.hstack([quantiles(means[:, [t]], sds, LEVELS) for t in range(0, 300, 50)])
+    together = quantiles(means, sds, LEVELS)[:, ::50]
     assert np.abs(alone - together).max() < 1e-6
 
 
@@ -151,23 +164,32 @@ def test_distribution_undoes_quantiles(
     generator = np.random.default_rng(seed)
     means = 10**spread * generator.standard_t(2, size=(number, 3))
     sds = 10 ** generator.uniform(narrow, 0, number)
-    x = mixture.quantiles(means, sds, np.array([p]))[0]
+    x = quantiles(means, sds, np.array([p]))[0]
     margin = 1e-6 * mixture_sd(means, sds)
-    assert (mixture.distribution(means, sds, x - margin) <= p + 1e-13).all()
-    assert (mixture.distribution(means, sds, x + margin) >= p - 1e-13).all()
+    assert (distribution(means, sds, x - margin) <= p + 1e-13).all()
+    assert (distribution(means, sds, x + margin) >= p - 1e-13).all()
 
 
 def test_distribution_is_the_mean_of_the_draws_distributions() -> None:
     means, sds = draws("usual", samples=500)
     values = means[0] + 0.3
     expected = np.mean(norm.cdf(values, means, sds[:, None]), axis=0)
-    assert expected == pytest.approx(mixture.distribution(means, sds, values), abs=1e-14)
+    assert expected == pytest.approx(distribution(means, sds, values), abs=1e-14)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_the_draws_are_left_as_they_are(scale: float) -> None:
+    means, sds = draws("usual")
+    before = means.copy()
+    quantiles(means, scale * sds, LEVELS)
+    crps(means, scale * sds, means[0])
+    assert np.array_equal(before, means)
 
 
 def test_a_draw_without_sd_is_a_step_of_the_distribution() -> None:
     means = np.array([[0.0], [1.0], [2.0], [3.0]])
     expected = (1 + 1 + 0.5 + 0) / 4
-    assert expected == mixture.distribution(means, np.zeros(4), np.array([2.0]))[0]
+    assert expected == distribution(means, np.zeros(4), np.array([2.0]))[0]
 
 
 @pytest.mark.parametrize("number", [1, 64, 65])
@@ -176,7 +198,7 @@ def test_crps_of_one_gaussian_is_the_closed_form(number: int) -> None:
     y = np.linspace(-3, 5, 9)
     z = (y - 0.4) / 1.7
     expected = 1.7 * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
-    got = mixture.crps(np.full((number, 9), 0.4), np.full(number, 1.7), y)
+    got = crps(np.full((number, 9), 0.4), np.full(number, 1.7), y)
     assert expected == pytest.approx(got, abs=1e-6 * 1.7)
 
 
@@ -202,14 +224,14 @@ def test_crps_is_the_double_sum_over_draws(kind: str, error: float) -> None:
     means, sds = draws(kind)
     sd = mixture_sd(means, sds)
     for values in (means[0], means.mean(axis=0) + 4 * sd):
-        difference = slow_crps(means, sds, values) - mixture.crps(means, sds, values)
+        difference = slow_crps(means, sds, values) - crps(means, sds, values)
         assert (np.abs(difference) < error * sd).all()
 
 
 def test_crps_without_sds_is_the_double_sum_over_draws() -> None:
     means, sds = draws("skewed")
     expected = slow_crps(means, 0 * sds, means[3])
-    assert expected == pytest.approx(mixture.crps(means, 0 * sds, means[3]), abs=1e-12)
+    assert expected == pytest.approx(crps(means, 0 * sds, means[3]), abs=1e-12)
 
 
 def test_crps_is_the_integral_of_the_squared_distance_to_the_step() -> None:
@@ -221,4 +243,4 @@ def test_crps_is_the_integral_of_the_squared_distance_to_the_step() -> None:
 
     below, above = (quad(squared, a, b, limit=200, epsabs=1e-9)[0] for a, b in ((-9, y), (y, 20)))
     expected = below + above
-    assert expected == pytest.approx(mixture.crps(means, sds, np.array([y]))[0], abs=1e-6)
+    assert expected == pytest.approx(crps(means, sds, np.array([y]))[0], abs=1e-6)

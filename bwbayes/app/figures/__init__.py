@@ -13,6 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
@@ -55,8 +56,14 @@ def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
     pictures: dict[str, bytes] = {}
     with mpl.rc_context(STYLE):
         for name, figure in figures.items():
-            buffer = BytesIO()
-            figure.savefig(buffer, format="png")
-            pictures[name] = buffer.getvalue()
+            pictures[name] = _png(figure)
             (folder / f"{quote(name, safe=' ,;()+')}.png").write_bytes(pictures[name])
     return pictures
+
+
+def _png(figure: Figure) -> bytes:
+    """Return a figure as PNG, laid out and drawn once: ``savefig`` does either twice."""
+    figure.set_dpi(mpl.rcParams["savefig.dpi"])
+    buffer = BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
+    return buffer.getvalue()
