@@ -58,7 +58,7 @@ def test_the_first_command_converges_with_the_effective_draws_it_was_asked_for(
 ) -> None:
     assert summary["converged"] is True
     for name, row in summary["parameters"].items():
-        assert min(row["ess_bulk"], row["ess_tail"]) >= 2000, name
+        assert min(row["ess_bulk"], row["ess_tail"]) >= 4000, name
         assert row["rhat"] < 1.01, name
 
 
