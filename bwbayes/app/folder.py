@@ -1,8 +1,8 @@
-"""A run's folder: what is in it, who may write it, and how it comes to be.
+"""The folder of a run or a calibration: what is in it, who may write it, and how it comes to be.
 
-The folder appears in one step, with the resolved config and the records in it, so that a run can be
-continued from any moment on. It is never overwritten unless that is asked for, and a lock refuses
-a second writer.
+The folder appears in one step, with the resolved config and the records in it, so that its work can
+be continued from any moment on. It is never overwritten unless that is asked for, and a lock
+refuses a second writer.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Self
 
 from filelock import FileLock, Timeout
 
@@ -20,7 +21,7 @@ from bwbayes.app.problem import Problem
 from bwbayes.data import write_record
 from bwbayes.errors import InputError
 
-__all__ = ["RunFolder"]
+__all__ = ["CalibrationFolder", "RunFolder"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,12 @@ class RunFolder:
     """The files of one run, by what they are."""
 
     path: Path
+
+    # What it holds, the file that only such a folder has at its start, and the commands for it.
+    KIND: ClassVar[str] = "run"
+    MARK: ClassVar[str | None] = None
+    BEGIN: ClassVar[str] = "bwbayes run CONFIG --out"
+    GO_ON: ClassVar[str] = "bwbayes resume"
 
     @property
     def config(self) -> Path:
@@ -45,7 +52,7 @@ class RunFolder:
         return self.path / "summary.json"
 
     @classmethod
-    def create(cls, path: Path, problem: Problem, overwrite: bool) -> RunFolder:
+    def create(cls, path: Path, problem: Problem, overwrite: bool) -> Self:
         """Make the folder of a new run, whole or not at all.
 
         Raises
@@ -53,14 +60,16 @@ class RunFolder:
         InputError
             It exists and ``overwrite`` is not given, or it is no run's, or it cannot be written.
         """
+        if path.name == "..":
+            raise InputError(f"{path}: is no name of a folder; choose one with --out")
         if path.exists():
             if not overwrite:
                 raise InputError(
-                    f"{path}: exists; go on with `bwbayes resume {path}`, choose another folder "
+                    f"{path}: exists; go on with `{cls.GO_ON} {path}`, choose another folder "
                     "with --out, or give --overwrite"
                 )
             if not cls(path)._may_go():
-                raise InputError(f"{path}: is not a run's folder; choose another with --out")
+                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another with --out")
         draft = path.absolute().with_name(f".{path.name}.partial")
         try:
             shutil.rmtree(draft, ignore_errors=True)
@@ -70,6 +79,8 @@ class RunFolder:
                 if validation.record is not None:
                     write_record(validation.record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
+            if cls.MARK:
+                (draft / cls.MARK).touch()
             if path.exists():
                 with cls(path).locked():
                     shutil.rmtree(path)
@@ -77,10 +88,12 @@ class RunFolder:
         except OSError as error:
             reason = error.strerror or error
             raise InputError(f"{path}: {reason}; choose another folder with --out") from None
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
         return cls(path)
 
     @classmethod
-    def open(cls, path: Path) -> RunFolder:
+    def open(cls, path: Path) -> Self:
         """Return the folder of a run that exists.
 
         Raises
@@ -89,17 +102,21 @@ class RunFolder:
             There is no run.
         """
         folder = cls(path)
-        if not folder.config.is_file():
-            raise InputError(
-                f"{path}: no run here; start one with `bwbayes run CONFIG --out {path}`"
-            )
+        if not (folder.config.is_file() and folder._is_of_its_kind()):
+            raise InputError(f"{path}: no {cls.KIND} here; start one with `{cls.BEGIN} {path}`")
         return folder
 
+    def _is_of_its_kind(self) -> bool:
+        """Tell a run's folder from a calibration's."""
+        found = (self.path / CalibrationFolder.MARK).is_file()
+        return found == (self.MARK is not None)
+
     def _may_go(self) -> bool:
-        """Tell whether nothing but a run would be lost with this folder."""
+        """Tell whether nothing of another kind would be lost with this folder."""
         record = self.path / "records/record.h5"
         empty = self.path.is_dir() and not any(self.path.iterdir())
-        return empty or (self.config.is_file() and record.is_file())
+        its_own = self.config.is_file() and record.is_file() and self._is_of_its_kind()
+        return empty or its_own
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -115,7 +132,7 @@ class RunFolder:
             lock.acquire(timeout=0)
         except Timeout:
             raise InputError(
-                f"{self.path}: another process is writing this run; wait for it to end"
+                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
             ) from None
         except OSError as error:
             raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
@@ -123,3 +140,23 @@ class RunFolder:
             yield
         finally:
             lock.release()
+
+
+@dataclass(frozen=True)
+class CalibrationFolder(RunFolder):
+    """The files of one calibration; its config is that of all its replicates."""
+
+    KIND: ClassVar[str] = "calibration"
+    MARK: ClassVar[str] = "replicates.jsonl"
+    BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out"
+    GO_ON: ClassVar[str] = "bwbayes calibrate --resume"
+
+    @property
+    def replicates(self) -> Path:
+        """The replicates, a line each, appended in the order of their numbers."""
+        return self.path / self.MARK
+
+    @property
+    def summary(self) -> Path:
+        """The calibration's numbers."""
+        return self.path / "calibration.json"

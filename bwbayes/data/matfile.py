@@ -12,6 +12,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,8 +21,8 @@ import numpy as np
 import scipy.io
 from scipy.io.matlab import MatReadWarning, matfile_version
 
-from bwbayes.data.checks import Table, named_columns
-from bwbayes.data.hdf5file import group_table, record_arrays
+from bwbayes.data.checks import MAXIMUM_SAMPLES, Table, named_columns
+from bwbayes.data.hdf5file import check_lists, datasets, group_table, record_arrays
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
@@ -35,6 +36,7 @@ _USERBLOCK = 512  # bytes before the HDF5 part of a version 7.3 file
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS_AND_TEXT = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
 _COMPLEX = 0x0800
+_LARGEST_ELEMENT = 16 * MAXIMUM_SAMPLES  # bytes that a compressed element may unpack to
 _PLAIN_CODES = {4, *range(6, 16)}
 _PLAIN_CLASSES = {"double", "single", "char", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
@@ -101,7 +103,8 @@ def _check_elements(data: bytes) -> None:
     order = {b"IM": "<", b"MI": ">"}[data[126:128]]
     for kind, body in _elements(data[128:], order, padded=False):
         if kind == _COMPRESSED:
-            ((kind, body),) = _elements(zlib.decompress(body), order)  # noqa: PLW2901
+            unpacked = zlib.decompressobj().decompress(body, _LARGEST_ELEMENT)
+            ((kind, body),) = _elements(unpacked, order)  # noqa: PLW2901
         if kind != _MATRIX:
             raise ValueError(f"unknown element {kind}")
         inner = list(_elements(body, order))
@@ -137,19 +140,22 @@ def _first(values: Any) -> str:
 
 
 def _read_7_3(path: Path) -> Table:
+    check_lists(path)
     with h5py.File(path, "r") as file:
-        notes = {}
+        names = set(datasets(file))
+        notes: dict[str, str] = {}
         for key in ("voltage_is", "origin"):
-            if key in file and "MATLAB_empty" not in file[key].attrs:
+            if key in names and "MATLAB_empty" not in file[key].attrs:
                 codes = np.asarray(file[key][()], dtype="<u2")
                 notes[key] = codes.tobytes().decode("utf-16-le", errors="replace")
-        if "interval_s" in file:
+        if "interval_s" in names:
             notes["interval_s"] = _first(file["interval_s"][()])
         return group_table(path, file, notes)
 
 
 def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> None:
-    with h5py.File(path, "w", userblock_size=_USERBLOCK) as file:
+    content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
+    with h5py.File(content, "w", userblock_size=_USERBLOCK) as file:
         for name, values in arrays.items():
             # MATLAB counts dimensions the other way round: (1, samples) here is a column there.
             dataset = file.create_dataset(name, data=values[np.newaxis, :])
@@ -165,5 +171,6 @@ def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> Non
                 dataset.attrs["MATLAB_empty"] = np.uint8(1)
     # Text of 116 bytes, 8 bytes that stay zero, version 2.0, and the mark of little-endian files.
     header = b"MATLAB 7.3 MAT-file, written by bwbayes".ljust(116) + bytes(8) + b"\x00\x02IM"
-    with path.open("r+b") as raw:
-        raw.write(header)
+    content.seek(0)
+    content.write(header)
+    path.write_bytes(content.getbuffer())

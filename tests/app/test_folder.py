@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
+import resource
+import signal
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,8 +19,8 @@ from bwbayes.app.folder import RunFolder
 from bwbayes.app.problem import Problem, resolve
 from bwbayes.errors import InputError
 from tests.app import small
+from tests.forks import FORKS
 
-FORKS = multiprocessing.get_context("forkserver")
 NOBODY = 65534
 
 
@@ -162,3 +164,27 @@ def test_read_only_folder_is_refused(read_only: Path, problem: Problem) -> None:
         assert_refused(made.path, problem, overwrite=True, why="Permission denied")
     made.path.chmod(0o755)
     assert made.config.is_file()
+
+
+def create_with_room_for(path: Path, size: int, told: Any) -> None:
+    """Make a run's folder where no file may be larger, and tell the error."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+    try:
+        small.begun(path)
+    except InputError as error:
+        told.put(str(error))
+
+
+@pytest.mark.parametrize("size", [0, 500, 5_000])
+def test_full_disk_leaves_no_folder(tmp_path: Path, size: int) -> None:
+    told = FORKS.Queue()
+    path = tmp_path / "a"
+    process = FORKS.Process(target=create_with_room_for, args=(path, size, told))
+    process.start()
+    text = told.get(timeout=60)
+    process.join()
+    assert 0 == process.exitcode
+    assert "\n" not in text
+    assert "File too large" in text
+    assert not path.exists()

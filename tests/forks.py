@@ -1,0 +1,13 @@
+"""Processes that start in milliseconds: from a server that has all imported already.
+
+There is one such server for all tests of a process, so what it imports is decided here.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+
+__all__ = ["FORKS"]
+
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["pytest", "bwbayes.app.cli", "bwbayes.app.run", "tests.app.small"])
