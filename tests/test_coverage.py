@@ -78,11 +78,7 @@ def replicate(seed: int, discrepancy: str, rate: float) -> Replicate:
     return Replicate(discrepancy, np.array(ranks), bands)
 
 
-@pytest.fixture(
-    scope="module",
-    # Each worker of a parallel run makes the replicates of one kind only.
-    params=[pytest.param(d, marks=pytest.mark.xdist_group(d)) for d in ("process", "none")],
-)
+@pytest.fixture(scope="module", params=["process", "none"])
 def replicates(request: pytest.FixtureRequest) -> list[Replicate]:
     return [replicate(seed, request.param, 100.0) for seed in range(12)]
 

@@ -13,12 +13,9 @@ from bwbayes.app import cli
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
 
-pytestmark = [
-    pytest.mark.skipif(
-        not RECORD.is_file(), reason="the measured record is not part of the project, and not here"
-    ),
-    pytest.mark.xdist_group("measured stack"),
-]
+pytestmark = pytest.mark.skipif(
+    not RECORD.is_file(), reason="the measured record is not part of the project, and not here"
+)
 
 
 def run(folder: Path, config: Path) -> Any:

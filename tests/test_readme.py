@@ -12,7 +12,6 @@ import pytest
 from bwbayes.app import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-pytestmark = pytest.mark.xdist_group("readme")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -51,14 +51,7 @@ class Reference:
     found: Mapping[str, Any]
 
 
-@pytest.fixture(
-    scope="module",
-    # Each worker of a parallel run makes one case only.
-    params=[
-        pytest.param("virtual", marks=pytest.mark.xdist_group("virtual reference")),
-        pytest.param("measured", marks=[pytest.mark.xdist_group("measured reference"), absent]),
-    ],
-)
+@pytest.fixture(scope="module", params=["virtual", pytest.param("measured", marks=absent)])
 def reference(request: pytest.FixtureRequest) -> Reference:
     config = FOLDER / f"{request.param}.toml"
     found = json.loads(config.with_suffix(".json").read_text(encoding="utf-8"))
