@@ -48,7 +48,7 @@ LARGEST_FILE = 1_000_000  # bytes
 MOST_KEY_PARTS = 100
 
 # Names go into file names.
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
 Positive = Annotated[float, Field(gt=0)]
 Window = Annotated[list[float], Field(min_length=2, max_length=2)]
 

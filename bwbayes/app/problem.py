@@ -41,6 +41,9 @@ from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
+# No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
+LARGEST = 1e60
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -232,6 +235,7 @@ def _parameter(
         prior = _distribution(name, given.prior)
     elif fixed is None:
         prior, fixed = _default(name, ranges, exponent or 1.0, stiffness)
+    _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
     unit = meaning.unit
     if name in ("beta", "gamma") and exponent != 1.0:
         unit = "um^(1-n)/V"
@@ -245,6 +249,13 @@ def _parameter(
         -np.inf if given.lower is None else given.lower,
         np.inf if given.upper is None else given.upper,
     )
+
+
+def _require_in_proportion(name: str, values: Collection[float]) -> None:
+    """Refuse numbers of which the model's products and quotients are too large or small to hold."""
+    for value in values:
+        if value and not 1 / LARGEST < abs(value) < LARGEST:
+            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
 
 
 def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:

@@ -24,7 +24,16 @@ from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.data.record import Record, VoltageIs, require_voltage_is
 from bwbayes.errors import InputError, InputWarning
 
-__all__ = ["MINIMUM_SAMPLES", "Column", "Table", "build_record", "named_columns", "parse_name"]
+__all__ = [
+    "MAXIMUM_SAMPLES",
+    "MINIMUM_SAMPLES",
+    "Column",
+    "Table",
+    "build_record",
+    "named_columns",
+    "parse_name",
+    "require_readable",
+]
 
 MINIMUM_SAMPLES = 10
 MAXIMUM_SAMPLES = 10**8
@@ -43,6 +52,7 @@ _NAMES = {
 _SHORTEST = 1e-12  # s
 _LATEST = 1e12  # s
 _LARGEST = 1e9  # V or um: beyond it a unit is wrong, whatever the actuator
+_SMALLEST = 1e-9  # V or um: a range below it is none
 
 
 @dataclass(frozen=True)
@@ -182,6 +192,27 @@ def build_record(
     )
 
 
+def require_readable(record: Record, where: str) -> None:
+    """Refuse a record that could be written to a file and not be read back.
+
+    Raises
+    ------
+    InputError
+        As for a file that is called ``where``.
+    """
+    arrays = {
+        "time": record.time,
+        "voltage": record.voltage,
+        "displacement": record.displacement,
+        "truth": record.truth,
+    }
+    columns = {q: Column(_NAMES[q], v, 0) for q, v in arrays.items() if v is not None}
+    table = Table(Path(where), columns, {"interval_s": repr(record.interval)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        build_record(table, need_displacement=record.displacement is not None)
+
+
 def _check_lengths(table: Table, needed: Iterable[str]) -> None:
     for quantity in needed:
         if quantity not in table.columns:
@@ -299,8 +330,12 @@ def _declared_interval(table: Table, measured: float, tolerance: float) -> float
 
 
 def _check_moving(table: Table, quantity: str, values: FloatArray) -> None:
-    if np.ptp(values) == 0:
+    extent = float(np.ptp(values))
+    if extent == 0:
         problem = f"constant at {values[0]:g}; give a record in which it moves"
+        raise table.error(problem, quantity)
+    if extent < _SMALLEST:
+        problem = f"moves by {extent:.3g} at most, which is absurdly little; check the unit"
         raise table.error(problem, quantity)
 
 

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, one_line
 
 __all__ = ["Record", "Split", "VoltageIs", "Window", "require_voltage_is"]
 
@@ -89,7 +89,7 @@ class Record:
         object.__setattr__(self, "interval", float(self.interval))
         object.__setattr__(self, "start", float(self.start) + 0.0)  # turns -0.0 into 0.0
         object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
-        object.__setattr__(self, "origin", _printable(self.origin))
+        object.__setattr__(self, "origin", one_line(self.origin))
 
     @property
     def samples(self) -> int:
@@ -228,7 +228,3 @@ def _frozen_vector(name: str, values: ArrayLike, samples: int) -> FloatArray:
         raise InputError(f"{name}: {vector[sample]} at sample {sample}; give finite numbers")
     vector.setflags(write=False)
     return vector
-
-
-def _printable(text: str) -> str:
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -34,6 +34,8 @@ __all__ = [
     "verification_signal",
 ]
 
+MOST_SAMPLES = 10**7
+
 
 def _require_finite(where: str, value: float) -> None:
     if not math.isfinite(value):
@@ -304,7 +306,7 @@ class Waveform:
             V.
 
         Raises :class:`InputError` if the rate is not above zero or too low for the carrier, or the
-        duration holds fewer than two samples.
+        duration holds fewer than two samples or more than ten million.
         """
         _require_positive("sampling: rate", rate)
         lowest = 2 * self.carrier.highest_frequency
@@ -313,12 +315,11 @@ class Waveform:
                 f"sampling: rate: {rate:g} Hz cannot resolve {lowest / 2:g} Hz; "
                 f"sample faster than {lowest:g} Hz"
             )
-        samples = round(self.duration * rate)
-        if samples < 2:
-            raise InputError(
-                f"sampling: {self.duration:g} s at {rate:g} Hz is fewer than two samples; "
-                "sample faster or make the signal longer"
-            )
+        samples = round(min(self.duration * rate, MOST_SAMPLES + 1))
+        if not 2 <= samples <= MOST_SAMPLES:
+            bound = "fewer than two" if samples < 2 else f"more than {MOST_SAMPLES:,}"
+            where = f"sampling: {self.duration:g} s at {rate:g} Hz is {bound} samples"
+            raise InputError(f"{where}; give another rate or duration")
         time = np.arange(samples) / rate
         return time, self(time)
 

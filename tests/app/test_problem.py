@@ -192,6 +192,11 @@ def test_integer_is_a_number(folder: Path) -> None:
         ("[validation.a]\nsignal = 'verificaton'", "did you mean 'verification'?"),
         ("[validation.a]\nfile = 'none.csv'", "none.csv: does not exist"),
         ("[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
+        ("[parameters]\nlag = { fixed = 5e-324 }", "parameters.lag: 4.94066e-324 is out of prop"),
+        (
+            "[parameters]\nd = { prior = { distribution = 'normal', mean = 1e300, sd = 1e299 } }",
+            "parameters.d: 1e+300 is out of proportion; check its unit",
+        ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said: str) -> None:
@@ -204,11 +209,30 @@ def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said
         ("train = [[0.0, 2.0], [1.0, 3.0]]", "overlaps the training window 0 to 2 s"),
         ("train = [[0.0, 9.0]]", "reaches outside the record"),
         ("start = 3.0\nstop = 2.0", "holds no sample"),
-        ("decimate = 1000", "record"),
+        ("decimate = 1000", "record: too short, samples: 1;"),
+        ("stop = 0.09", "record: too short, samples: 9; give at least 10"),
     ],
 )
 def test_windows_that_cannot_be_cut_are_named(folder: Path, text: str, said: str) -> None:
     assert said in refused(RECORD + text, folder)
+
+
+@pytest.mark.parametrize(
+    ("signal", "said"),
+    [
+        ("amplitude = 1e30, frequency = 1.0, duration = 3.0", "voltage_V: "),
+        ("amplitude = 1e-30, frequency = 1.0, duration = 3.0", "voltage_V: moves by "),
+        ("amplitude = 1.0, frequency = 1.0, duration = 0.005", "too short, samples: 5"),
+        ("amplitude = 1.0, frequency = 1.0, duration = 1e12", "more than 10,000,000 samples"),
+    ],
+)
+def test_made_record_that_no_file_could_hold_is_refused_before_the_run(
+    tmp_path: Path, signal: str, said: str
+) -> None:
+    """The run's folder keeps it as a file, and reads it back."""
+    assert said in refused(f"[record]\nsignal = {{ {signal} }}", tmp_path)
+    held_out = f"[validation.a]\nsignal = {{ {signal} }}\nlead_in = 0.001"
+    assert said in refused(f'[record]\nsignal = "identification"\n{held_out}', tmp_path)
 
 
 def test_training_window_without_drive_is_refused(tmp_path: Path) -> None:

@@ -97,6 +97,24 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
     assert ["8.22 µm"] * 2 == table["90 % sensor band: interval score"]
 
 
+@pytest.mark.parametrize("converged", [True, False])
+def test_acceptance_of_each_move_and_pareto_k_are_shown(converged: bool) -> None:
+    text = page(example.run(converged=converged))
+    expected = {"differential evolution": ["1000", "12.3 %"], "mixture": ["3800", "32.1 %"]}
+    assert expected == rows(text, "moves")
+    assert "Pareto k of the mixture at the draws: 0.31;" in text
+
+
+def test_draws_without_a_proposal_have_no_pareto_k() -> None:
+    run = example.run()
+    outcome = dataclasses.replace(
+        run.outcome, check=dataclasses.replace(run.outcome.check, pareto_k=None)
+    )
+    text = page(dataclasses.replace(run, outcome=outcome))
+    assert "No mixture proposed these draws" in text
+    assert "Pareto k of" not in text
+
+
 def test_bands_without_a_measurement_have_no_validation() -> None:
     text = page(example.run(every=(example.bands(measured=False),)))
     assert "Validation" not in text

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import cumulative_trapezoid
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.waveforms import identification_signal, verification_signal
@@ -168,46 +167,9 @@ def test_two_samples_are_one_step() -> None:
         np.testing.assert_allclose(hysteresis(voltage, *TABLE_1, initial=2.0)[0], expected)
 
 
-@pytest.mark.parametrize("exponent", EXPONENTS)
-def test_mirrored_voltage_and_start_give_mirrored_h(exponent: float) -> None:
-    parameters = model(SHAPES[0], exponent)
-    expected = -hysteresis(random_walk(7), *parameters, initial=2.0)
-    np.testing.assert_array_equal(expected, hysteresis(-random_walk(7), *parameters, initial=-2.0))
-
-
-@given(
-    repeats=st.lists(st.integers(1, 4), min_size=61, max_size=61),
-    exponent=st.sampled_from(EXPONENTS),
-)
-@settings(deadline=None, max_examples=40)
-def test_h_depends_on_the_path_and_not_on_the_pace(repeats: list[int], exponent: float) -> None:
-    """Repeated and inserted samples leave h at the common points as it was."""
-    voltage, parameters = random_walk(8, turns=10), model(SHAPES[0], exponent)
-    fractions = [np.arange(count) / count for count in repeats[:-1]]
-    place = np.concatenate([index + part for index, part in enumerate(fractions)] + [[60.0]])
-    common = np.flatnonzero(place == np.round(place))
-    expected = hysteresis(voltage, *parameters, initial=1.0)[0]
-    refined = np.interp(place, np.arange(61), voltage)
-    assert_close(expected, hysteresis(refined, *parameters, initial=1.0)[0][common], 1e-11)
-    held = np.repeat(voltage, repeats)
-    ends = np.cumsum(repeats) - 1
-    assert_close(expected, hysteresis(held, *parameters, initial=1.0)[0][ends], 1e-12)
-
-
 def test_only_changes_of_voltage_matter() -> None:
     expected = hysteresis(random_walk(9), *TABLE_1, initial=1.0)[0]
     assert_close(expected, hysteresis(random_walk(9) + 500.0, *TABLE_1, initial=1.0)[0], 1e-11)
-
-
-def test_a_model_does_not_depend_on_its_batch() -> None:
-    generator = np.random.default_rng(10)
-    models = [model(SHAPES[row % 5], EXPONENTS[row % 4]) for row in range(60)]
-    initial = generator.uniform(-4, 4, len(models))
-    alpha, beta, gamma, exponent = np.array(models).T
-    batch = hysteresis(random_walk(10), alpha, beta, gamma, exponent, initial)
-    for row, parameters in enumerate(models):
-        alone = hysteresis(random_walk(10), *parameters, initial=initial[row])[0]
-        assert_close(alone, batch[row], 1e-12)
 
 
 def test_scalars_and_rows_mix() -> None:
@@ -247,43 +209,6 @@ def test_h_stays_below_the_ceiling_and_reaches_it(exponent: float) -> None:
 def test_ceiling_is_infinite_where_gamma_is_minus_beta() -> None:
     row = np.array([0.02])
     assert np.inf == ceiling(np.array([ALPHA]), row, -row, np.array([2.0]))[0]
-
-
-def dissipation(corners: list[float], parameters: Model, initial: float) -> FloatArray:
-    """∫ h du − Δ(h²)/(2α) up to every sample, in um V."""
-    count = len(corners) - 1
-    voltage = np.interp(np.linspace(0, count, 400 * count + 1), np.arange(count + 1), corners)
-    h = hysteresis(voltage, *parameters, initial=initial)[0]
-    supplied = cumulative_trapezoid(h, voltage, initial=0)
-    return np.asarray(supplied - (h**2 - h[0] ** 2) / (2 * parameters.alpha))
-
-
-@given(
-    beta=st.floats(0.0, 0.1),
-    fraction=st.floats(-1.0, 1.0),
-    start=st.integers(-20, 20).map(float),
-    corners=st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=8),
-)
-@settings(deadline=None, max_examples=80)
-def test_no_path_draws_energy_from_a_passive_model(
-    beta: float, fraction: float, start: float, corners: list[float]
-) -> None:
-    assert dissipation(corners, Model(ALPHA, beta, fraction * beta), start).min() >= -0.05
-
-
-def test_gamma_above_beta_is_not_passive() -> None:
-    assert dissipation([0.0, 10.0], Model(ALPHA, 0.01, 0.03), -7.0).min() < -2.0
-
-
-def test_a_minor_loop_does_not_close_but_settles() -> None:
-    """Back at the voltage of the reversal h is lower than before, by less in every round."""
-    voltage = np.array([0.0, 80.0, *[20.0, 80.0] * 12])
-    h = hysteresis(voltage, *TABLE_1)[0]
-    assert_close(by_samples(voltage, TABLE_1, 0.0), h, 1e-13)
-    gaps = np.diff(h[1::2])
-    assert pytest.approx(-0.972087, rel=1e-5) == gaps[0]
-    np.testing.assert_allclose(gaps[1:4] / gaps[:3], 0.0164, rtol=0.03)
-    assert np.abs(gaps[-3:]).max() < 1e-13
 
 
 def test_plateaus_belong_to_the_stretch_that_leads_to_them() -> None:

@@ -1,0 +1,201 @@
+"""Ten thousand spoilt configs and records: each is used, or refused in one line.
+
+Every case goes through ``bwbayes check`` in this process. What is used must give finite numbers,
+and make a run's folder that reads back the same, with nothing written beside it. The best of some
+prior draws stands in for the point fit, which takes longer than all the rest, but for a few cases.
+
+The default run takes the first cases; ``-m slow`` takes all. A case is made again from its number:
+``tests.app.mutations.case(SEED, number)``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import io
+import itertools
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.app import cli
+from bwbayes.app.config import load
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import generator, resolve
+from bwbayes.app.run import load_run
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+from tests.app.mutations import KINDS, Case, case
+
+SEED = 1
+FEW, ALL, FITTED = 1500, 10_000, 6
+SECONDS = 10  # of processor time, for a case that takes some hundredths
+LONGEST_LINE = 700
+
+
+class TooLate(BaseException):
+    """The time of a case is over; no ``except Exception`` may take it for damage to a file."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What the command said of a case, its exit status, and the processor time it took, s."""
+
+    status: int
+    out: str
+    err: str
+    seconds: float
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder that the commands run in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["bwbayes", "check", "my.toml"])
+    monkeypatch.setenv("COLUMNS", "200")
+    return tmp_path
+
+
+@pytest.fixture
+def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pointfit, "fit", best_draw)
+
+
+def best_draw(posterior: Posterior, generator: np.random.Generator) -> pointfit.PointFit:
+    """Stand in for the point fit, with its error for priors that the record contradicts."""
+    prior = posterior.prior
+    draws = prior.unconstrain(prior.draw(generator, 64))
+    density = posterior.log_density(draws)
+    if not np.isfinite(density).any():
+        raise InputError("priors: no draw has a finite posterior density; check priors and record")
+    best, spread = draws[np.argmax(density)], np.atleast_2d(np.cov(draws, rowvar=False))
+    return pointfit.PointFit(best, spread, float(density.max()), best[np.newaxis], spread)
+
+
+def check(one: Case, place: Path) -> Said:
+    """Type ``bwbayes check my.toml`` with the files of a case; a defect keeps its traceback."""
+    (place / "my.toml").write_bytes(one.config)
+    (place / one.record).write_bytes(one.data)
+    out, err, status = io.StringIO(), io.StringIO(), None
+    begun = time.process_time()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), limited():
+        try:
+            cli.main()
+        except SystemExit as end:
+            status = end.code
+    assert isinstance(status, int)
+    return Said(status, out.getvalue(), err.getvalue(), time.process_time() - begun)
+
+
+@contextlib.contextmanager
+def limited() -> Iterator[None]:
+    """Raise after some seconds, and end the process if it hangs where Python cannot raise."""
+
+    def late(*_: object) -> None:
+        raise TooLate
+
+    before = signal.signal(signal.SIGPROF, late), signal.getsignal(signal.SIGTERM)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    faulthandler.dump_traceback_later(30 * SECONDS, exit=True, file=sys.__stderr__ or 2)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        faulthandler.cancel_dump_traceback_later()
+        signal.signal(signal.SIGPROF, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+
+
+def assert_used_or_refused(one: Case, said: Said, place: Path) -> None:
+    assert {"my.toml", one.record} == {path.name for path in place.iterdir()}
+    if said.status == 2:
+        assert said.out == ""
+        assert said.err.startswith("bwbayes: ")
+        assert said.err.endswith("\n")
+        assert said.err[:-1].isprintable()
+        assert len(said.err) <= LONGEST_LINE
+        assert "out of memory" not in said.err
+    else:
+        assert (0, "") == (said.status, said.err)
+        assert "point fit" in said.out
+        assert_becomes_a_run(place)
+
+
+def assert_becomes_a_run(place: Path) -> None:
+    """Make the run's folder, and find the same numbers in it and nothing beside it."""
+    problem = resolve(load(place / "my.toml"), place)
+    before = {path.name for path in place.iterdir()}
+    folder = RunFolder.create(place / "out", problem, overwrite=False)
+    assert before | {"out"} == {path.name for path in place.iterdir()}
+    again = load_run(folder)
+    assert again.config == problem.config
+    assert again.record.sha256 == problem.record.sha256
+    prior = problem.posterior.prior
+    coordinates = prior.unconstrain(prior.draw(generator(1, "hostile"), 8))
+    np.testing.assert_array_equal(
+        problem.posterior.log_density(coordinates), again.posterior.log_density(coordinates)
+    )
+    free, _ = prior.constrain(coordinates)
+    assert np.isfinite(problem.posterior.simulate(prior.theta(free))).all()
+    shutil.rmtree(folder.path)
+
+
+def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
+    """Check the cases of these numbers; return how often each kind ended with each status."""
+    found = {kind.strip(): Counter[int]() for kind in KINDS}
+    slowest = (0.0, "")
+    for number in numbers:
+        one = case(SEED, number)
+        try:
+            said = check(one, place)
+            assert_used_or_refused(one, said, place)
+        except BaseException as error:
+            error.add_note(f"case({SEED}, {number}): {one.kind}")
+            raise
+        slowest = max(slowest, (said.seconds, f"case({SEED}, {number}), {one.kind}"))
+        found[one.kind.strip()][said.status] += 1
+        (place / one.record).unlink()
+    print(f"slowest: {slowest[0]:.2f} s, {slowest[1]}")
+    for kind, counts in found.items():
+        print(f"{kind}: {counts[0]} used, {counts[2]} refused")
+    return found
+
+
+@pytest.mark.usefixtures("quick_fit")
+def test_1500_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+    for kind, counts in spoilt(range(FEW), place).items():
+        assert counts[0] > 0, f"{kind}: nothing was used"
+        assert counts[2] > 0, f"{kind}: nothing was refused"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_fit")
+def test_10000_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+    found = spoilt(range(ALL), place)
+    assert ALL == sum(counts.total() for counts in found.values())
+
+
+def test_what_is_used_goes_through_the_whole_check(place: Path) -> None:
+    """With the point fit itself, for the first records that are used."""
+    fitted = 0
+    numbers = (n for n in itertools.count() if not kind_of(n).startswith("config"))
+    while fitted < FITTED:
+        one = case(SEED, next(numbers))
+        said = check(one, place)
+        fitted += said.status == 0
+        assert "nan" not in said.out
+        assert said.status in (0, 2)
+        (place / one.record).unlink()
+
+
+def kind_of(number: int) -> str:
+    return list(KINDS)[number % len(KINDS)]

@@ -1,0 +1,355 @@
+"""Files from strangers run no code, leave no folder, and put nothing of theirs into the page."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import io
+import os
+import pickle
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from rich.console import Console
+
+from bwbayes.app.config import parse
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.problem import resolve
+from bwbayes.app.report import render
+from bwbayes.app.screen import show_priors
+from bwbayes.data import Record, read_record, write_record
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.chainfile import ChainFile
+from bwbayes.results.result import Result, summary
+from tests.app import example
+from tests.app.odd_files import good_arrays
+from tests.app.oddities import CONFIGS, GOOD, QUICK
+from tests.inference.chains import finish, new
+
+SOURCES = Path(__file__).parents[2] / "bwbayes"
+
+
+# Code in data files
+
+
+class Payload:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture
+def mark(tmp_path: Path) -> Path:
+    return tmp_path / "the payload ran"
+
+
+@pytest.fixture
+def payload(mark: Path) -> bytes:
+    return pickle.dumps(Payload(mark))
+
+
+def test_the_payload_is_live(payload: bytes, mark: Path) -> None:
+    pickle.loads(payload)
+    assert mark.exists()
+
+
+def as_itself(payload: bytes) -> bytes:
+    return payload
+
+
+def as_numpy_file(payload: bytes) -> bytes:
+    """Give the header of an array of objects, with the payload as its pickle."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "|O", "fortran_order": False, "shape": (40,)}
+    )
+    return buffer.getvalue() + payload
+
+
+def in_hdf5(place: str) -> Callable[[bytes], bytes]:
+    """Return a maker of HDF5 files with the payload as opaque, as bytes, or in a note."""
+
+    def make(payload: bytes) -> bytes:
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
+            for name, values in good_arrays().items():
+                file[name] = values
+            match place:
+                case "opaque":
+                    del file["voltage_V"]
+                    file["voltage_V"] = np.array([np.void(payload)] * 40)
+                case "bytes":
+                    del file["voltage_V"]
+                    file["voltage_V"] = np.frombuffer(payload, dtype=np.uint8)
+                case "note":
+                    file.attrs["origin"] = np.void(payload)
+                    file.attrs["voltage_is"] = np.void(payload)
+                case "object":
+                    # As PyTables and pandas mark what they pickle.
+                    file["voltage_V"].attrs["PSEUDOATOM"] = "object"
+                    file["voltage_V"].attrs["h5py_pickle"] = np.void(payload)
+        return buffer.getvalue()
+
+    return make
+
+
+def in_matlab(value: Callable[[bytes], Any]) -> Callable[[bytes], bytes]:
+    """Return a maker of MATLAB files of version 5 with the payload in the voltage's place."""
+
+    def make(payload: bytes) -> bytes:
+        buffer = io.BytesIO()
+        scipy.io.savemat(buffer, good_arrays() | {"voltage_V": value(payload)})
+        return buffer.getvalue()
+
+    return make
+
+
+def of_class(code: int) -> Callable[[bytes], bytes]:
+    """Return a maker of MATLAB files whose voltage says that it is an object, or a function."""
+
+    def make(payload: bytes) -> bytes:
+        data = bytearray(in_matlab(lambda p: np.frombuffer(p, dtype=np.uint8))(payload))
+        flags = data.index(b"voltage_V") - 8 - 16 - 8
+        assert data[flags] == 9  # uint8
+        data[flags] = code
+        return bytes(data)
+
+    return make
+
+
+PLANTS: dict[str, tuple[str, Callable[[bytes], bytes]]] = {
+    "pickle as csv": ("csv", as_itself),
+    "pickle as h5": ("h5", as_itself),
+    "pickle as mat": ("mat", as_itself),
+    "npy as csv": ("csv", as_numpy_file),
+    "npy as h5": ("h5", as_numpy_file),
+    "npy as mat": ("mat", as_numpy_file),
+    "opaque in h5": ("h5", in_hdf5("opaque")),
+    "bytes in h5": ("h5", in_hdf5("bytes")),
+    "note in h5": ("h5", in_hdf5("note")),
+    "attribute in h5": ("h5", in_hdf5("object")),
+    "opaque in mat 7.3": ("mat", in_hdf5("opaque")),
+    "text in mat": ("mat", in_matlab(lambda p: p.decode("latin-1"))),
+    "cell in mat": ("mat", in_matlab(lambda p: np.array([p.decode("latin-1")] * 2, dtype=object))),
+    "struct in mat": ("mat", in_matlab(lambda p: {"code": np.frombuffer(p, dtype=np.uint8)})),
+    "object in mat": ("mat", of_class(3)),
+    "function in mat": ("mat", of_class(16)),
+    "opaque in mat": ("mat", of_class(17)),
+}
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_a_pickle_in_a_record_is_refused_or_inert(
+    tmp_path: Path, payload: bytes, mark: Path, plant: str
+) -> None:
+    suffix, make = PLANTS[plant]
+    path = tmp_path / f"record.{suffix}"
+    path.write_bytes(make(payload))
+    if plant == "attribute in h5":
+        np.testing.assert_array_equal(good_arrays()["voltage_V"], read_record(path).voltage)
+    else:
+        with pytest.raises(InputError):
+            read_record(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("place", ["attributes", "committed", "start/coordinates", "more"])
+def test_a_pickle_in_a_chain_is_refused_or_inert(
+    tmp_path: Path, payload: bytes, mark: Path, place: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    with new(path) as chain:
+        finish(chain)
+    with h5py.File(path, "r+") as file:
+        match place:
+            case "attributes":
+                for name in list(file.attrs):
+                    file.attrs[name] = np.void(payload)
+            case "more":
+                file["more"] = np.void(payload)
+            case _:
+                del file[place]
+                file[place] = np.array([np.void(payload)] * 40)
+    for open_chain in (ChainFile.read, ChainFile.resume):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            with contextlib.suppress(InputError):
+                open_chain(path).close()
+    assert not mark.exists()
+
+
+RUN_CODE = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "code"}
+CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "read_pickle", "unsafe_load"}
+
+
+def called(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func).rpartition(".")[2], node
+
+
+@pytest.mark.parametrize(
+    "path", sorted(SOURCES.rglob("*.py")), ids=lambda path: str(path.relative_to(SOURCES))
+)
+def test_no_module_runs_what_it_reads(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            assert not RUN_CODE & {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert (node.module or "").partition(".")[0] not in RUN_CODE
+    for name, node in called(tree):
+        # A regular expression may be compiled.
+        assert name not in CALLS or ast.unparse(node.func) == "re.compile", name
+        assert "allow_pickle" not in {word.arg for word in node.keywords}
+
+
+def test_a_run_loads_no_code_while_it_reads(tmp_path: Path) -> None:
+    """What Python itself reports of pickles, compiled code and other programs."""
+    events: list[str] = []
+    listening = [True]
+    watched = ("pickle.find_class", "exec", "compile", "marshal.loads", "subprocess.Popen")
+
+    def hook(event: str, _: tuple[object, ...]) -> None:
+        if listening[0] and event.startswith((*watched, "os.system", "os.exec", "ctypes.dlopen")):
+            events.append(event)
+
+    record = Record(np.arange(40.0), np.arange(40.0) ** 2, 0.01)
+    paths = [tmp_path / name for name in ("record.csv", "record.h5", "record.mat")]
+    for path in paths:
+        write_record(record, path)
+        read_record(path)  # libraries load the rest of themselves now
+    with new(tmp_path / "chain.h5") as chain:
+        finish(chain)
+    ChainFile.read(tmp_path / "chain.h5")
+    sys.addaudithook(hook)
+    try:
+        for path in paths:
+            read_record(path)
+        ChainFile.read(tmp_path / "chain.h5")
+        assert [] == events
+        pickle.loads(pickle.dumps(Path()))
+        assert "pickle.find_class" in events
+    finally:
+        listening[0] = False
+
+
+# Texts in the page and on the screen
+
+PAYLOADS = (
+    "<script>alert(1)</script>",
+    "</title><img src=x onerror=alert(1)>",
+    "\"'><svg/onload=alert(1)>",
+    "--></style></table><iframe src='javascript:alert(1)'>",
+    "{{ 7 * 7 }}{% include 'report.html.j2' %}",
+    "&lt;b&gt;&#60;i&#62;",
+    "<x\N{NULL}y \N{RIGHT-TO-LEFT OVERRIDE}>",
+    "$\\frac{1$ [/red] \\",
+)
+
+
+class Skeleton(HTMLParser):
+    """The tags of a page with their attributes' names, and nothing else."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, ...]] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:  # noqa: D102
+        self.tags.append((tag, *(name for name, _ in attrs)))
+
+    def handle_endtag(self, tag: str) -> None:  # noqa: D102
+        self.tags.append((f"/{tag}",))
+
+    def handle_comment(self, data: str) -> None:  # noqa: D102
+        self.tags.append(("comment", data))
+
+
+def page(text: str, converged: bool) -> str:
+    """Return the report of a run whose every text from a config or a record is this one."""
+    config = parse(QUICK + f"[parameters.d]\nfixed = 1.0\nlabel = {_toml(text)}\n", "my.toml")
+    odd = [
+        dataclasses.replace(
+            p, unit=text, label=config.parameters["d"].label or "", description=text
+        )
+        for p in example.PARAMETERS
+    ]
+    run: Result = example.run(converged, parameters=tuple(odd))
+    origin = Record(np.arange(20.0), None, 1.0, origin=text).origin
+    run = dataclasses.replace(
+        run, name=text, remarks=(text,), facts={"record": origin, "config": text}
+    )
+    return render(run, summary(run), {"trace": b"png"})
+
+
+def _toml(text: str) -> str:
+    return '"' + "".join(f"\\U{ord(character):08X}" for character in text) + '"'
+
+
+@pytest.mark.parametrize("converged", [True, False])
+@pytest.mark.parametrize("text", PAYLOADS)
+def test_texts_add_no_tag_to_the_page(text: str, converged: bool) -> None:
+    expected, got = (Skeleton(page(words, converged)).tags for words in ("harmless", text))
+    # A symbol that is no letter is shown by its name, which has no subscript either.
+    assert expected == got
+    assert "49" not in page("{{ 7 * 7 }}", converged)
+
+
+@pytest.mark.parametrize("text", PAYLOADS)
+def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
+    """Brackets are no markup there, and do not stop the command."""
+    parameters = [dataclasses.replace(p, unit=text) for p in example.PARAMETERS]
+    console = Console(file=io.StringIO(), width=500)
+    show_priors(parameters, console)
+    assert isinstance(console.file, io.StringIO)
+    assert text.partition("\0")[0] in console.file.getvalue()
+
+
+# Names and paths
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["..", ".", "", "../up", "a/b", "/tmp/x", "a\\\\b", "a.b", "a\\u0000", "a\\n", "é", "x" * 101],
+)
+def test_a_validation_may_not_be_called_like_a_path(name: str) -> None:
+    with pytest.raises(InputError):
+        parse(f'{QUICK}[validation."{name}"]\nwindow = [0.1, 0.2]\n', "my.toml")
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    (tmp_path / "record.csv").write_text("\n".join([*GOOD, ""]))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["a", "-", "_", "x" * 100, "con", "-rf"])
+def test_whatever_a_validation_is_called_all_stays_in_the_folder(bench: Path, name: str) -> None:
+    text = CONFIGS[1].replace("other", name)
+    RunFolder.create(bench / "out", resolve(parse(text, "my.toml"), bench), overwrite=False)
+    assert {"record.csv", "out"} == {path.name for path in bench.iterdir()}
+    found = {str(path.relative_to(bench / "out")) for path in (bench / "out").rglob("*")}
+    assert {"config.toml", "records", "records/record.h5", f"records/{name}.h5"} == found
+
+
+@pytest.mark.parametrize("out", ["results/..", "x" * 250, "record.csv/out"])
+def test_a_folder_that_cannot_be_made_leaves_nothing(bench: Path, out: str) -> None:
+    problem = resolve(parse(QUICK, "my.toml"), bench)
+    with pytest.raises(InputError, match="--out"):
+        RunFolder.create(bench / out, problem, overwrite=False)
+    assert ["record.csv"] == [path.name for path in bench.iterdir()]
