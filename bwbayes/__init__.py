@@ -24,9 +24,11 @@ from typing import TYPE_CHECKING
 __all__ = [
     "Actuator",
     "Bands",
+    "Calibration",
     "Chain",
     "Config",
     "Distribution",
+    "Experiment",
     "InputError",
     "InputWarning",
     "JointPrior",
@@ -36,6 +38,7 @@ __all__ = [
     "Posterior",
     "Problem",
     "Record",
+    "Replicate",
     "SamplingPlan",
     "Scores",
     "Start",
@@ -44,6 +47,7 @@ __all__ = [
     "draws",
     "first_chain",
     "hysteresis",
+    "judge",
     "load_config",
     "noise_model",
     "parse_config",
@@ -51,6 +55,7 @@ __all__ = [
     "predict_record",
     "predict_windows",
     "read_record",
+    "replicates",
     "resolve",
     "sample",
     "score",
@@ -80,16 +85,20 @@ if TYPE_CHECKING:
     from bwbayes.model.actuator import Actuator
     from bwbayes.model.boucwen import hysteresis
     from bwbayes.results.bands import Bands
+    from bwbayes.results.calibration import Calibration, judge
     from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+    from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
 else:
     # The module of each name, and what it is called there if not the same.
     HOMES = {
         "Actuator": "model.actuator",
         "Bands": "results.bands",
+        "Calibration": "results.calibration",
         "Chain": "inference.chain",
         "Config": "app.config",
         "Distribution": "inference.distributions",
+        "Experiment": "results.replicates",
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
@@ -99,6 +108,7 @@ else:
         "Posterior": "inference.posterior",
         "Problem": "app.problem",
         "Record": "data.record",
+        "Replicate": "results.replicates",
         "SamplingPlan": "inference.sampling",
         "Scores": "results.scores",
         "Start": "results.prediction",
@@ -107,6 +117,7 @@ else:
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
         "hysteresis": "model.boucwen",
+        "judge": "results.calibration",
         "load_config": "app.config:load",
         "noise_model": "inference.noise",
         "parse_config": "app.config:parse",
@@ -114,6 +125,7 @@ else:
         "predict_record": "results.prediction",
         "predict_windows": "results.prediction",
         "read_record": "data.files",
+        "replicates": "results.replicates",
         "resolve": "app.problem",
         "sample": "inference.sampling",
         "score": "results.scores",

@@ -31,6 +31,8 @@ PUBLIC = {
     "bwbayes.model.actuator": {"Actuator"},
     "bwbayes.model.boucwen": {"hysteresis"},
     "bwbayes.results.bands": {"Bands"},
+    "bwbayes.results.calibration": {"Calibration", "judge"},
+    "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
     "bwbayes.results.prediction": {"Start", "predict_record", "predict_windows", "thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
 }

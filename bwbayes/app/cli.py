@@ -1,7 +1,7 @@
 """The command line: a thin layer over the package.
 
 Exit status 0: done, and converged. 2: input that cannot be used, said in one line. 4: finished
-without converging. 130: interrupted; what was computed is kept.
+without converging, or a calibration not passed. 130: interrupted; what was computed is kept.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import signal
 import sys
+import warnings
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import click
 from rich.console import Console
@@ -19,9 +20,15 @@ from bwbayes.app.config import LARGEST_SEED, load
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 
+if TYPE_CHECKING:
+    from bwbayes.app.folder import CalibrationFolder
+
 __all__ = ["main"]
 
 NOT_CONVERGED = 4
+
+# Replicates of a calibration, unless told otherwise.
+REPLICATES = 500
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -215,6 +222,75 @@ def report(folder: Path) -> int:
     return 0
 
 
+@cli.command()
+@click.argument("config", type=FILE, required=False)
+@click.option("--resume", "begun", type=FILE, help="Go on with the calibration in this folder.")
+@click.option(
+    "--replicates", type=click.IntRange(1), help=f"How many; default: {REPLICATES}, or as begun."
+)
+@click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
+@click.option("--overwrite", is_flag=True, help="Replace a calibration that is there already.")
+@click.option("--workers", type=click.IntRange(1), help="Replicates side by side; default: cores.")
+@quiet_option
+def calibrate(
+    config: Path | None,
+    begun: Path | None,
+    replicates: int | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
+    workers: int | None,
+    quiet: bool,
+) -> int:
+    """Calibrate the posterior of a CONFIG: fit simulated records whose truth is known.
+
+    Each replicate draws parameters from the config's prior, simulates its record anew and fits it
+    as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
+    replicates did not converge.
+
+    Example: bwbayes calibrate runs/calibration.toml --replicates 500
+    """
+    from bwbayes.app.calibrate import start  # noqa: PLC0415
+    from bwbayes.app.folder import CalibrationFolder  # noqa: PLC0415
+
+    if (config is None) == (begun is None):
+        raise InputError("calibrate: give either a CONFIG or --resume FOLDER")
+    if begun is not None:
+        if out is not None or seed is not None or overwrite:
+            raise InputError("calibrate: --resume goes on as begun; leave the other options out")
+        return _calibrate(CalibrationFolder.open(begun), replicates, workers, quiet)
+    assert config is not None
+    changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
+    wanted = load(config)
+    wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
+    where = out or Path("results") / f"{config.stem}-calibration"
+    folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
+    return _calibrate(folder, None, workers, quiet)
+
+
+def _calibrate(
+    folder: CalibrationFolder, replicates: int | None, workers: int | None, quiet: bool
+) -> int:
+    from bwbayes.app.calibrate import carry_on  # noqa: PLC0415
+    from bwbayes.app.screen import show_calibration  # noqa: PLC0415
+
+    console = Console(stderr=True, quiet=quiet)
+    try:
+        calibration = carry_on(folder, console, workers=workers, count=replicates)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; go on with `{folder.GO_ON} {folder.path}`", err=True)
+        return INTERRUPTED
+    if not quiet:
+        show_calibration(calibration, folder, Console())
+    if calibration.passed:
+        return 0
+    first, *others = calibration.shortcomings
+    more = f", and {len(others)} more" if others else ""
+    click.echo(f"NOT PASSED: {first}{more}; see {folder.path}/calibration.html", err=True)
+    return NOT_CONVERGED
+
+
 def _finish(
     path: Path,
     workers: int | None,
@@ -251,10 +327,15 @@ def _terminate(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+def _one_line(message: Warning | str, *_: object, **__: object) -> str:
+    return f"bwbayes: {message}\n"
+
+
 def main() -> None:
     """Run the command line; every mendable error becomes one line and exit status 2."""
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, _terminate)
+    warnings.formatwarning = _one_line
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
     except (InputError, click.ClickException) as error:

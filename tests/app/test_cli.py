@@ -18,7 +18,7 @@ from bwbayes.app import cli
 from bwbayes.data import read_record
 from tests.app import small
 
-COMMANDS = ("run", "resume", "check", "simulate", "predict", "report")
+COMMANDS = ("run", "resume", "check", "simulate", "predict", "report", "calibrate")
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,14 @@ from bwbayes.app.config import load, parse
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.progress import Progress
 from bwbayes.app.run import carry_on, redraw
+from bwbayes.app.screen import show_result
 from bwbayes.data import read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.inference import sampling
 from bwbayes.inference.chain import Phase
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.diagnostics import Check
-from tests.app import small
+from tests.app import example, small
 
 FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
 LEVELS = {"50", "90", "95"}
@@ -97,6 +98,34 @@ def test_summary_says_how_the_run_ended(run: Path) -> None:
     assert all(isinstance(text, str) for text in found["versions"].values())
     problem = module.load_run(RunFolder(run))
     assert problem.record.sha256 == found["data_sha256"]
+
+
+def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> None:
+    found = json.loads((run / "summary.json").read_text())
+    chain = ChainFile.read(run / "chain.h5")
+    moves = chain.moves("sampling")
+    assert {"differential evolution", "snooker", "mixture"} == set(moves)
+    sampling = found["sampling"]
+    assert {name: tried for name, (tried, _) in moves.items()} == sampling["proposals"]
+    assert {name: kept / tried for name, (tried, kept) in moves.items()} == sampling["acceptance"]
+    overall = sum(kept for _, kept in moves.values()) / sum(tried for tried, _ in moves.values())
+    assert overall == pytest.approx(found["acceptance"])
+    assert sampling["pareto_k"] < 0.7
+
+
+def test_acceptance_of_each_phase_is_in_the_facts(run: Path) -> None:
+    page = (run / "report.html").read_text()
+    each = r"differential evolution \d+%, snooker \d+%"
+    assert re.search(f"pilot: {each}; tuning: {each}, mixture .*; sampling: {each}, mixture", page)
+
+
+def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
+    said = StringIO()
+    show_result(example.run(), RunFolder(Path("made-up")), Console(file=said, width=200))
+    expected = (
+        "sampling: 120 steps, accepted: differential evolution 12%, mixture 32%; Pareto k 0.31\n"
+    )
+    assert expected in said.getvalue()
 
 
 def test_summary_has_every_free_parameter(run: Path) -> None:
@@ -278,7 +307,7 @@ def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
         progress("sampling", None)
     assert re.search(r" 30 models/s   ETA 0:00   acceptance 0", progress.line("sampling"))
     line = r"sampling +\d+ steps +0 models/s   ETA unknown   acceptance 0\.\d\d   R-hat 1\.\d{3}   "
-    assert re.fullmatch(line + r"ESS \d+ of 200\n", said.getvalue())
+    assert re.fullmatch(line + r"ESS \d+ of 200   Pareto k -?\d\.\d\d\n", said.getvalue())
 
 
 # A larger target

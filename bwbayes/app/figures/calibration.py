@@ -1,0 +1,167 @@
+"""Pictures of a calibration: whether ranks are even, and what intervals and bands cover."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import binom
+
+from bwbayes.app.figures.style import COLOURS, STYLE, axis_label, hide_unused
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.parameters import Parameter
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.calibration import LIMIT, LIMITS, Calibration
+from bwbayes.results.replicates import EXTRA
+
+__all__ = ["draw_calibration"]
+
+RANK_BINS = 20
+COLUMNS = 4
+
+EVEN_COLOUR = "#dddddd"
+NOMINAL_COLOUR = "#777777"
+
+# What is ranked besides parameters.
+EXTRA_LABELS = dict(
+    zip(EXTRA, ("log likelihood", "loop opening (µm)", "displacement range (µm)"), strict=True)
+)
+
+
+def draw_calibration(
+    calibration: Calibration, parameters: Sequence[Parameter]
+) -> dict[str, Figure]:
+    """Draw a calibration's figures, by name: ``rank_histograms``, ``rank_ecdf``, ``coverage``."""
+    known = {parameter.name: axis_label(parameter) for parameter in parameters} | EXTRA_LABELS
+    labels = [known[name] for name in calibration.statistics]
+    with mpl.rc_context(STYLE):
+        return {
+            "rank_histograms": _draw_histograms(calibration, labels),
+            "rank_ecdf": _draw_ecdf(calibration, labels),
+            "coverage": _draw_coverage(calibration, labels),
+        }
+
+
+def _draw_histograms(calibration: Calibration, labels: Sequence[str]) -> Figure:
+    """Draw how the ranks of each statistic are spread, over what is expected.
+
+    The grey band holds each bar of an even statistic with a probability of 99 %.
+    """
+    count = calibration.positions.shape[0]
+    low, high = binom.interval(LIMITS, count, 1 / RANK_BINS)
+    figure, panels = _grid(labels, "rank among the draws (%)", "replicates\n(expected: 1)")
+    for panel, column in zip(panels, calibration.positions.T, strict=True):
+        heights, edges = np.histogram(column, RANK_BINS, range=(0, 1))
+        scale = RANK_BINS / count
+        panel.axhspan(low * scale, high * scale, color=EVEN_COLOUR, lw=0, label="99 % of even bars")
+        panel.axhline(1.0, color=NOMINAL_COLOUR, lw=0.8)
+        panel.stairs(heights * scale, 100 * edges, color=COLOURS[0], lw=1.2, label="replicates")
+    panels[0].set_ylim(bottom=0)
+    _share_legend(figure)
+    return figure
+
+
+def _draw_ecdf(calibration: Calibration, labels: Sequence[str]) -> Figure:
+    """Draw each distribution function of ranks less that of even ones, and its band."""
+    band = calibration.ecdf
+    ecdf = band.ecdf(calibration.positions)
+    figure, panels = _grid(labels, "rank among the draws (%)", "ECDF less\neven ECDF (%)")
+    at = _closed(band.points, 0, 1)
+    lower, upper = (100 * _closed(edge - band.points, 0, 0) for edge in (band.lower, band.upper))
+    for i, (panel, one) in enumerate(zip(panels, calibration.statistics.values(), strict=True)):
+        panel.fill_between(
+            100 * at, lower, upper, color=EVEN_COLOUR, lw=0, label="simultaneous band"
+        )
+        panel.axhline(0.0, color=NOMINAL_COLOUR, lw=0.8)
+        panel.plot(
+            100 * at,
+            100 * _closed(ecdf[:, i] - band.points, 0, 0),
+            color=COLOURS[1] if one.outside else COLOURS[0],
+            label="leaves the band" if one.outside else "replicates",
+        )
+        panel.text(0.97, 0.95, f"p = {one.p:.2g}", transform=panel.transAxes, ha="right", va="top")
+        panel.margins(y=0.2)
+    _share_legend(figure)
+    return figure
+
+
+def _draw_coverage(calibration: Calibration, labels: Sequence[str]) -> Figure:
+    """Draw the coverage of the posteriors' intervals, and of the bands on held-out samples."""
+    width = 11 if calibration.bands else 7.5
+    figure = Figure(figsize=(width, 0.28 * len(labels) + 1.8), layout="constrained")
+    both = figure.subplots(1, 2 if calibration.bands else 1, squeeze=False)[0]
+    _draw_intervals(both[0], calibration, labels)
+    if calibration.bands:
+        _draw_bands(both[1], calibration)
+    return figure
+
+
+def _draw_intervals(panel: Axes, calibration: Calibration, labels: Sequence[str]) -> None:
+    """Draw a row for each statistic, and binomial limits around each level."""
+    rows = np.arange(len(labels))
+    for i, level in enumerate(LEVELS):
+        low, high = calibration.limits[level]
+        panel.axvspan(100 * low, 100 * high, color=COLOURS[i], alpha=0.13, lw=0)
+        panel.axvline(level, color=COLOURS[i], lw=0.8, ls="--")
+        covered = [100 * one.covered[level] for one in calibration.statistics.values()]
+        panel.plot(covered, rows, "o", color=COLOURS[i], ms=4.5, label=f"{level} %")
+    panel.set_yticks(rows, labels)
+    panel.invert_yaxis()
+    panel.set_xlabel("truths inside the interval (%)")
+    panel.set_title("posterior intervals (shaded: 99 % binomial limits)")
+    panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=len(LEVELS))
+
+
+def _draw_bands(panel: Axes, calibration: Calibration) -> None:
+    """Draw how far each band's mean coverage is off, with three standard errors."""
+    for i, kind in enumerate(KINDS):
+        off, error = zip(
+            *(
+                (100 * one.mean - level, 100 * LIMIT * one.error)
+                for level, one in (
+                    (level, calibration.bands[f"{kind} {level}"]) for level in LEVELS
+                )
+            ),
+            strict=True,
+        )
+        place = np.arange(len(LEVELS)) + 0.15 * (i - 1)
+        panel.errorbar(
+            place, off, error, fmt="os^"[i], ms=5, capsize=3, color=COLOURS[i], label=f"{kind} band"
+        )
+    panel.axhline(0.0, color=NOMINAL_COLOUR, lw=0.8, ls="--")
+    panel.set_xticks(range(len(LEVELS)), [f"{level} %" for level in LEVELS])
+    panel.set_xlabel("nominal coverage (%)")
+    panel.set_ylabel("measured less nominal coverage (%)")
+    panel.set_title("bands on held-out samples (whiskers: 3 standard errors)")
+    panel.legend(loc="best")
+
+
+def _grid(labels: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a titled panel for each label."""
+    rows = -(-len(labels) // COLUMNS)
+    figure = Figure(figsize=(11, 1.7 * rows + 0.7), layout="constrained")
+    grid = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False)
+    panels = hide_unused(grid, len(labels), xlabel)
+    for i, (panel, label) in enumerate(zip(panels, labels, strict=True)):
+        panel.tick_params(labelbottom=bool(panel.get_xlabel()))
+        panel.set_title(label)
+        panel.set_xlim(0, 100)
+        if i % COLUMNS == 0:
+            panel.set_ylabel(ylabel)
+    return figure, panels
+
+
+def _closed(values: FloatArray, first: float, last: float) -> FloatArray:
+    return np.concatenate([[first], values, [last]])
+
+
+def _share_legend(figure: Figure) -> None:
+    found: dict[str, Artist] = {}
+    for panel in figure.axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    figure.legend(list(found.values()), list(found), loc="outside upper center", ncols=8)

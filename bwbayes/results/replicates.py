@@ -1,0 +1,329 @@
+"""Replicates: fit records whose truth is known, because it was drawn from the prior.
+
+Draw parameters from the prior, simulate a record with them, fit it as a run does: if prior, model,
+likelihood and sampler are right, the truth is one more draw from the posterior. So its rank among
+as many independent draws is any of the possible ones, each as likely as the next, and a band covers
+as much as it promises (simulation-based calibration). :func:`replicate` is a pure function of an
+experiment, a seed and a number, so it does not matter where, when or in which order replicates are
+made; :mod:`bwbayes.results.calibration` judges many of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypedDict
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
+from bwbayes.results.bands import LEVELS, Bands, Kind
+from bwbayes.results.prediction import predict_windows, thinned
+
+__all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
+
+# Draws that a truth is ranked among.
+RANKED = 199
+
+# What is ranked besides the free parameters.
+EXTRA = ("log_likelihood", "opening", "range")
+
+
+class Entry(TypedDict):
+    """A replicate as it is stored: ranks by statistic, coverage by band ("sensor 95")."""
+
+    number: int
+    converged: bool
+    stop_reason: str
+    steps: int
+    spacing: int
+    truth: dict[str, float]
+    ranks: dict[str, int]
+    covered: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What all replicates have in common.
+
+    Parameters
+    ----------
+    posterior
+        Voltage, training windows, model and prior that are fitted; of its displacement nothing is
+        used.
+    plan
+        How to sample.
+    held_out
+        Windows (slices of the voltage) for which bands are predicted and held against the
+        simulated record.
+    source
+        Where truths and records come from, if not from ``posterior``; its parameters must include
+        those of ``posterior``. A calibration then must fail: it says how an analysis fares on
+        records that it is wrong about.
+
+    Raises
+    ------
+    InputError
+        The training voltage does not go forth and back, so that there is no loop to measure.
+    """
+
+    posterior: Posterior
+    plan: SamplingPlan
+    held_out: Mapping[str, slice] = field(default_factory=dict)
+    source: Posterior | None = None
+
+    def __post_init__(self) -> None:
+        rising, falling = self._crossings
+        if not (rising.size and falling.size):
+            raise InputError(
+                "record: its training voltage does not go forth and back, so there is no loop to "
+                "calibrate; take another signal"
+            )
+
+    @property
+    def truth(self) -> Posterior:
+        """The posterior whose prior and model make truths and records."""
+        return self.source or self.posterior
+
+    @property
+    def statistics(self) -> tuple[str, ...]:
+        """Names of what is ranked."""
+        return (*self.posterior.names, *EXTRA)
+
+    @cached_property
+    def level(self) -> float:
+        """Voltage at which loops are measured, V: zero, or the middle of a drive beside it."""
+        path = self._path
+        low, high = float(np.min(path)), float(np.max(path))
+        return 0.0 if low < 0 < high else (low + high) / 2
+
+    @cached_property
+    def _path(self) -> FloatArray:
+        end = max(window.stop for window in self.posterior.training)
+        path: FloatArray = self.posterior.voltage[:end]
+        return path
+
+    @cached_property
+    def _crossings(self) -> tuple[IntArray, IntArray]:
+        """Samples after which the voltage goes up and down through the level."""
+        above = self._path > self.level
+        return np.flatnonzero(~above[:-1] & above[1:]), np.flatnonzero(above[:-1] & ~above[1:])
+
+    def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
+        """Log likelihood and the two loop measures of models θ, (models, 3).
+
+        The opening (um) is the model's displacement where the voltage falls through
+        :attr:`level` less that where it rises through it, interpolated between samples, each the
+        mean over all passages; the range (um) is its largest less its smallest displacement.
+        """
+        displacement = posterior.simulate(theta)
+        falling, rising = (self._passed(displacement, at) for at in reversed(self._crossings))
+        extent = np.ptp(displacement, axis=1)
+        return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
+
+    def _passed(self, displacement: FloatArray, at: IntArray) -> FloatArray:
+        before, after = self._path[at], self._path[at + 1]
+        part = (self.level - before) / (after - before)
+        passed = displacement[:, at] * (1 - part) + displacement[:, at + 1] * part
+        mean: FloatArray = np.mean(passed, axis=1)
+        return mean
+
+
+@dataclass(frozen=True, eq=False)
+class Replicate:
+    """One record, made and fitted.
+
+    Parameters
+    ----------
+    number
+        Which replicate.
+    converged, stop_reason, steps
+        How the sampling ended, and its steps that count.
+    spacing
+        Steps between two draws of one walker, at least one autocorrelation time. The draws below
+        are a random choice of all that are left.
+    names
+        Names of the statistics.
+    truth
+        (statistics,) their true values.
+    draws
+        (RANKED, statistics) their posterior draws; empty if no posterior could be sampled.
+    covered
+        Part of the held-out samples inside each band, by its kind and level.
+    """
+
+    number: int
+    converged: bool
+    stop_reason: str
+    steps: int
+    spacing: int
+    names: tuple[str, ...]
+    truth: FloatArray
+    draws: FloatArray
+    covered: Mapping[str, float]
+
+    @property
+    def ranks(self) -> IntArray:
+        """How many draws lie below the truth, (statistics,), from 0 to ``RANKED``."""
+        return np.asarray(np.sum(self.draws < self.truth, axis=0), dtype=np.int64)
+
+    def entry(self) -> Entry:
+        """Return what is stored of it."""
+        found = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        return Entry(
+            number=self.number,
+            converged=self.converged,
+            stop_reason=self.stop_reason,
+            steps=self.steps,
+            spacing=self.spacing,
+            truth=dict(zip(self.names, truth, strict=True)),
+            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            covered=dict(self.covered),
+        )
+
+
+def replicates(
+    experiment: Experiment, seed: int, numbers: Iterable[int], executor: Executor
+) -> Iterator[Replicate]:
+    """Make the replicates of those numbers, side by side, and yield them in their order.
+
+    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit.
+    """
+    futures = [executor.submit(replicate, experiment, seed, number) for number in numbers]
+    for future in futures:
+        yield future.result()
+
+
+def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
+    """Draw a truth, simulate its record, fit that, and compare."""
+    generator = np.random.default_rng([seed, number])
+    simulating, fitting, sampling, choosing, predicting = generator.spawn(5)
+    theta, record, model = _simulated(experiment, simulating)
+    assert record.displacement is not None
+    posterior = replace(experiment.posterior, displacement=record.displacement)
+    true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
+    truth = _statistics(experiment, posterior, true)[0]
+    names = experiment.statistics
+    try:
+        outcome, chained = _sampled(posterior, experiment.plan, fitting, sampling)
+    except InputError as error:
+        nothing = np.empty((0, len(names)))
+        return Replicate(number, False, str(error), 0, 0, names, truth, nothing, {})
+    time = float(np.max(outcome.check.autocorrelation))
+    spacing, free = _independent(chained, time, choosing)
+    flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
+    bands = predict_windows(posterior, flat, record, experiment.held_out)
+    return Replicate(
+        number,
+        outcome.converged,
+        outcome.stop_reason,
+        outcome.check.steps,
+        spacing,
+        names,
+        truth,
+        _statistics(experiment, posterior, posterior.prior.theta(free)),
+        _covered(experiment, bands, record, model),
+    )
+
+
+def _simulated(
+    experiment: Experiment, generator: np.random.Generator
+) -> tuple[dict[str, FloatArray], Record, FloatArray]:
+    """Draw a truth; return it by parameter, (1,) each, its record, and its model's displacement."""
+    source = experiment.truth
+    theta = source.prior.theta(source.prior.draw(generator, 1))
+    column = dict(zip(source.prior.names, theta.T, strict=True))
+    model = source.actuator.displacement(
+        theta[:, : len(source.actuator.parameters)], source.voltage
+    )[0]
+    # Training windows have discrepancies of their own: so the likelihood has it.
+    ends = {end for window in source.training for end in (window.start, window.stop)}
+    pieces = np.diff(sorted(ends | {0, source.voltage.size}))
+    interval = source.actuator.interval
+    discrepancy = [_discrepancy(column, int(piece), interval, generator) for piece in pieces]
+    truth = model + np.concatenate(discrepancy)
+    reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
+    return column, Record(source.voltage, reading, interval, truth=truth), model
+
+
+def _discrepancy(
+    theta: Mapping[str, FloatArray], samples: int, interval: float, generator: np.random.Generator
+) -> FloatArray:
+    """Draw a stationary Ornstein-Uhlenbeck process (samples,) in um, if the noise has one."""
+    if "discrepancy_sd" not in theta:
+        return np.zeros(samples)
+    rate = interval / float(theta["discrepancy_time"][0])
+    shocks = float(theta["discrepancy_sd"][0]) * generator.standard_normal(samples)
+    shocks[1:] *= math.sqrt(-math.expm1(-2 * rate))
+    return np.asarray(lfilter([1.0], [1.0, -math.exp(-rate)], shocks), dtype=np.float64)
+
+
+def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
+    """Free parameters and measures of models θ, (models, statistics)."""
+    free = [posterior.prior.names.index(name) for name in posterior.names]
+    return np.concatenate([theta[:, free], experiment.measures(posterior, theta)], axis=1)
+
+
+def _sampled(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    fitting: np.random.Generator,
+    sampling: np.random.Generator,
+) -> tuple[Outcome, FloatArray]:
+    """Fit and sample by the path of a run; the draws are (steps, ensembles, walkers, free)."""
+    point = pointfit.fit(posterior, fitting)
+    chain = first_chain(posterior, point, plan, sampling)
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(posterior, plan, chain, executor)
+    return outcome, draws(posterior, chain)
+
+
+def _independent(
+    chained: FloatArray, time: float, generator: np.random.Generator
+) -> tuple[int, FloatArray]:
+    """Choose ``RANKED`` draws that are as good as independent: spacing in steps, (RANKED, free).
+
+    Every walker keeps one step in as many as the longest autocorrelation time has; of what is left
+    of all walkers some are chosen at random. As two draws of a chain are correlated by 1/ESS on
+    average, that much of the ranks' evenness is lost, and no more.
+    """
+    steps, ensembles, walkers, free = chained.shape
+    # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
+    wanted = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    left = chained[::-spacing].reshape(-1, free)
+    return spacing, thinned(left, generator, RANKED)
+
+
+def _covered(
+    experiment: Experiment, every: list[Bands], record: Record, model: FloatArray
+) -> dict[str, float]:
+    """Part of the held-out samples that lie inside each band, by "kind level".
+
+    The parameter band is for the model's displacement, the displacement band for the simulated
+    truth, which has the discrepancy, and the sensor band for the readings.
+    """
+    target: dict[Kind, FloatArray | None]
+    target = {"parameter": model, "displacement": record.truth, "sensor": record.displacement}
+    held_out = list(zip(experiment.held_out.values(), every, strict=True))
+    covered = {}
+    for kind, values in target.items():
+        assert values is not None
+        for level in LEVELS if held_out else ():
+            edges = [(bands.lower[kind, level], bands.upper[kind, level]) for _, bands in held_out]
+            inside = [
+                (low <= values[window]) & (values[window] <= high)
+                for (window, _), (low, high) in zip(held_out, edges, strict=True)
+            ]
+            covered[f"{kind} {level}"] = float(np.mean(np.concatenate(inside)))
+    return covered

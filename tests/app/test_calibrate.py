@@ -1,0 +1,305 @@
+"""The calibrate command: what it leaves, how it goes on, and the status it ends with."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import time
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bwbayes.app import calibrate as module
+from bwbayes.app.calibrate import carry_on, start
+from bwbayes.app.cli import cli
+from bwbayes.app.config import parse
+from bwbayes.app.folder import CalibrationFolder, RunFolder
+from bwbayes.app.progress import ReplicateProgress
+from bwbayes.errors import InputError
+from tests.app import small
+
+# Three free parameters: a replicate takes a fraction of a second.
+TEXT = """\
+seed = 3
+name = "<b>small</b>"
+
+[record]
+signal = { amplitude = 100.0, frequency = 1.0, duration = 2.0, decay = 0.2 }
+train = [[0.0, 1.5]]
+
+[stand]
+sample_rate = 40.0
+
+[model]
+dynamics = "none"
+noise = "white"
+
+[parameters]
+initial = { fixed = 0.0 }
+offset = { fixed = 0.0 }
+beta = { fixed = 0.0272 }
+gamma = { fixed = 0.0172 }
+d = { prior = { distribution = "normal", mean = 0.7, sd = 0.05 } }
+alpha = { prior = { distribution = "normal", mean = 0.3, sd = 0.05 } }
+sensor_sd = { prior = { distribution = "lognormal", median = 0.5, sigma = 0.3 } }
+
+[sampling]
+engine = "numpy"
+ess = 100
+walkers = 12
+block = 10
+pilot_steps = 30
+
+[validation.end]
+window = [1.5, 2.0]
+"""
+
+FILES = ("calibration.json", "calibration.html", "replicates.jsonl", "config.toml")
+
+
+def begun(path: Path, count: int = 3, text: str = TEXT) -> CalibrationFolder:
+    return start(parse(text, "small.toml"), path.parent, path, count)
+
+
+def said(*arguments: str | Path, where: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command as a person does."""
+    return subprocess.run(
+        small.command("calibrate", *arguments),
+        cwd=where,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def assert_same_end(expected: Path, got: Path) -> None:
+    pictures = sorted(f"figures/{path.name}" for path in expected.glob("figures/*"))
+    assert [f"figures/{name}.png" for name in ("coverage", "rank_ecdf", "rank_histograms")] == (
+        pictures
+    )
+    for name in (*FILES, *pictures):
+        assert (expected / name).read_bytes() == (got / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a calibration of three replicates, made in one piece by one worker; for reading."""
+    path = tmp_path_factory.mktemp("whole") / "a"
+    assert carry_on(begun(path), small.quiet(), workers=1).passed
+    return path
+
+
+def cut(whole: Path, path: Path, size: int) -> CalibrationFolder:
+    """Return a copy of a calibration that ended after so many bytes of replicates."""
+    shutil.copytree(whole, path)
+    shutil.rmtree(path / "figures")
+    for name in ("calibration.json", "calibration.html"):
+        (path / name).unlink()
+    (path / "replicates.jsonl").write_bytes((whole / "replicates.jsonl").read_bytes()[:size])
+    return CalibrationFolder.open(path)
+
+
+def line_ends(whole: Path) -> list[int]:
+    content = (whole / "replicates.jsonl").read_bytes()
+    return [found.end() for found in re.finditer(b"\n", content)]
+
+
+def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: Path) -> None:
+    """The installed command with two workers ends in the same bytes as one worker in a process."""
+    (tmp_path / "small.toml").write_text(TEXT)
+    done = said("small.toml", "--replicates", "3", "--workers", "2", where=tmp_path)
+    assert 0 == done.returncode, done.stderr
+    for text in ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not"):
+        assert text in done.stdout
+    assert "judging" in done.stderr
+    assert_same_end(whole, tmp_path / "results/small-calibration")
+
+
+def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
+    found = json.loads((whole / "calibration.json").read_text())
+    assert (True, 3, [], 12) == tuple(
+        found[key] for key in ("passed", "replicates", "unconverged", "tests")
+    )
+    assert 3 == found["seed"]
+    assert {"20 % too small", "10 % too small"} == set(found["power_of_one_smooth_test"])
+    first, *lines = (whole / "replicates.jsonl").read_text().splitlines()
+    assert {"replicates": 3} == json.loads(first)
+    assert [0, 1, 2] == [json.loads(line)["number"] for line in lines]
+
+
+def test_prior_is_resolved_once(whole: Path) -> None:
+    """The folder's config has every prior in numbers, though the record is simulated."""
+    text = (whole / "config.toml").read_text()
+    assert "signal" not in text
+    assert 'file = "records/record.h5"' in text
+    assert "median = 0.5" in text
+
+
+def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
+    page = (whole / "calibration.html").read_text(encoding="utf-8")
+    assert "<b>small</b>" not in page
+    assert "&lt;b&gt;small&lt;/b&gt;" in page
+    assert "Passed" in page
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
+    assert 3 == page.count("data:image/png;base64,")
+    for text in ("12 tests", "1%", "20 % too small", "Binomial limits".lower(), "±"):
+        assert text in page
+
+
+def test_interrupted_it_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path) -> None:
+    """Whole lines are kept, and half a line is made again."""
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[1] + 70)
+    carry_on(folder, small.quiet(), workers=1)
+    assert_same_end(whole, folder.path)
+
+
+def test_replicates_that_are_there_are_not_made_again(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
+    monkeypatch.setattr(module, "_made", None)
+    carry_on(folder, small.quiet())
+    assert_same_end(whole, folder.path)
+
+
+def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
+    folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's": 3', b's": 2'))
+    assert 3 == carry_on(folder, small.quiet(), workers=1, count=3).replicates
+    lines = [line for line in folder.replicates.read_bytes().splitlines() if b"number" in line]
+    assert (whole / "replicates.jsonl").read_bytes().splitlines()[1:] == lines
+    assert b'{"replicates": 3}' in folder.replicates.read_bytes().splitlines()
+
+
+def test_request_to_stop_is_answered_with_how_to_go_on(whole: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(TEXT)
+    command = small.command(
+        "calibrate", "small.toml", "--replicates", "3", "--out", "a", "--quiet", "--workers", "1"
+    )
+    lines = tmp_path / "a/replicates.jsonl"
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    end = time.monotonic() + 120
+    while not (lines.exists() and lines.read_bytes().count(b"\n") > 1):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=120)
+    assert (130, "") == (process.returncode, out)
+    assert "interrupted; go on with `bwbayes calibrate --resume a`\n" == err
+    assert not (tmp_path / "a/calibration.json").exists()
+    done = said("--resume", "a", "--quiet", "--workers", "1", where=tmp_path)
+    assert (0, "", "") == (done.returncode, done.stdout, done.stderr)
+    assert_same_end(whole, tmp_path / "a")
+
+
+def test_unconverged_replicates_are_counted_and_end_with_status_four(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "short.toml").write_text(TEXT.replace("block = 10", "block = 10\nsteps = 10"))
+    arguments = [str(tmp_path / "short.toml"), "--replicates", "2", "--out", str(tmp_path / "a")]
+    status = cli.main(["calibrate", *arguments, "--workers", "1"], standalone_mode=False)
+    assert 4 == status
+    printed = capsys.readouterr()
+    expected = "NOT PASSED: 2 of 2 replicates did not converge, more than 1%; see "
+    assert expected in printed.err
+    assert "2 replicates, 2 not converged" in printed.out
+    found = json.loads((tmp_path / "a/calibration.json").read_text())
+    assert (False, [0, 1]) == (found["passed"], found["unconverged"])
+    page = (tmp_path / "a/calibration.html").read_text(encoding="utf-8")
+    assert "NOT PASSED" in page
+    assert "replicates 0, 1" in page
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ((), "give either a CONFIG or --resume"),
+        (("small.toml", "--resume", "a"), "give either a CONFIG or --resume"),
+        (("--resume", "none"), "none: no calibration here; start one with"),
+        (("--resume", "a", "--seed", "1"), "goes on as begun"),
+        (("small.toml", "--replicates", "0"), "0 is not in the range x>=1"),
+        (("none.toml",), "none.toml: No such file"),
+        (("small.toml", "--out", "a"), "a: exists; go on with `bwbayes calibrate --resume a`"),
+        (("small.toml", "--out", "b", "--overwrite"), "b: is not a calibration's folder"),
+    ],
+)
+def test_wrong_command_line_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], part: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.toml").write_text(TEXT)
+    begun(tmp_path / "a")
+    small.begun(tmp_path / "b")
+    with pytest.raises(Exception, match=re.escape(part)):
+        cli.main(["calibrate", *arguments], standalone_mode=False)
+
+
+def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
+    begun(tmp_path / "a")
+    small.begun(tmp_path / "b")
+    with pytest.raises(InputError, match="no run here"):
+        RunFolder.open(tmp_path / "a")
+    with pytest.raises(InputError, match="no calibration here"):
+        CalibrationFolder.open(tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    ("damage", "part"),
+    [
+        (b'{"replicates": 3}\nnonsense\n', ":2: is no replicate"),
+        (b'{"replicates": 3}\n{"number": 0}\n', ":2: is no replicate"),
+        (b'{"replicates": 3}\n[1]\n', ":2: is no replicate"),
+        (b'{"replicates": "x"}\n', ":1: is no replicate"),
+        (b"", "does not say how many"),
+        (b'{"replic', "does not say how many"),
+    ],
+)
+def test_damaged_lines_are_refused(tmp_path: Path, damage: bytes, part: str) -> None:
+    folder = begun(tmp_path / "a")
+    folder.replicates.write_bytes(damage)
+    with pytest.raises(InputError, match=part):
+        carry_on(folder, small.quiet())
+
+
+def test_replicate_out_of_order_is_refused(whole: Path, tmp_path: Path) -> None:
+    folder = begun(tmp_path / "a")
+    first, _, second, *_ = (whole / "replicates.jsonl").read_bytes().splitlines(keepends=True)
+    folder.replicates.write_bytes(first + second)
+    with pytest.raises(InputError, match=":2: is no replicate"):
+        carry_on(folder, small.quiet())
+
+
+def test_voltage_without_a_loop_leaves_nothing(tmp_path: Path) -> None:
+    ramp = TEXT.replace("train = [[0.0, 1.5]]", "train = [[0.0, 0.2]]")
+    with pytest.raises(InputError, match="does not go forth and back"):
+        begun(tmp_path / "a", text=ramp)
+    assert [] == list(tmp_path.iterdir())
+
+
+# Progress
+
+
+def test_progress_tells_rate_and_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    console = Console(record=True, width=200, file=StringIO())
+    with ReplicateProgress(console, 10, 30) as progress:
+        now[0] += 30
+        progress(converged=True)
+        now[0] += 30
+        progress(converged=False)
+    assert [
+        "replicate 11 of 30   2.0 a minute   ETA 9:30   not converged 0",
+        "replicate 12 of 30   2.0 a minute   ETA 9:00   not converged 1",
+    ] == console.export_text().splitlines()

@@ -1,0 +1,180 @@
+"""Replicates: records come from the model that is fitted, and statistics are what they say."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.errors import InputError
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.sampling import SamplingPlan
+from bwbayes.model.actuator import Actuator
+from bwbayes.results import replicates as module
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
+from tests.inference.problems import decaying_sine, posterior_of, short_posterior
+
+# Three free parameters, so that a replicate takes a fraction of a second.
+FIXED = {"initial": 0.0, "offset": 0.0, "beta": 0.0272, "gamma": 0.0172}
+PRIORS = {
+    "d": Distribution("normal", {"mean": 0.7, "sd": 0.05}),
+    "alpha": Distribution("normal", {"mean": 0.3, "sd": 0.05}),
+    "sensor_sd": Distribution("lognormal", {"median": 0.5, "sigma": 0.3}),
+}
+PLAN = SamplingPlan(ess=100, walkers=12, block=10, most_pilot_steps=30, most_steps=2_000)
+
+
+def small(**changes: object) -> Experiment:
+    """Return an experiment of 80 samples, of which 20 are held out."""
+    posterior = short_posterior("white", 80, fixed=FIXED, priors=PRIORS, training=(slice(0, 60),))
+    return replace(Experiment(posterior, PLAN, {"end": slice(60, 80)}), **changes)  # type: ignore[arg-type]
+
+
+def test_replicate_depends_on_seed_and_number_alone() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        both = [made.entry() for made in replicates(small(), 1, [0, 1], executor)]
+    assert both[1] == replicate(small(), 1, 1).entry()
+    assert both[1]["truth"] != both[0]["truth"]
+    assert both[1]["truth"] != replicate(small(), 2, 1).entry()["truth"]
+
+
+def test_entry_is_plain_and_complete() -> None:
+    made = replicate(small(), 1, 3)
+    entry = made.entry()
+    assert entry == json.loads(json.dumps(entry))
+    names = ["d", "alpha", "sensor_sd", "log_likelihood", "opening", "range"]
+    assert names == list(entry["ranks"]) == list(entry["truth"])
+    assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
+    assert (3, True) == (entry["number"], entry["converged"])
+    assert (RANKED, len(names)) == made.draws.shape
+    for name, truth, draws in zip(names, made.truth, made.draws.T, strict=True):
+        assert sum(draw < truth for draw in draws) == entry["ranks"][name]
+
+
+def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise InputError("priors: no draw has a finite posterior density")
+
+    monkeypatch.setattr("bwbayes.inference.pointfit.fit", refuse)
+    entry = replicate(small(), 1, 0).entry()
+    assert (False, {}, {}) == (entry["converged"], entry["ranks"], entry["covered"])
+    assert "finite posterior density" in entry["stop_reason"]
+    assert 6 == len(entry["truth"])
+
+
+def test_replicate_out_of_budget_is_ranked_and_not_converged() -> None:
+    entry = replicate(small(plan=replace(PLAN, most_steps=10)), 1, 0).entry()
+    assert (False, 10) == (entry["converged"], entry["steps"])
+    assert 6 == len(entry["ranks"])
+
+
+def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
+    steps, time = 300, 20.0
+    kept = np.exp(-1 / (time / 2))
+    generator = np.random.default_rng(1)
+    chain = generator.standard_normal((steps, 4, 12, 1))
+    for step in range(1, steps):
+        chain[step] = kept * chain[step - 1] + np.sqrt(1 - kept**2) * chain[step]
+    spacing, chosen = module._independent(chain, time, np.random.default_rng(2))
+    assert (20, (RANKED, 1)) == (spacing, chosen.shape)
+    assert RANKED == np.unique(chosen).size
+    assert np.isin(chosen, chain[::-20]).all()
+
+
+@pytest.mark.parametrize("time", [np.nan, 1e9])
+def test_short_or_stuck_chain_still_gives_enough_draws(time: float) -> None:
+    chain = np.random.default_rng(1).standard_normal((10, 4, 12, 2))
+    _, chosen = module._independent(chain, time, np.random.default_rng(2))
+    assert (RANKED, 2) == chosen.shape
+
+
+# Simulated records
+
+
+def test_discrepancy_is_the_process_that_the_likelihood_has() -> None:
+    """Its covariance is σ² exp(−|t − t'|/τ); 4,000 draws know it to some 3 %."""
+    theta = {"discrepancy_sd": np.array([1.5]), "discrepancy_time": np.array([0.05])}
+    generator = np.random.default_rng(1)
+    drawn = np.stack([module._discrepancy(theta, 12, 0.01, generator) for _ in range(4_000)])
+    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) * 0.01
+    expected = 1.5**2 * np.exp(-lag / 0.05)
+    # sd of a covariance of n draws: sqrt((c_ii c_jj + c_ij²) / n)
+    error = np.sqrt((1.5**4 + expected**2) / 4_000)
+    assert np.max(np.abs(drawn.T @ drawn / 4_000 - expected) / error) < 5
+
+
+def test_white_noise_has_no_discrepancy() -> None:
+    drawn = module._discrepancy({}, 5, 0.01, np.random.default_rng(1))
+    np.testing.assert_array_equal(np.zeros(5), drawn)
+
+
+def test_training_windows_have_discrepancies_of_their_own() -> None:
+    """As the likelihood takes them: over 200 records, ends of windows are uncorrelated."""
+    windows = (slice(0, 30), slice(30, 60))
+    posterior = short_posterior("discrepancy", 80, fixed=FIXED, training=windows)
+    experiment = Experiment(posterior, PLAN)
+    away = []
+    for seed in range(200):
+        theta, record, model = module._simulated(experiment, np.random.default_rng(seed))
+        assert record.truth is not None
+        away.append((record.truth - model) / theta["discrepancy_sd"])
+    last_but_one, last, first = np.array(away)[:, 28:31].T
+    assert np.corrcoef(last_but_one, last)[0, 1] > 0.9
+    assert abs(np.corrcoef(last, first)[0, 1]) < 4 / np.sqrt(200)
+
+
+def test_reading_is_truth_and_sensor_noise() -> None:
+    theta, record, _ = module._simulated(small(), np.random.default_rng(1))
+    assert record.displacement is not None
+    assert record.truth is not None
+    noise = (record.displacement - record.truth) / theta["sensor_sd"]
+    assert abs(np.std(noise) - 1) < 4 / np.sqrt(2 * noise.size)
+    assert abs(np.mean(noise)) < 4 / np.sqrt(noise.size)
+
+
+# Loop measures
+
+
+def test_loop_of_a_lag_is_known_in_closed_form() -> None:
+    """Without hysteresis a sine V sin ωt comes out as d V/√(1 + (ωτ)²) sin(ωt − φ), tan φ = ωτ.
+
+    So the loop opens by 2 d V ωτ/(1 + (ωτ)²) at zero and ranges over 2 d V/√(1 + (ωτ)²).
+    """
+    samples, interval, lag, d = 4_000, 1e-3, 0.02, 0.7
+    time = interval * np.arange(samples)
+    # From the crest, where it is at rest: the sine has settled by the first passage.
+    voltage = 100 * np.cos(2 * np.pi * time)
+    posterior = posterior_of(voltage, voltage, Actuator("lag", "first", interval), "white")
+    experiment = Experiment(posterior, PLAN)
+    known = {"d": d, "alpha": 1e-9, "beta": 0.02, "exponent": 1.0, "lag": lag, "sensor_sd": 1.0}
+    theta = np.array([[known.get(name, 0.0) for name in posterior.prior.names]])
+    _, opening, extent = experiment.measures(posterior, theta)[0]
+    turn = 2 * np.pi * lag
+    np.testing.assert_allclose(2 * d * 100 * turn / (1 + turn**2), opening, rtol=1e-3)
+    # The crest that it starts from is the range's upper end.
+    np.testing.assert_allclose(d * 100 * (1 + 1 / np.sqrt(1 + turn**2)), extent, rtol=1e-3)
+
+
+def test_first_measure_is_the_log_likelihood() -> None:
+    posterior = small().posterior
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 3))
+    found = small().measures(posterior, theta)
+    np.testing.assert_array_equal(posterior.log_likelihood(theta), found[:, 0])
+
+
+@pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])
+def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None) -> None:
+    voltage = decaying_sine(80) + shift
+    posterior = replace(small().posterior, voltage=voltage)
+    expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
+    assert expected == Experiment(posterior, PLAN).level
+
+
+def test_voltage_without_a_loop_is_refused() -> None:
+    posterior = replace(small().posterior, voltage=np.linspace(0.0, 100.0, 80))
+    with pytest.raises(InputError, match="does not go forth and back"):
+        Experiment(posterior, PLAN)

@@ -1,0 +1,261 @@
+"""The package's posteriors are calibrated, and a calibration notices when they are not.
+
+Forty replicates of ``runs/calibration.toml`` are made once: each draws nine parameters from the
+prior, simulates a record and fits it as a run does. The calibration itself must pass; a small one
+like this has a false alarm once in 100 times, and hardly any power against widths. A sharper test
+looks at all parameters of a replicate together: ranks of its whitened coordinates are nearly
+independent, so that forty replicates tell as much as 360 of one parameter. Its level is 0.01, with
+errors taken from the spread between replicates; sds a fifth too small it finds 98 times in 100, a
+bias of 0.3 sd nearly always.
+
+Both are planted on the stored draws, as twins. The other defects are planted in the likelihood or
+the prior, with as few replicates as show them, and fewer free parameters, because these defects
+are large: the twins without a defect are the forty replicates.
+
+Bands are held to three standard errors from the spread between the replicates. One of the nine
+comparisons, which depend on each other, is off by chance in at most one calibration of 24. The
+white noise model, fitted to records of the same kind, fails by far.
+
+``-m slow`` makes 500 replicates, with nearly full power for each parameter by itself.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from bwbayes.app.calibrate import experiment
+from bwbayes.app.config import load, parse
+from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.workers import executor, one_thread
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.noise import DiscrepancyNoise, SteadyState, WhiteNoise
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.calibration import LIMIT, Calibration, judge
+from bwbayes.results.replicates import Experiment, Replicate, replicates
+
+CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
+SEED = 1
+REPLICATES = 40
+FEW = 10
+LEVEL = 0.01
+
+EVERY_SAMPLE = slice(None)
+
+
+def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
+    """Return the config's problem; parameters are fixed at, or given, something else."""
+    config = load(CONFIG)
+    medians = {"d": 0.7, "alpha": 0.35, "beta": 0.03, "gamma": 0.0, "lag": 0.03, "offset": 0.0}
+    lines = [f"{name} = {{ fixed = {medians[name]} }}" for name in fixed]
+    lines += [f"{name} = {{ prior = {text} }}" for name, text in priors.items()]
+    changed = parse("[record]\nfile = 'x'\n[parameters]\n" + "\n".join(lines), "changes")
+    parameters = config.parameters | changed.parameters
+    return resolve(config.model_copy(update={"parameters": parameters}), CONFIG.parent)
+
+
+def made(common: Experiment, count: int, seed: int = SEED) -> list[Replicate]:
+    with one_thread(), ThreadPoolExecutor(1) as pool:
+        return list(replicates(common, seed, range(count), pool))
+
+
+def judged(found: list[Replicate]) -> Calibration:
+    return judge([one.entry() for one in found], np.random.default_rng(SEED))
+
+
+# The sound calibration, and defects that are planted on its draws
+
+
+@pytest.fixture(scope="module")
+def sound() -> list[Replicate]:
+    return made(experiment(problem()), REPLICATES)
+
+
+@pytest.fixture(scope="module")
+def prior() -> JointPrior:
+    return problem().posterior.prior
+
+
+Plant = Callable[[FloatArray], FloatArray]
+
+
+def nothing(draws: FloatArray) -> FloatArray:
+    return draws
+
+
+def narrowed(draws: FloatArray) -> FloatArray:
+    """Make the sds of draws (draws, free) a fifth smaller."""
+    middle = np.mean(draws, axis=0)
+    return middle + 0.8 * (draws - middle)
+
+
+def widened(draws: FloatArray) -> FloatArray:
+    """Make the sds a quarter larger."""
+    middle = np.mean(draws, axis=0)
+    return middle + 1.25 * (draws - middle)
+
+
+def shifted(draws: FloatArray) -> FloatArray:
+    """Put a bias of 0.3 sd on every coordinate."""
+    return draws + 0.3 * np.std(draws, axis=0)
+
+
+def whitened_positions(found: Replicate, prior: JointPrior, plant: Plant) -> FloatArray:
+    """Where the truth lies among the draws, along each whitened coordinate: (free,) in (0, 1).
+
+    The axes are those of the covariance of truth and draws together, by its symmetric root, so
+    that they do not tell one from the other, and a bias of one sign keeps it.
+    """
+    free = prior.dimensions
+    draws = plant(prior.unconstrain(found.draws[:, :free]))
+    both = np.concatenate([prior.unconstrain(found.truth[np.newaxis, :free]), draws])
+    both = (both - np.mean(both, axis=0)) / np.std(both, axis=0)
+    variances, axes = linalg.eigh(np.atleast_2d(np.corrcoef(both.T)))
+    white = both @ (axes / np.sqrt(variances)) @ axes.T
+    jitter = np.random.default_rng([SEED, found.number]).uniform(size=free)
+    positions: FloatArray = (np.sum(white[1:] < white[0], axis=0) + jitter) / len(both)
+    return positions
+
+
+def together_test(found: list[Replicate], prior: JointPrior, plant: Plant = nothing) -> float:
+    """P-value of the smooth test of all parameters together.
+
+    A replicate gives the means of b₁ and b₂ over its whitened coordinates; Hotelling's test asks
+    whether both means over replicates are zero, with the covariance that replicates show.
+    """
+    u = np.stack([whitened_positions(one, prior, plant) for one in found])
+    b = np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u**2 - 6 * u + 1)], axis=-1)
+    each = np.mean(b, axis=1)
+    count = len(found)
+    mean = np.mean(each, axis=0)
+    squared = count * mean @ linalg.solve(np.cov(each.T), mean)
+    return float(stats.f.sf(squared * (count - 2) / (2 * (count - 1)), 2, count - 2))
+
+
+def test_calibration_passes(sound: list[Replicate]) -> None:
+    found = judged(sound)
+    assert () == found.shortcomings
+    assert () == found.unconverged
+    assert REPLICATES == found.replicates
+
+
+def test_parameters_together_are_calibrated(sound: list[Replicate], prior: JointPrior) -> None:
+    assert together_test(sound, prior) > LEVEL
+
+
+@pytest.mark.parametrize("defect", [narrowed, widened, shifted])
+def test_twin_planted_defect_is_found(
+    sound: list[Replicate], prior: JointPrior, defect: Plant
+) -> None:
+    assert together_test(sound, prior, defect) < LEVEL
+
+
+def test_bands_cover_held_out_samples_with_parameters_from_the_prior(
+    sound: list[Replicate],
+) -> None:
+    assert {} == {name: off for name, off in errors_off(sound) if not abs(off) < LIMIT}
+
+
+def errors_off(found: list[Replicate]) -> Iterator[tuple[str, float]]:
+    """Yield how far each band's mean coverage is off, in standard errors between replicates."""
+    for name in (f"{kind} {level}" for kind in KINDS for level in LEVELS):
+        covered = np.array([one.covered[name] for one in found])
+        error = np.std(covered, ddof=1) / np.sqrt(covered.size)
+        yield name, float((np.mean(covered) - int(name.split()[1]) / 100) / error)
+
+
+# Defects that are planted in the likelihood or the prior
+
+
+def test_white_noise_model_fails_the_bands() -> None:
+    """It takes the discrepancy of the same records for sensor noise."""
+    common = experiment(problem(fixed=("lag", "beta")))
+    right = common.posterior
+    names = (*right.actuator.parameters, "sensor_sd")
+    white = replace(
+        right,
+        noise=WhiteNoise(),
+        prior=JointPrior(p for p in right.prior.parameters if p.name in names),
+    )
+    found = made(replace(common, posterior=white, source=right), FEW)
+    off = dict(errors_off(found))
+    for kind in ("parameter", "displacement"):
+        assert off[f"{kind} 95"] < -LIMIT
+    assert not judged(found).passed
+
+
+@dataclass(frozen=True)
+class WrongCorrelation(DiscrepancyNoise):
+    """Noise whose correlation decays three times as fast as its correlation time says."""
+
+    def steady_state(self, theta: FloatArray) -> SteadyState:
+        """Return the filter of a third of the correlation time."""
+        return super().steady_state(theta * [1, 1, 1 / 3])
+
+
+@dataclass(frozen=True)
+class Swapped(Posterior):
+    """A posterior whose model has the sign of γ, against β, the wrong way round."""
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log likelihood of the model with the wrong sign."""
+        return super().log_likelihood(self._swapped(theta))
+
+    def simulate(self, theta: FloatArray, rows: IntArray | slice = EVERY_SAMPLE) -> FloatArray:
+        """Displacement of the model with the wrong sign."""
+        return super().simulate(self._swapped(theta), rows)
+
+    def _swapped(self, theta: FloatArray) -> FloatArray:
+        signs = np.ones(theta.shape[1])
+        signs[self.prior.names.index("gamma")] = -1
+        swapped: FloatArray = theta * signs
+        return swapped
+
+
+def wrong_correlation() -> Experiment:
+    common = experiment(problem(fixed=("alpha", "beta", "gamma", "lag")))
+    right = common.posterior
+    wrong = replace(right, noise=WrongCorrelation(right.actuator.interval))
+    return replace(common, posterior=wrong, source=right)
+
+
+def swapped_sign() -> Experiment:
+    common = experiment(problem(fixed=("d", "lag", "offset")))
+    right = common.posterior
+    parts = {name: getattr(right, name) for name in right.__dataclass_fields__}
+    return replace(common, posterior=Swapped(**parts), source=right)
+
+
+def forgotten_prior() -> Experiment:
+    """Simulate with the config's correlation time, and fit with a prior of ten times that."""
+    fixed = ("alpha", "beta", "gamma", "lag")
+    wide = '{ distribution = "lognormal", median = 3.0, sigma = 1.0 }'
+    common = experiment(problem(fixed=fixed))
+    forgetful = experiment(problem(fixed=fixed, discrepancy_time=wide))
+    return replace(forgetful, source=common.posterior)
+
+
+@pytest.mark.parametrize("defect", [wrong_correlation, swapped_sign, forgotten_prior])
+def test_defect_of_likelihood_or_prior_is_found(defect: Callable[[], Experiment]) -> None:
+    found = judged(made(replace(defect(), held_out={}), FEW))
+    assert not found.passed
+    assert any("ranks" in text for text in found.shortcomings), found.shortcomings
+
+
+@pytest.mark.slow
+def test_five_hundred_replicates_are_calibrated() -> None:
+    with executor(os.cpu_count()) as pool, one_thread():
+        found = list(replicates(experiment(problem()), SEED + 1, range(500), pool))
+    result = judged(found)
+    assert () == result.shortcomings
+    assert result.power["20 % too small"] > 0.98
+    assert together_test(found, problem().posterior.prior) > LEVEL
