@@ -52,7 +52,7 @@ TUNING_BLOCKS = 2
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing.
-FIRST_CHECK = 2
+FIRST_CHECK = 4
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 

@@ -173,7 +173,7 @@ def spoilt_values(good: bytes, generator: Generator) -> bytes:
         at = _somewhere(table, generator)
         old = chosen(generator, [*at]) if at else "a"
         match int(generator.integers(0, 8)):
-            case 6 | 7 if isinstance(at.get(old), int | float):
+            case 6 | 7 if isinstance(at.get(old), int | float) and abs(at[old]) < 1e300:
                 at[old] *= chosen(generator, (0.5, 2.0, 3, -1, 1e3, 1e-3, 1 + 1e-9))
             case 0:
                 at.pop(old, None)

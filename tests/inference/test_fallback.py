@@ -16,7 +16,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.chain import Chain
 from bwbayes.inference.proposals import COMPONENTS, StudentMixture, StudentProposal
-from bwbayes.inference.sampling import Outcome, draws, sample
+from bwbayes.inference.sampling import FIRST_CHECK, Outcome, draws, sample
 from tests.inference.samplings import (
     LONG,
     PLAN,
@@ -49,19 +49,21 @@ def test_a_proposal_that_does_not_cover_its_draws_is_given_up(
 ) -> None:
     """At the first check; what it drew does not count, and what counts it did not draw."""
     chain, outcome = fallen_back
-    assert 2 == chain.set_aside
+    assert FIRST_CHECK == chain.set_aside
     assert chain.proposals["sampling"] is not None
     assert chain.proposal_in_use("sampling") is None
     assert {"differential evolution", "snooker"} == set(chain.moves("sampling"))
-    assert len(chain.history("sampling")) == chain.blocks("sampling") + 2
+    assert len(chain.history("sampling")) == chain.blocks("sampling") + FIRST_CHECK
     assert chain.steps("sampling") == len(chain.log_density("sampling")) == outcome.check.steps
-    first = chain.history("sampling")[2][0].coordinates
+    first = chain.history("sampling")[FIRST_CHECK][0].coordinates
     np.testing.assert_array_equal(first, chain.coordinates("sampling")[: PLAN.block, 0])
 
 
 def test_a_proposal_that_was_given_up_is_told_of(fallen_back: tuple[Chain, Outcome]) -> None:
     (remark,) = fallen_back[1].remarks
-    found = re.match(r"the proposal did not cover its first 40 steps \(Pareto k (0\.\d\d) ", remark)
+    steps = FIRST_CHECK * PLAN.block
+    told = rf"the proposal did not cover its first {steps} steps \(Pareto k (0\.\d\d) "
+    found = re.match(told, remark)
     assert found
     assert float(found[1]) > 0.7
     assert "differential evolution and snooker moves alone" in remark
@@ -79,7 +81,7 @@ def test_without_the_proposal_the_draws_are_the_posteriors(
     assert (np.abs(np.var(found, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
 
 
-@pytest.mark.parametrize("blocks", [1, 2, 3])
+@pytest.mark.parametrize("blocks", [1, FIRST_CHECK, FIRST_CHECK + 1])
 def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
     fallen_back: tuple[Chain, Outcome], monkeypatch: pytest.MonkeyPatch, blocks: int
 ) -> None:
@@ -90,10 +92,10 @@ def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
     chain = new_chain(LONG)
     with pytest.raises(InterruptedRunError):
         sample(POSTERIOR, LONG, chain, PluggedExecutor(PLAN.ensembles * (before + blocks)))
-    assert (2 if blocks >= 2 else 0) == chain.set_aside
+    assert (FIRST_CHECK if blocks >= FIRST_CHECK else 0) == chain.set_aside
     with ThreadPoolExecutor(1) as executor:
         again = sample(POSTERIOR, LONG, chain, executor)
-    assert 2 == chain.set_aside
+    assert FIRST_CHECK == chain.set_aside
     assert_same_chain(expected, chain)
     assert_same_outcome(outcome, again)
 

@@ -19,7 +19,14 @@ from bwbayes.inference.diagnostics import pareto_k
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentMixture
-from bwbayes.inference.sampling import TUNING_BLOCKS, Outcome, draws, first_chain, sample
+from bwbayes.inference.sampling import (
+    FIRST_CHECK,
+    TUNING_BLOCKS,
+    Outcome,
+    draws,
+    first_chain,
+    sample,
+)
 from tests.inference.problems import short_posterior, target
 from tests.inference.samplings import (
     LONG,
@@ -207,7 +214,7 @@ def checked(watched: Watched) -> list[int]:
 @pytest.mark.usefixtures("finished")
 def test_checks_wait_until_the_chain_is_predicted_to_be_long_enough(watched: Watched) -> None:
     """Each is at the steps that the one before needs, or right after one that passed."""
-    assert 40 == checked(watched)[0]
+    assert FIRST_CHECK * PLAN.block == checked(watched)[0]
     for before, after in itertools.pairwise(watched.checks):
         fewest = np.min([before.ess_bulk, before.ess_tail])
         wanted = max(before.steps * PLAN.ess / fewest, 50 * np.max(before.autocorrelation))
