@@ -107,7 +107,7 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
         Steps in a block.
     """
     steps, ensembles, walkers, free = draws.shape
-    scores, folded = _scores(draws), _folded_scores(draws)
+    scores, folded = _scores(draws)
     bulk, tail = _effective_draws(draws, scores)
     autocorrelation = autocorrelation_time(draws.reshape(steps, ensembles * walkers, free))
     half = steps // 2
@@ -162,7 +162,7 @@ def as_chains(draws: FloatArray) -> FloatArray:
 
 def nested_rhat(draws: FloatArray) -> FloatArray:
     """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
-    return _rhat(_scores(draws), _folded_scores(draws), draws.shape[1])
+    return _rhat(*_scores(draws), draws.shape[1])
 
 
 def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -172,7 +172,7 @@ def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     W independent walkers has a W-th of the variance, so n effective means are worth n times the
     ratio of the variances.
     """
-    return _effective_draws(draws, _scores(draws))
+    return _effective_draws(draws, _scores(draws)[0])
 
 
 def _effective_draws(draws: FloatArray, scores: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -218,33 +218,35 @@ def _series(draws: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.moveaxis(as_chains(draws), -1, 0))
 
 
-def _scores(draws: FloatArray) -> FloatArray:
+def _scores(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rank draws (steps, ensembles, walkers, free) into normal scores (free, chains, steps).
 
-    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)).
+    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)). The second ones are
+    those of the draws' distances from their median.
     """
-    return np.stack([_normal_scores(one) for one in _series(draws)])
-
-
-def _folded_scores(draws: FloatArray) -> FloatArray:
-    """Return the normal scores of the draws' distances from their median."""
+    every = _series(draws)
+    scores, folded = np.empty_like(every), np.empty_like(every)
     with np.errstate(invalid="ignore"):
-        return np.stack([_normal_scores(np.abs(s - np.median(s))) for s in _series(draws)])
+        for i, series in enumerate(every):
+            scores[i], median = _normal_scores(series)
+            folded[i], _ = _normal_scores(np.abs(series - median))
+    return scores, folded
 
 
-def _normal_scores(draws: FloatArray) -> FloatArray:
-    """Rank one parameter's draws; nan for all if any of them is."""
+def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
+    """Rank one parameter's draws, and find their median; all nan if any of them is."""
     values = draws.ravel()
-    if np.isnan(values).any():
-        return np.full(draws.shape, np.nan)
     order = np.argsort(values)
     ordered = values[order]
+    if np.isnan(ordered[-1]):  # nan sorts last
+        return np.full(draws.shape, np.nan), np.nan
     first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
     equal = np.diff(first, append=values.size)
     rank = first + 0.5 * (equal + 1)
     scores = np.empty(values.size)
     scores[order] = np.repeat(ndtri((rank - 3 / 8) / (values.size + 1 / 4)), equal)
-    return scores.reshape(draws.shape)
+    middle = ordered[(values.size - 1) // 2], ordered[values.size // 2]
+    return scores.reshape(draws.shape), float(np.mean(middle))
 
 
 def _ensemble_mean_ess(draws: FloatArray) -> FloatArray:

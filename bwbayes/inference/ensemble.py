@@ -173,16 +173,17 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
     """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
 
     As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
-    but for all walkers at once. It is nan where it cannot be told, for instance where nothing
-    moves.
+    but for all walkers at once: the mean is taken of their spectra, and transformed back once. It
+    is nan where it cannot be told, for instance where nothing moves.
     """
     steps = draws.shape[0]
     padded = fft.next_fast_len(2 * steps, real=True)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        away = np.moveaxis(draws - np.mean(draws, axis=0), 0, -1)
+        away = np.ascontiguousarray(np.moveaxis(draws - np.mean(draws, axis=0), 0, -1))
         spectrum = fft.rfft(away, padded)
-        covariance = fft.irfft(spectrum.real**2 + spectrum.imag**2, padded)[..., :steps]
-        correlation = np.mean(covariance / covariance[..., :1], axis=0)
+        power = spectrum.real**2 + spectrum.imag**2
+        power /= np.sum(away**2, axis=-1, keepdims=True)
+        correlation = fft.irfft(np.mean(power, axis=0), padded)[:, :steps]
     times = 2 * np.cumsum(correlation, axis=1) - 1
     found = np.array([time[auto_window(time, WINDOW)] for time in times])
     return np.where(found > 0, found, np.nan)
