@@ -35,6 +35,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from tests.app.mutations import KINDS, Case, case
+from tests.found import keep
 
 SEED = 1
 FEW, ALL, FITTED = 1500, 10_000, 6
@@ -181,6 +182,8 @@ def test_1500_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None
 @pytest.mark.usefixtures("quick_fit")
 def test_10000_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
     found = spoilt(range(ALL), place)
+    used, refused = (sum(counts[status] for counts in found.values()) for status in (0, 2))
+    keep("hostile input", {"used": used, "refused": refused})
     assert ALL == sum(counts.total() for counts in found.values())
 
 

@@ -13,6 +13,7 @@ from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
+from tests.found import keep
 
 # Name, sign and number of each target; what was found is in `_found`.
 TARGETS: tuple[tuple[str, str, float], ...] = (
@@ -39,7 +40,8 @@ WIDTH = 110
     show_default=True,
     help="Where the figures go.",
 )
-def main(*, quick: bool, out: Path) -> None:
+@click.option("--keep", "kept", is_flag=True, help="Store what the README quotes.")
+def main(*, quick: bool, out: Path, kept: bool) -> None:
     """Measure what the likelihood, the sampling and a start cost on this machine."""
     console = Console()
     console.width = max(console.width, WIDTH)
@@ -51,6 +53,8 @@ def main(*, quick: bool, out: Path) -> None:
     tables.append(_targets({table.name: table for table in tables}))
     printed(tables[-1], console)
     written(tables, before | {"load_after": machine()["load"], "quick": quick}, out)
+    if kept:
+        keep("benchmarks", {str(row["target"]): row["found"] for row in tables[-1].rows})
     console.print(f"{out}: {before['processor']}, load {before['load']} before it began")
 
 
