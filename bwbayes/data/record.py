@@ -162,7 +162,7 @@ class Record:
         return self._part(slice(0, self.samples, int(factor)))
 
     def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
-        """Return training and held-out windows as slices of this record.
+        """Return training windows, in order of time, and held-out ones as slices of this record.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class Record:
             If a window is empty or outside the record, if a training window overlaps a held-out
             one (nothing would be held out) or another training window (samples would count twice).
         """
-        trained = [(window, self.window_slice(*window)) for window in training]
+        trained = [(window, self.window_slice(*window)) for window in sorted(training)]
         held = [(window, self.window_slice(*window)) for window in held_out]
         for index, (one, one_slice) in enumerate(trained):
             for kind, others in (("training", trained[:index]), ("held-out", held)):

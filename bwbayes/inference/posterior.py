@@ -37,12 +37,18 @@ class Posterior:
     displacement
         (samples,), um.
     training
-        Slices of the samples that enter the likelihood. The discrepancy of one window is taken as
-        independent of that of the next, so windows should lie several correlation times apart.
+        Slices of the samples that enter the likelihood, in order of time and apart. The discrepancy
+        of one window is taken as independent of that of the next, so windows should lie several
+        correlation times apart.
     actuator, noise, prior
         The model; the prior's parameters are those of the actuator followed by those of the noise.
     engine
         What computes the likelihood; see :mod:`bwbayes.inference.engine`.
+
+    Raises
+    ------
+    InputError
+        The prior is another model's, or the windows are out of order.
     """
 
     voltage: FloatArray
@@ -57,6 +63,9 @@ class Posterior:
         expected = (*self.actuator.parameters, *self.noise.parameters)
         if self.prior.names != expected:
             raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
+        edges = [edge for window in self.training for edge in (window.start, window.stop)]
+        if edges != sorted(edges):
+            raise InputError("training: windows must be in order of time and must not overlap")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -131,6 +131,12 @@ def test_split_gives_slices_of_the_whole_record() -> None:
     assert (slice(0, 20), slice(10, 50)) == split.held_out
 
 
+def test_split_puts_training_windows_in_order_of_time() -> None:
+    split = ramp(100, 0.01).split([(0.5, 1.0), (0.0, 0.3)], [(0.45, 0.5), (0.3, 0.4)])
+    assert (slice(0, 30), slice(50, 100)) == split.training
+    assert (slice(45, 50), slice(30, 40)) == split.held_out
+
+
 @pytest.mark.parametrize(
     ("training", "held_out", "kind"),
     [

@@ -188,6 +188,16 @@ def test_the_input_is_not_modified() -> None:
     np.testing.assert_array_equal(before, z)
 
 
+@pytest.mark.parametrize(
+    "windows",
+    [(slice(20, 50), slice(0, 20)), (slice(0, 30), slice(20, 50))],
+    ids=["order", "apart"],
+)
+def test_windows_must_be_in_order_and_apart(windows: tuple[slice, ...]) -> None:
+    with pytest.raises(InputError, match="in order of time and must not overlap"):
+        short_posterior("white", 50, training=windows)
+
+
 def test_parameters_must_be_those_of_the_model() -> None:
     sound = short_posterior("white", 50)
     with pytest.raises(InputError, match=r"^prior: its parameters must be d, .*, in this order"):
