@@ -63,6 +63,9 @@ def _start(pool: Executor, count: int) -> None:
 
 def _settle() -> None:
     """Prepare a worker process: one thread, deaf to Ctrl-C, and gone when its parent is."""
+    # The limit is set to libraries that are there, and this one has not been needed yet.
+    import scipy.linalg  # noqa: F401, PLC0415
+
     one_thread()
     # The Ctrl-C that asks a run to stop in order must not kill its workers first.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
