@@ -3,7 +3,8 @@
 :func:`start` makes the folder: the config with every prior an explicit number, the same for all
 replicates. :func:`carry_on` makes whatever replicates are missing, side by side, writes a line for
 each, and judges them all. Each replicate depends on the config, the seed and its number alone, so
-it does not matter in how many pieces or with how many workers a calibration is done.
+it does not matter in how many pieces or with how many workers a calibration is done. Replicates of
+another config or record are refused.
 """
 
 from __future__ import annotations
@@ -11,13 +12,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.calibration_report import render
-from bwbayes.app.config import Config, load
+from bwbayes.app.config import Config, dump, load
 from bwbayes.app.figures import save
 from bwbayes.app.figures.calibration import draw_calibration
 from bwbayes.app.folder import CalibrationFolder
@@ -28,9 +32,25 @@ from bwbayes.app.workers import executor, one_thread
 from bwbayes.errors import InputError
 from bwbayes.results.calibration import Calibration, judge, summary
 from bwbayes.results.files import write_summary
-from bwbayes.results.replicates import Entry, Experiment, replicates
+from bwbayes.results.replicates import RANKED, Entry, Experiment, replicates
 
 __all__ = ["carry_on", "experiment", "start"]
+
+# Draws of the prior that show whether there is one.
+TRIED = 64
+
+
+class _Wanted(BaseModel):
+    """The first line, and any that asks for more: how many replicates, of what."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    replicates: PositiveInt
+    of: str
+
+    @property
+    def line(self) -> bytes:
+        return self.model_dump_json().encode() + b"\n"
 
 
 def start(
@@ -47,9 +67,8 @@ def start(
     """
     problem = resolve(config, where)
     experiment(problem)
-    folder = CalibrationFolder.create(out, problem, overwrite)
-    _append(folder, {"replicates": count})
-    return folder
+    wanted = _Wanted(replicates=count, of=_identity(problem))
+    return CalibrationFolder.create(out, problem, overwrite, wanted.line)
 
 
 def experiment(problem: Problem) -> Experiment:
@@ -60,8 +79,9 @@ def experiment(problem: Problem) -> Experiment:
     Raises
     ------
     InputError
-        Its voltage shows no loop.
+        Its voltage shows no loop, or its prior leaves hardly anything.
     """
+    problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
     windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
     return Experiment(problem.posterior, problem.plan, windows)
 
@@ -82,7 +102,8 @@ def carry_on(
     console
         Where progress goes.
     workers
-        Processes for the replicates; by default one a core. The result does not depend on it.
+        Replicates side by side, in processes if more than one; by default as many as cores. The
+        result does not depend on it.
     count
         A new number of replicates, if given; none is thrown away.
 
@@ -93,83 +114,119 @@ def carry_on(
     """
     with folder.locked(), one_thread():
         problem = resolve(load(folder.config), folder.path)
-        wanted, entries = _read(folder)
-        if count is not None and count != wanted:
-            _append(folder, {"replicates": count})
-            wanted = count
-        # It is written last, as the sign that all is there; now something is to come.
-        folder.summary.unlink(missing_ok=True)
-        if len(entries) < wanted:
-            entries += _made(folder, problem, range(len(entries), wanted), workers, console)
+        common = experiment(problem)
+        wanted, entries = _read(folder, common, _identity(problem))
+        if count is not None and count != wanted.replicates:
+            wanted = wanted.model_copy(update={"replicates": count})
+            _append(folder, wanted.line)
+        missing = [number for number in range(wanted.replicates) if number not in entries]
+        # What is written last is the sign that all is there; now something is to come.
+        _clear(folder)
+        if missing:
+            _make(folder, common, problem.config.seed, missing, entries, workers, console)
         console.print("judging and drawing ...", highlight=False)
-        calibration = judge(entries, generator(problem.config.seed, "ranks"))
+        ordered = [entries[number] for number in sorted(entries)]
+        calibration = judge(ordered, generator(problem.config.seed, "ranks"))
         _write(folder, problem, calibration)
     return calibration
 
 
-def _made(
+def _identity(problem: Problem) -> str:
+    """Return a digest of everything that replicates depend on."""
+    return sha256((dump(problem.config) + problem.record.sha256).encode()).hexdigest()
+
+
+def _make(
     folder: CalibrationFolder,
-    problem: Problem,
-    numbers: range,
+    common: Experiment,
+    seed: int,
+    missing: Sequence[int],
+    entries: dict[int, Entry],
     workers: int | None,
     console: Console,
-) -> list[Entry]:
-    """Make replicates, and write each as soon as all before it are written."""
-    entries = []
-    common, seed = experiment(problem), problem.config.seed
-    # Always processes: most of a replicate's time goes into Python, not into compiled code.
+) -> None:
+    """Add the missing replicates to the entries, and write each as soon as it is there."""
+    count = min(workers or os.cpu_count() or 1, len(missing))
+    unconverged = sum(not entry["converged"] for entry in entries.values())
+    # Processes, also for the compiled engine: most of a replicate's time goes into Python.
     with (
-        executor(min(workers or os.cpu_count() or 1, len(numbers))) as pool,
-        ReplicateProgress(console, numbers.start, numbers.stop) as progress,
+        executor(count) as pool,
+        ReplicateProgress(console, len(entries), len(missing), unconverged) as progress,
     ):
-        for made in replicates(common, seed, numbers, pool):
-            entries.append(made.entry())
-            _append(folder, entries[-1])
+        for made in replicates(common, seed, missing, pool, count):
+            entry = entries[made.number] = made.entry()
+            _append(folder, json.dumps(entry).encode() + b"\n")
             progress(made.converged)
-    return entries
 
 
-def _append(folder: CalibrationFolder, line: Any) -> None:
+def _append(folder: CalibrationFolder, line: bytes) -> None:
     """Write a line that is there after a crash."""
     with folder.replicates.open("ab") as file:
-        file.write(json.dumps(line).encode() + b"\n")
+        file.write(line)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _read(folder: CalibrationFolder) -> tuple[int, list[Entry]]:
+def _read(
+    folder: CalibrationFolder, common: Experiment, identity: str
+) -> tuple[_Wanted, dict[int, Entry]]:
     """Read how many replicates are wanted, and those that are there; cut off half a line."""
     content = folder.replicates.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
         os.truncate(folder.replicates, whole)
-    wanted = 0
-    entries: list[Entry] = []
-    for number, text in enumerate(content[:whole].splitlines(), start=1):
+    first, *others = content[:whole].splitlines() or [b""]
+    wanted = _wanted(folder, first, identity)
+    entries: dict[int, Entry] = {}
+    for number, line in enumerate(others, start=2):
+        if line.startswith(b'{"replicates"'):
+            wanted = _wanted(folder, line, identity)
+            continue
         try:
-            line = json.loads(text)
-            if line.keys() == {"replicates"}:
-                wanted = int(line["replicates"])
-                continue
-            entries.append(_entry(line, len(entries)))
-        except (ValueError, TypeError, AttributeError):
+            entry = _entry(line, common, entries)
+        except ValueError:
             raise InputError(
-                f"{folder.replicates}:{number}: is no replicate; delete this line and all after it"
+                f"{folder.replicates}:{number}: is no replicate of these; delete this line"
             ) from None
-    if not wanted:
-        raise InputError(
-            f"{folder.replicates}: does not say how many replicates there are to be; "
-            "calibrate anew with --overwrite"
-        )
+        entries[entry["number"]] = entry
     return wanted, entries
 
 
-def _entry(line: Any, number: int) -> Entry:
-    """Check that a line is the replicate of that number."""
-    if line.keys() != Entry.__annotations__.keys() or line["number"] != number:
-        raise ValueError("not the next replicate")
-    entry: Entry = line
+def _wanted(folder: CalibrationFolder, line: bytes, identity: str) -> _Wanted:
+    """Read the line that says how many replicates are wanted, and check that they are these."""
+    try:
+        wanted = _Wanted.model_validate_json(line)
+    except ValueError:
+        raise InputError(
+            f"{folder.replicates}: does not say how many replicates there are to be; "
+            "calibrate anew with --overwrite"
+        ) from None
+    if wanted.of != identity:
+        raise InputError(
+            f"{folder.replicates}: these are replicates of another config or record than the "
+            "folder's; put that back, or calibrate anew with --overwrite"
+        )
+    return wanted
+
+
+def _entry(line: bytes, common: Experiment, others: Mapping[int, Entry]) -> Entry:
+    """Read a line, and check that it is a replicate of this experiment, and a new one."""
+    entry = TypeAdapter(Entry).validate_json(line)
+    found = [*entry["ranks"]], [*entry["covered"]]
+    if found not in (([*common.statistics], [*common.bands]), ([], [])):
+        raise ValueError("has other statistics")
+    if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
+        raise ValueError("has a rank that there is not")
+    if entry["number"] in others:
+        raise ValueError("is there already")
     return entry
+
+
+def _clear(folder: CalibrationFolder) -> None:
+    """Remove what an earlier end has left."""
+    for path in (folder.summary, folder.path / "calibration.html"):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder.path / "figures", ignore_errors=True)
 
 
 def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration) -> None:
@@ -182,7 +239,6 @@ def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration
         "data_sha256": problem.record.sha256,
         "versions": versions(problem.posterior.engine),
     }
-    shutil.rmtree(folder.path / "figures", ignore_errors=True)
     figures = draw_calibration(calibration, problem.parameters)
     pictures = save(figures, folder.path / "figures")
     page = render(problem, calibration, numbers, pictures)

@@ -10,6 +10,7 @@ import math
 import signal
 import sys
 import warnings
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -346,6 +347,9 @@ def main() -> None:
         # A full disk, a folder that went away: what is on disk already stays whole.
         where = f"{error.filename}: " if error.filename else ""
         click.echo(f"bwbayes: {where}{error.strerror or error}; mend it and resume", err=True)
+        status = BAD_INPUT
+    except BrokenExecutor:
+        click.echo("bwbayes: a worker process was ended; mind the memory, and resume", err=True)
         status = BAD_INPUT
     except MemoryError:
         click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)

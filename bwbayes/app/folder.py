@@ -52,8 +52,8 @@ class RunFolder:
         return self.path / "summary.json"
 
     @classmethod
-    def create(cls, path: Path, problem: Problem, overwrite: bool) -> Self:
-        """Make the folder of a new run, whole or not at all.
+    def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
+        """Make the folder of a new run, whole or not at all; ``mark`` goes into its mark.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class RunFolder:
                     write_record(validation.record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
             if cls.MARK:
-                (draft / cls.MARK).touch()
+                (draft / cls.MARK).write_bytes(mark)
             if path.exists():
                 with cls(path).locked():
                     shutil.rmtree(path)
@@ -153,7 +153,7 @@ class CalibrationFolder(RunFolder):
 
     @property
     def replicates(self) -> Path:
-        """The replicates, a line each, appended in the order of their numbers."""
+        """What they are replicates of, how many are wanted, and then a line for each."""
         return self.path / self.MARK
 
     @property

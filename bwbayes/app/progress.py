@@ -52,13 +52,13 @@ class _Line:
 
 
 class ReplicateProgress(_Line):
-    """Watches the replicates of a calibration, ``done`` of ``wanted`` so far."""
+    """Watches the replicates of a calibration, of which ``done`` are there and some missing."""
 
-    def __init__(self, console: Console, done: int, wanted: int) -> None:
+    def __init__(self, console: Console, done: int, missing: int, unconverged: int = 0) -> None:
         super().__init__(console)
         self.before = self.done = done
-        self.wanted = wanted
-        self.unconverged = 0
+        self.wanted = done + missing
+        self.unconverged = unconverged
 
     def __call__(self, converged: bool) -> None:
         """Take note of a finished replicate."""

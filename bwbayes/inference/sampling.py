@@ -77,7 +77,7 @@ class SamplingPlan:
     walkers
         Walkers of one ensemble, even, at least twice the free parameters.
     block
-        Steps between two checks.
+        Steps that are made and stored at a time; checks come after whole blocks.
     most_steps, most_pilot_steps
         The budget: steps of each ensemble that count, and before.
     least_pilot_steps

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from typing import TypedDict
 
 import numpy as np
@@ -22,11 +23,11 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
-from bwbayes.results.bands import LEVELS, Bands, Kind
+from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import predict_windows, thinned
 
 __all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
@@ -99,6 +100,11 @@ class Experiment:
         """Names of what is ranked."""
         return (*self.posterior.names, *EXTRA)
 
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Names of the bands that are held against the held-out samples ("sensor 95")."""
+        return tuple(f"{kind} {level}" for kind in KINDS for level in LEVELS if self.held_out)
+
     @cached_property
     def level(self) -> float:
         """Voltage at which loops are measured, V: zero, or the middle of a drive beside it."""
@@ -149,16 +155,16 @@ class Replicate:
     converged, stop_reason, steps
         How the sampling ended, and its steps that count.
     spacing
-        Steps between two draws of one walker, at least one autocorrelation time. The draws below
-        are a random choice of all that are left.
+        Steps between two draws of one walker, at least one autocorrelation time if the sampling has
+        converged. The draws below are a random choice of all that are left.
     names
         Names of the statistics.
     truth
         (statistics,) their true values.
     draws
-        (RANKED, statistics) their posterior draws; empty if no posterior could be sampled.
+        (RANKED, statistics) their posterior draws; empty if there are not so many.
     covered
-        Part of the held-out samples inside each band, by its kind and level.
+        Part of the held-out samples inside each band, by its kind and level; empty without draws.
     """
 
     number: int
@@ -193,19 +199,37 @@ class Replicate:
 
 
 def replicates(
-    experiment: Experiment, seed: int, numbers: Iterable[int], executor: Executor
+    experiment: Experiment,
+    seed: int,
+    numbers: Iterable[int],
+    executor: Executor,
+    together: int = 1,
 ) -> Iterator[Replicate]:
-    """Make the replicates of those numbers, side by side, and yield them in their order.
+    """Make the replicates of those numbers, and yield each as soon as it is done.
 
-    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit.
+    Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
+    be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
     """
-    futures = [executor.submit(replicate, experiment, seed, number) for number in numbers]
-    for future in futures:
-        yield future.result()
+    waiting = iter(numbers)
+    running: set[Future[Replicate]] = set()
+    while True:
+        for number in islice(waiting, together - len(running)):
+            running.add(executor.submit(replicate, experiment, seed, number))
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            yield future.result()
 
 
 def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
-    """Draw a truth, simulate its record, fit that, and compare."""
+    """Draw a truth, simulate its record, fit that, and compare.
+
+    Raises
+    ------
+    InputError
+        The prior draws a model without a finite displacement.
+    """
     generator = np.random.default_rng([seed, number])
     simulating, fitting, sampling, choosing, predicting = generator.spawn(5)
     theta, record, model = _simulated(experiment, simulating)
@@ -214,26 +238,22 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     truth = _statistics(experiment, posterior, true)[0]
     names = experiment.statistics
+    nothing = np.empty((0, len(names)))
+    # InputError, and what linear algebra raises: one record must not end the whole calibration.
     try:
         outcome, chained = _sampled(posterior, experiment.plan, fitting, sampling)
-    except InputError as error:
-        nothing = np.empty((0, len(names)))
-        return Replicate(number, False, str(error), 0, 0, names, truth, nothing, {})
+    except ValueError as error:
+        return Replicate(number, False, one_line(str(error)), 0, 0, names, truth, nothing, {})
     time = float(np.max(outcome.check.autocorrelation))
     spacing, free = _independent(chained, time, choosing)
+    ended = outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
+    if len(free) < RANKED:
+        return Replicate(number, *ended, names, truth, nothing, {})
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
     bands = predict_windows(posterior, flat, record, experiment.held_out)
-    return Replicate(
-        number,
-        outcome.converged,
-        outcome.stop_reason,
-        outcome.check.steps,
-        spacing,
-        names,
-        truth,
-        _statistics(experiment, posterior, posterior.prior.theta(free)),
-        _covered(experiment, bands, record, model),
-    )
+    drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
+    covered = _covered(experiment, bands, record, model)
+    return Replicate(number, *ended, names, truth, drawn, covered)
 
 
 def _simulated(
@@ -291,7 +311,7 @@ def _sampled(
 def _independent(
     chained: FloatArray, time: float, generator: np.random.Generator
 ) -> tuple[int, FloatArray]:
-    """Choose ``RANKED`` draws that are as good as independent: spacing in steps, (RANKED, free).
+    """Choose ``RANKED`` draws, or all, as good as independent: spacing in steps, (RANKED, free).
 
     Every walker keeps one step in as many as the longest autocorrelation time has; of what is left
     of all walkers some are chosen at random. As two draws of a chain are correlated by 1/ESS on

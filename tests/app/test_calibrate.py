@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -59,7 +60,7 @@ pilot_steps = 30
 window = [1.5, 2.0]
 """
 
-FILES = ("calibration.json", "calibration.html", "replicates.jsonl", "config.toml")
+FILES = ("calibration.json", "calibration.html", "config.toml")
 
 
 def begun(path: Path, count: int = 3, text: str = TEXT) -> CalibrationFolder:
@@ -84,6 +85,9 @@ def assert_same_end(expected: Path, got: Path) -> None:
     )
     for name in (*FILES, *pictures):
         assert (expected / name).read_bytes() == (got / name).read_bytes(), name
+    # Replicates are written in the order in which they are done.
+    lines = [(p / "replicates.jsonl").read_bytes().splitlines() for p in (expected, got)]
+    assert sorted(lines[0]) == sorted(lines[1])
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +132,7 @@ def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     assert 3 == found["seed"]
     assert {"20 % too small", "10 % too small"} == set(found["power_of_one_smooth_test"])
     first, *lines = (whole / "replicates.jsonl").read_text().splitlines()
-    assert {"replicates": 3} == json.loads(first)
+    assert 3 == json.loads(first)["replicates"]
     assert [0, 1, 2] == [json.loads(line)["number"] for line in lines]
 
 
@@ -162,18 +166,20 @@ def test_replicates_that_are_there_are_not_made_again(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
-    monkeypatch.setattr(module, "_made", None)
+    monkeypatch.setattr(module, "_make", None)
     carry_on(folder, small.quiet())
     assert_same_end(whole, folder.path)
 
 
 def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
-    folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's": 3', b's": 2'))
+    folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's":3', b's":2'))
     assert 3 == carry_on(folder, small.quiet(), workers=1, count=3).replicates
     lines = [line for line in folder.replicates.read_bytes().splitlines() if b"number" in line]
     assert (whole / "replicates.jsonl").read_bytes().splitlines()[1:] == lines
-    assert b'{"replicates": 3}' in folder.replicates.read_bytes().splitlines()
+    assert (whole / "replicates.jsonl").read_bytes().splitlines()[0] in (
+        folder.replicates.read_bytes().splitlines()
+    )
 
 
 def test_request_to_stop_is_answered_with_how_to_go_on(whole: Path, tmp_path: Path) -> None:
@@ -257,27 +263,104 @@ def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "part"),
     [
-        (b'{"replicates": 3}\nnonsense\n', ":2: is no replicate"),
-        (b'{"replicates": 3}\n{"number": 0}\n', ":2: is no replicate"),
-        (b'{"replicates": 3}\n[1]\n', ":2: is no replicate"),
-        (b'{"replicates": "x"}\n', ":1: is no replicate"),
-        (b"", "does not say how many"),
-        (b'{"replic', "does not say how many"),
+        ({0: b"nonsense"}, "does not say how many"),
+        ({0: b'{"replicates":0,"of":"x"}'}, "does not say how many"),
+        ({0: b'{"replicates":3}'}, "does not say how many"),
+        ({0: b'{"replicates":1e999,"of":"x"}'}, "does not say how many"),
+        ({1: b"nonsense"}, ":2: is no replicate of these; delete this line"),
+        ({1: b'{"number": 0}'}, ":2: is no replicate of these; delete this line"),
+        ({2: b"[1]"}, ":3: is no replicate of these; delete this line"),
+        ({2: b"[" * 100_000}, ":3: is no replicate of these; delete this line"),
+        ({2: b"{}"}, ":3: is no replicate of these; delete this line"),
+        ({2: b"\xff"}, ":3: is no replicate of these; delete this line"),
     ],
 )
-def test_damaged_lines_are_refused(tmp_path: Path, damage: bytes, part: str) -> None:
-    folder = begun(tmp_path / "a")
-    folder.replicates.write_bytes(damage)
+def test_damaged_lines_are_refused(
+    whole: Path, tmp_path: Path, damage: dict[int, bytes], part: str
+) -> None:
+    assert_refused(whole, tmp_path, part, damage.get)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (rb'"ranks": .*}, "covered"', b'"ranks": "many", "covered"'),
+        (rb'"covered": .*', b'"covered": null}'),
+        (rb'"covered": .*', b'"covered": {}}'),
+        (rb'"d": \d+', b'"d": 200'),
+        (rb'"d": \d+', b'"d": -1'),
+        (rb'"alpha"', b'"beta"'),
+        (rb'"number": 1', b'"number": 0'),
+    ],
+)
+def test_line_of_another_replicate_is_refused(
+    whole: Path, tmp_path: Path, one: bytes, other: bytes
+) -> None:
+    def change(number: int, line: bytes) -> bytes:
+        return re.sub(one, other, line) if number == 2 else line
+
+    assert_refused(whole, tmp_path, ":3: is no replicate of these; delete this line", change)
+
+
+def assert_refused(
+    whole: Path, tmp_path: Path, part: str, change: Callable[[int, bytes], bytes]
+) -> None:
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
+    lines = folder.replicates.read_bytes().splitlines()
+    changed = [change(number, line) for number, line in enumerate(lines)]
+    assert changed != lines
+    folder.replicates.write_bytes(b"".join(line + b"\n" for line in changed))
     with pytest.raises(InputError, match=part):
         carry_on(folder, small.quiet())
 
 
-def test_replicate_out_of_order_is_refused(whole: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [b"", b'{"replic'])
+def test_folder_without_a_number_of_replicates_is_refused(tmp_path: Path, damage: bytes) -> None:
     folder = begun(tmp_path / "a")
-    first, _, second, *_ = (whole / "replicates.jsonl").read_bytes().splitlines(keepends=True)
-    folder.replicates.write_bytes(first + second)
-    with pytest.raises(InputError, match=":2: is no replicate"):
+    folder.replicates.write_bytes(damage)
+    with pytest.raises(InputError, match="does not say how many"):
         carry_on(folder, small.quiet())
+
+
+def test_replicates_of_another_config_are_refused(whole: Path, tmp_path: Path) -> None:
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[1])
+    text = folder.config.read_text(encoding="utf-8")
+    assert "mean = 0.7" in text
+    folder.config.write_text(text.replace("mean = 0.7", "mean = 0.8"), encoding="utf-8")
+    with pytest.raises(InputError, match="another config or record"):
+        carry_on(folder, small.quiet())
+
+
+def test_lines_may_come_in_any_order(whole: Path, tmp_path: Path) -> None:
+    folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
+    first, zero, one, two = folder.replicates.read_bytes().splitlines(keepends=True)
+    folder.replicates.write_bytes(first + two + zero)
+    carry_on(folder, small.quiet(), workers=1)
+    assert_same_end(whole, folder.path)
+    assert one == folder.replicates.read_bytes().splitlines(keepends=True)[-1]
+
+
+def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    shutil.copytree(whole, tmp_path / "a")
+    monkeypatch.setattr(module, "_make", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        carry_on(CalibrationFolder.open(tmp_path / "a"), small.quiet(), count=4)
+    assert {"config.toml", "records", "replicates.jsonl"} == {
+        path.name for path in (tmp_path / "a").iterdir() if path.name != ".lock"
+    }
+
+
+def test_prior_that_leaves_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    """Said at once, not by the first replicate."""
+    impossible = TEXT.replace("mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01")
+    with pytest.raises(InputError, match="hardly a draw has"):
+        begun(tmp_path / "a", text=impossible)
+    assert [] == list(tmp_path.iterdir())
 
 
 def test_voltage_without_a_loop_leaves_nothing(tmp_path: Path) -> None:
@@ -294,12 +377,12 @@ def test_progress_tells_rate_and_remaining_time(monkeypatch: pytest.MonkeyPatch)
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     console = Console(record=True, width=200, file=StringIO())
-    with ReplicateProgress(console, 10, 30) as progress:
+    with ReplicateProgress(console, 10, 20, 3) as progress:
         now[0] += 30
         progress(converged=True)
         now[0] += 30
         progress(converged=False)
     assert [
-        "replicate 11 of 30   2.0 a minute   ETA 9:30   not converged 0",
-        "replicate 12 of 30   2.0 a minute   ETA 9:00   not converged 1",
+        "replicate 11 of 30   2.0 a minute   ETA 9:30   not converged 3",
+        "replicate 12 of 30   2.0 a minute   ETA 9:00   not converged 4",
     ] == console.export_text().splitlines()

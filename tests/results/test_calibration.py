@@ -227,11 +227,11 @@ def test_nothing_fitted_is_said() -> None:
 
 @pytest.mark.parametrize(("mean", "passed"), [(0.95, True), (0.91, False), (0.99, False)])
 def test_bands_must_cover_within_three_standard_errors(mean: float, passed: bool) -> None:
-    covered = mean + 0.1 * np.random.default_rng(1).standard_normal(200)
+    covered = mean + 0.1 * np.random.default_rng(1).standard_normal(500)
     covered += mean - np.mean(covered)
-    found = judged(entries(scores(200), covered))
+    found = judged(entries(scores(500), covered))
     assert found.bands["sensor 95"].mean == pytest.approx(mean)
-    assert found.bands["sensor 95"].error == pytest.approx(0.1 / np.sqrt(200), rel=0.2)
+    assert found.bands["sensor 95"].error == pytest.approx(0.1 / np.sqrt(500), rel=0.2)
     assert passed == found.passed
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +38,8 @@ def small(**changes: object) -> Experiment:
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:
     with ThreadPoolExecutor(2) as executor:
-        both = [made.entry() for made in replicates(small(), 1, [0, 1], executor)]
+        made = {one.number: one.entry() for one in replicates(small(), 1, [0, 1], executor, 2)}
+    both = [made[0], made[1]]
     assert both[1] == replicate(small(), 1, 1).entry()
     assert both[1]["truth"] != both[0]["truth"]
     assert both[1]["truth"] != replicate(small(), 2, 1).entry()["truth"]
@@ -55,9 +58,12 @@ def test_entry_is_plain_and_complete() -> None:
         assert sum(draw < truth for draw in draws) == entry["ranks"][name]
 
 
-def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError])
+def test_replicate_that_cannot_be_fitted_is_kept(
+    monkeypatch: pytest.MonkeyPatch, kind: type[Exception]
+) -> None:
     def refuse(*_: object) -> None:
-        raise InputError("priors: no draw has a finite posterior density")
+        raise kind("priors: no draw has a finite posterior density")
 
     monkeypatch.setattr("bwbayes.inference.pointfit.fit", refuse)
     entry = replicate(small(), 1, 0).entry()
@@ -70,6 +76,32 @@ def test_replicate_out_of_budget_is_ranked_and_not_converged() -> None:
     entry = replicate(small(plan=replace(PLAN, most_steps=10)), 1, 0).entry()
     assert (False, 10) == (entry["converged"], entry["steps"])
     assert 6 == len(entry["ranks"])
+
+
+def test_replicate_with_too_few_draws_is_not_ranked() -> None:
+    """Among fewer than others it would have other ranks."""
+    plan = replace(PLAN, walkers=6, block=5, most_steps=5)
+    made = replicate(small(plan=plan), 1, 0)
+    assert (5, False, {}, {}) == (made.steps, made.converged, made.entry()["ranks"], made.covered)
+
+
+def test_only_so_many_are_under_way_together() -> None:
+    """Who stops after the first has to wait for no more than those."""
+    begun: list[Any] = []
+
+    class Watched(ThreadPoolExecutor):
+        def submit[**P, T](
+            self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
+        ) -> Future[T]:
+            begun.append(args[-1])
+            return super().submit(fn, *args, **kwargs)
+
+    with Watched(1) as executor:
+        made = replicates(small(), 1, range(100), executor, 2)
+        next(made)
+        assert [0, 1] == begun
+        next(made)
+        assert 3 >= len(begun)
 
 
 def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
