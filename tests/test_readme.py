@@ -1,15 +1,22 @@
-"""The README's commands are there, and the numbers it quotes are those of its first command."""
+"""The README's commands are there, and the numbers it quotes are those of its commands.
+
+Those of its first command are held against a run of it; those of the slow ones against what was
+found when they last ran in full.
+"""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bwbayes.app import cli
+from bwbayes.results.bands import LEVELS
+from tests.found import found
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -88,3 +95,51 @@ def test_the_quoted_verification_is_that_of_the_run(summary: Any) -> None:
     ]
     for wanted, got in zip(quoted, expected, strict=True):
         assert wanted == pytest.approx(got, rel=0.05, abs=0.3)
+
+
+def covered(discrepancy: str) -> str:
+    """Say how much the intervals and bands of each level covered."""
+    parts = found()[f"coverage {discrepancy}"]["covered"]
+    return ", ".join(
+        f"{name} " + "/".join(f"{100 * parts[f'{name} {level}']:.0f}" for level in LEVELS)
+        for name in ("parameters", "sensor", "displacement")
+    )
+
+
+def coverage() -> str:
+    every = [found()[f"coverage {kind}"]["errors_off"].values() for kind in ("process", "none")]
+    worst = max(abs(off) for offs in every for off in offs)
+    return (
+        f"50/90/95 %: {covered('process')}; without a discrepancy {covered('none')}; none off by "
+        f"more than {worst:.1f} standard errors"
+    )
+
+
+def calibration() -> str:
+    one = found()["calibration"]
+    return (
+        f"{one['replicates']} replicates, {one['unconverged']} not converged; {one['tests']} tests "
+        f"of ranks and 9 of bands, {one['shortcomings']} failed; sds a fifth too small in one "
+        f"parameter would be found with a probability of {one['power']:.2f}"
+    )
+
+
+def kills() -> str:
+    one = found()["kills"]
+    return f"{one['kills']} kills over {one['runs']} runs: none"
+
+
+def hostile() -> str:
+    used, refused = (found()["hostile input"][key] for key in ("used", "refused"))
+    return f"{used + refused:,} cases: {used:,} used, {refused:,} refused, nothing else"
+
+
+@pytest.mark.parametrize("finding", [coverage, calibration, kills, hostile])
+def test_the_quoted_findings_are_those_of_the_last_full_run(finding: Callable[[], str]) -> None:
+    assert f"| {finding()} |" in README
+
+
+def test_the_quoted_speeds_are_those_of_the_last_benchmarks() -> None:
+    rows = [line.split("|")[1:-1] for line in block("numbers: speed").strip().splitlines()[2:]]
+    quoted = {name.strip(): float(value.replace(",", "")) for name, value in rows}
+    assert quoted == pytest.approx(found()["benchmarks"], rel=0.01)

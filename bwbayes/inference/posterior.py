@@ -23,7 +23,7 @@ __all__ = ["Posterior"]
 
 # Models simulated together: enough to share the loop over turns, few enough for the memory.
 BATCH = 64
-ELEMENTS = 1 << 22
+ELEMENTS = 1 << 23
 
 
 @dataclass(frozen=True)
