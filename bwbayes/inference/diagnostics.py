@@ -176,13 +176,18 @@ def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _effective_draws(draws: FloatArray, scores: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Effective draws, given the normal scores of the draws too."""
+    """Effective draws, given the normal scores of the draws too.
+
+    Of the means of the scores and of being in a tail: what arviz calls bulk and tail, which would
+    rank the draws three times more.
+    """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = _ensemble_mean_ess(draws)
-        # Of the mean of the scores: what arviz calls bulk, which would rank the draws once more.
         bulk = array_stats.ess(scores, method="mean")
-        tail = array_stats.ess(_series(draws), method="tail", prob=TAIL)
-    return np.minimum(np.atleast_1d(bulk), cap), np.minimum(np.atleast_1d(tail), cap)
+        # A comparison would take what is not a number for a draw beyond the tail.
+        low, high = (np.where(np.isnan(scores), np.nan, scores <= ndtri(part)) for part in TAIL)
+        tails = [array_stats.ess(tail, method="mean") for tail in (low, high)]
+    return np.minimum(np.atleast_1d(bulk), cap), np.minimum(np.atleast_1d(np.min(tails, 0)), cap)
 
 
 def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> FloatArray:
