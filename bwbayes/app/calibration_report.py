@@ -62,6 +62,7 @@ def render(
     return template("calibration.html.j2").render(
         name=problem.config.name or "calibration",
         passed=calibration.passed,
+        telling=calibration.telling,
         shortcomings=calibration.shortcomings,
         replicates=calibration.replicates,
         unconverged=[str(number) for number in calibration.unconverged],

@@ -87,6 +87,8 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
         console.print(table)
     for text, power in calibration.power.items():
         console.print(f"power of a smooth test against sds {text}: {power:.2f}", highlight=False)
+    if not calibration.telling:
+        console.print("note: so few replicates may well miss sds a fifth too small; make more")
     for remark in calibration.shortcomings:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
     console.print(

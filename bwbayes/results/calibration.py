@@ -59,6 +59,9 @@ LIMITS = 0.99
 # Points at which the distribution functions of ranks are held against their band.
 POINTS = 49
 
+# Power below which nothing follows from a calibration that has passed.
+TELLING = 0.8
+
 # Ratios of a stated to a right posterior sd for which the power is stated.
 WIDTHS = {"20 % too small": 0.8, "10 % too small": 0.9}
 
@@ -148,6 +151,11 @@ class Calibration:
     def passed(self) -> bool:
         """Whether nothing speaks against the posteriors."""
         return not self.shortcomings
+
+    @property
+    def telling(self) -> bool:
+        """Whether there are enough replicates to have noticed sds a fifth too small."""
+        return max(self.power.values()) >= TELLING
 
 
 def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibration:
@@ -347,6 +355,7 @@ def summary(calibration: Calibration) -> dict[str, object]:
     """Return the numbers as ``calibration.json`` holds them."""
     return {
         "passed": calibration.passed,
+        "telling": calibration.telling,
         "shortcomings": list(calibration.shortcomings),
         "replicates": calibration.replicates,
         "unconverged": list(calibration.unconverged),

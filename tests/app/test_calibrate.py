@@ -118,7 +118,8 @@ def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: P
     (tmp_path / "small.toml").write_text(TEXT)
     done = said("small.toml", "--replicates", "3", "--workers", "2", where=tmp_path)
     assert 0 == done.returncode, done.stderr
-    for text in ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not"):
+    said_of_it = ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not")
+    for text in (*said_of_it, "so few replicates may well miss"):
         assert text in done.stdout
     assert "judging" in done.stderr
     assert_same_end(whole, tmp_path / "results/small-calibration")
@@ -126,8 +127,8 @@ def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: P
 
 def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     found = json.loads((whole / "calibration.json").read_text())
-    assert (True, 3, [], 12) == tuple(
-        found[key] for key in ("passed", "replicates", "unconverged", "tests")
+    assert (True, False, 3, [], 12) == tuple(
+        found[key] for key in ("passed", "telling", "replicates", "unconverged", "tests")
     )
     assert 3 == found["seed"]
     assert {"20 % too small", "10 % too small"} == set(found["power_of_one_smooth_test"])
@@ -149,6 +150,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     assert "<b>small</b>" not in page
     assert "&lt;b&gt;small&lt;/b&gt;" in page
     assert "Passed" in page
+    assert "so few replicates may well miss sds a fifth too small" in page
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 3 == page.count("data:image/png;base64,")
     for text in ("12 tests", "1%", "20 % too small", "Binomial limits".lower(), "±"):

@@ -166,6 +166,7 @@ def test_twin_sds_a_fifth_too_small_are_found(seed: int) -> None:
     found = judged(entries(scores(500, seed) / 0.8))
     assert not found.passed
     assert min(found.power.values()) > 0.2
+    assert found.telling
     assert found.power["20 % too small"] > 0.98
 
 
