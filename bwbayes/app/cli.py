@@ -38,6 +38,9 @@ FILE = click.Path(path_type=Path)
 workers_option = click.option(
     "--workers", type=click.IntRange(1), help="Ensembles side by side; default: all cores."
 )
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace files that are there already."
+)
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 
@@ -139,9 +142,9 @@ def check(config: Path, record: Path | None) -> int:
     show_default=True,
     help="identification, verification, step10, step50, step100, or sine (see the next options).",
 )
-@click.option("--amplitude", type=float, default=100.0, show_default=True, help="Of the sine, V.")
-@click.option("--frequency", type=float, default=1.0, show_default=True, help="Of the sine, Hz.")
-@click.option("--duration", type=float, default=16.0, show_default=True, help="Of the sine, s.")
+@click.option("--amplitude", type=float, help="Of the sine, V; default: 100.")
+@click.option("--frequency", type=float, help="Of the sine, Hz; default: 1.")
+@click.option("--duration", type=float, help="Of the sine, s; default: 16.")
 @click.option(
     "--discrepancy",
     type=click.Choice(["none", "process", "structural"]),
@@ -151,15 +154,17 @@ def check(config: Path, record: Path | None) -> int:
 )
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), default=1, show_default=True)
 @click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
+@overwrite_option
 def simulate(
     out: Path,
     wanted: str,
-    amplitude: float,
-    frequency: float,
-    duration: float,
+    amplitude: float | None,
+    frequency: float | None,
+    duration: float | None,
     discrepancy: str,
     seed: int,
     rate: float,
+    overwrite: bool,
 ) -> int:
     """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
 
@@ -167,8 +172,15 @@ def simulate(
     """
     from bwbayes.app.simulate import simulate as write  # noqa: PLC0415
 
-    sine = (amplitude, frequency, duration)
-    for path in write(out, wanted, sine, discrepancy, seed, rate):
+    given = (amplitude, frequency, duration)
+    if wanted != "sine" and any(value is not None for value in given):
+        raise InputError("simulate: amplitude, frequency and duration need --signal sine")
+    first, second, third = (
+        default if value is None else value
+        for value, default in zip(given, (100.0, 1.0, 16.0), strict=True)
+    )
+    sine = (first, second, third)
+    for path in write(out, wanted, sine, discrepancy, seed, rate, overwrite=overwrite):
         click.echo(f"wrote {path}")
     return 0
 
@@ -183,6 +195,7 @@ def simulate(
 )
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="Default: FOLDER/predictions/NAME.csv.")
+@overwrite_option
 def predict(
     folder: Path,
     record: Path | None,
@@ -191,6 +204,7 @@ def predict(
     lead_in: float,
     same_offset: bool,
     out: Path | None,
+    overwrite: bool,
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
 
@@ -204,7 +218,7 @@ def predict(
     if not 0 < lead_in < math.inf:
         raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
     begin = Start(from_rest, not same_offset, lead_in)
-    return write(folder, record, wanted, begin, out, Console())
+    return write(folder, record, wanted, begin, out, Console(), overwrite=overwrite)
 
 
 @cli.command()

@@ -92,6 +92,13 @@ class RecordConfig(_Source):
     decimate: Annotated[int, Field(ge=1)] = 1
     train: Annotated[list[Window], Field(min_length=1)] | None = None
 
+    @field_validator("train", mode="before")
+    @classmethod
+    def _one_window(cls, given: object) -> object:
+        """Take a single window for a list of one."""
+        alone = isinstance(given, list) and given and not any(isinstance(x, list) for x in given)
+        return [given] if alone else given
+
     @model_validator(mode="after")
     def _one_source(self) -> RecordConfig:
         if (self.file is None) == (self.signal is None):

@@ -16,7 +16,7 @@ from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
 from bwbayes.results.files import write_bands
-from bwbayes.results.prediction import Start, predict_record, thinned
+from bwbayes.results.prediction import Start, beyond_training, predict_record, thinned
 from bwbayes.results.scores import score
 
 __all__ = ["predict"]
@@ -29,14 +29,18 @@ def predict(
     start: Start,
     out: Path | None,
     console: Console,
+    *,
+    overwrite: bool = False,
 ) -> int:
     """Predict a record or a signal, write the bands, show their scores; return the exit status.
 
     Raises
     ------
     InputError
-        No such run, or a record that cannot be used.
+        No such run, a record that cannot be used, or a file ``out`` that is there already.
     """
+    if out is not None and out.exists() and not overwrite:
+        raise InputError(f"{out}: exists; choose another name, or give --overwrite")
     folder = RunFolder.open(path)
     problem, chain, outcome = finished(folder)
     if not outcome.converged:
@@ -56,6 +60,8 @@ def predict(
     posterior = problem.posterior
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     chosen = thinned(flat, generator(seed, "draws"))
+    if remark := beyond_training(posterior, other.voltage):
+        click.echo(f"bwbayes: {name}: {remark}", err=True)
     bands = predict_record(
         posterior, chosen, other, start, generator(seed, f"predict {name}"), name
     )

@@ -9,6 +9,7 @@ moved, continued and run again by itself.
 from __future__ import annotations
 
 import difflib
+import re
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -37,7 +38,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import Start
+from bwbayes.results.prediction import Start, beyond_training
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -114,6 +115,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
     prior = JointPrior(_parameters(config, names, record, split.training))
+    if not prior.dimensions:
+        raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
     posterior = Posterior(
         record.voltage,
@@ -131,6 +134,10 @@ def resolve(config: Config, folder: Path) -> Problem:
         else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
         for name, v in config.validation.items()
     }
+    for name, one in validations.items():
+        voltage = record.voltage[one.window] if one.record is None else one.record.voltage
+        if remark := beyond_training(posterior, voltage):
+            remarks.append(f"{name}: {remark}")
     explicit = _explicit(config, posterior, truth)
     plan = _plan(config, posterior)
     return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
@@ -212,6 +219,8 @@ def _parameters(
 def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
     for name in given:
         if name not in known:
+            if name in CATALOGUE:
+                raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
 
@@ -239,6 +248,10 @@ def _parameter(
     unit = meaning.unit
     if name in ("beta", "gamma") and exponent != 1.0:
         unit = "um^(1-n)/V"
+    if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
+        raise InputError(
+            f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
+        )
     return Parameter(
         name,
         given.unit or unit,

@@ -40,15 +40,17 @@ CAPTIONS = {
         "Along time",
         "Voltage, displacement, and what is left of it without the mean; on the right, the stretch "
         "with the largest error enlarged. Each dot is one reading. Of all readings, 95 % should "
-        "lie inside the sensor band; samples of a lead-in served to find the sensor's offset and "
-        "are not judged.",
+        "lie inside the sensor band; those of a lead-in, if any, served to find the sensor's "
+        "offset and are not judged.",
     ),
     "coverage": (
         "Coverage and PIT",
         "Left: how much the bands cover, against what they promise; whiskers are one "
-        "block-bootstrap standard error. Right: how often readings fall at each predicted "
-        "probability. Level is right; a hump means bands that are too wide, a bowl too narrow, a "
-        "slope a bias.",
+        "block-bootstrap standard error. It leaves out that a record has one offset, and a "
+        "posterior one estimate of the discrepancy: one record may be covered more or less than "
+        "many are on average, and its PIT may lean. Right: how often readings fall at each "
+        "predicted probability. Level is right; a hump means bands that are too wide, a bowl too "
+        "narrow, a slope a bias.",
     ),
     "corner": (
         "Posterior",

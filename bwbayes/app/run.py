@@ -48,6 +48,10 @@ __all__ = [
     "versions",
 ]
 
+# A root mean square error, in parts of the range, above which something is wrong: a Bouc-Wen model
+# leaves over one or two percent of an actuator's displacement.
+POOR = 0.05
+
 PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
 
@@ -252,7 +256,14 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     if not outcome.converged:
         return result
     bands = predictions(problem, result)
-    return replace(result, bands=bands, scores=_scores(problem, bands))
+    scores = _scores(problem, bands)
+    missed = max([scores[b.name].nrmse for b in bands if b.training and b.name in scores])
+    if missed > POOR:
+        remarks.append(
+            f"the mean misses the readings that were fitted by {missed:.1%} of their range (rms): "
+            "check the displacement's sign, outliers, and whether this is the right model"
+        )
+    return replace(result, bands=bands, scores=scores, remarks=tuple(remarks))
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
@@ -268,7 +279,6 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     }
     return {
         "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
-        "data_sha256": record.sha256,
         "fitted": windows,
         "model": f"Bouc-Wen, dynamics {config.model.dynamics}, {config.model.hold}-order hold",
         "noise": config.model.noise,
@@ -278,8 +288,7 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
         ),
         "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
         "engine": posterior.engine,
-        "seed": str(config.seed),
-    } | {f"version of {name}": text for name, text in versions(posterior.engine).items()}
+    }
 
 
 def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
@@ -302,8 +311,10 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
     record = problem.record
     assert record.displacement is not None
     write_posterior(folder.path / "posterior.nc", result, record.voltage, record.displacement)
-    write_bands(folder.path / "bands.csv", result.bands)
-    shutil.rmtree(folder.path / "figures", ignore_errors=True)  # no picture of an earlier end
+    (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
+    if result.bands:
+        write_bands(folder.path / "bands.csv", result.bands)
+    shutil.rmtree(folder.path / "figures", ignore_errors=True)
     pictures = save(draw_all(result), folder.path / "figures")
     page = render(result, numbers, pictures)
     (folder.path / "report.html").write_text(page, encoding="utf-8")

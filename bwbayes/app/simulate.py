@@ -24,6 +24,8 @@ def simulate(
     discrepancy: str,
     seed: int,
     rate: float,
+    *,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write a record, and beside it its true parameters; return what was written.
 
@@ -40,8 +42,13 @@ def simulate(
     Raises
     ------
     InputError
-        An unknown signal, impossible values, or a file that cannot be written.
+        An unknown signal, impossible values, or a file that is there already or cannot be written.
     """
+    parameters = out.with_name(f"{out.stem}.truth.json")
+    beside = out.with_name(f"{out.stem}.truth{out.suffix}")
+    for path in (out, beside, parameters):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists; choose another name, or give --overwrite")
     amplitude, frequency, duration = sine
     waveform = Waveform(Sine(amplitude, frequency), duration) if signal == "sine" else named(signal)
     kind = cast("Literal['none', 'process', 'structural']", discrepancy)
@@ -49,10 +56,8 @@ def simulate(
     record = stand.run(waveform, generator(seed, "record"))
     record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
     write_record(record, out)
-    parameters = out.with_name(f"{out.stem}.truth.json")
     try:
         parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
-    beside = out.with_name(f"{out.stem}.truth{out.suffix}")
     return [out, *([beside] if beside.exists() else []), parameters]

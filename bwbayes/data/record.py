@@ -182,7 +182,7 @@ class Record:
                     if one_slice.start < other_slice.stop and other_slice.start < one_slice.stop:
                         raise InputError(
                             f"training window {one[0]:g} to {one[1]:g} s: overlaps the {kind}"
-                            f" window {other[0]:g} to {other[1]:g} s; move one of them"
+                            f" window {other[0]:g} to {other[1]:g} s; move one (record.train)"
                         )
         return Split(tuple(part for _, part in trained), tuple(part for _, part in held))
 

@@ -183,7 +183,8 @@ class Distribution:
         if not isinstance(family, stats.rv_continuous):
             known = [*FAMILIAR, *(n for n, f in vars(stats).items() if _is_continuous(f))]
             near = difflib.get_close_matches(self.name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(FAMILIAR)}"
+            usual = f"use one of {', '.join(FAMILIAR)}"
+            hint = f"did you mean {near[0]}? Else {usual}" if near else usual
             raise InputError(f"{self.name}: unknown distribution; {hint}")
         try:
             return family(**given)

@@ -118,6 +118,7 @@ def test_version_is_the_packages(bwbayes: Type) -> None:
         (("simulate", "none/a.csv"), "none/a.csv: cannot be written"),
         (("simulate", "a.csv", "--signal", "verificaton"), "did you mean 'verification'?"),
         (("simulate", "a.csv", "--discrepancy", "some"), "--discrepancy"),
+        (("simulate", "a.csv", "--amplitude", "20"), "need --signal sine"),
         (("simulate", "a.csv", "--rate", "nan"), "sample_rate"),
         (("simulate", "a.csv", "--rate", "0"), "sample_rate"),
         (("simulate", "a.csv", "--signal", "sine", "--amplitude", "nan"), "amplitude"),
@@ -341,6 +342,35 @@ def test_predict_takes_a_voltage_alone(bwbayes: Type, run: Path, tmp_path: Path)
     assert "CRPS" not in said.out
     header, _ = columns(tmp_path / "bands.csv")
     assert ["time_s", "voltage_V", "mean_um"] == header[:3]
+
+
+def test_predict_says_where_a_voltage_leaves_what_was_fitted(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    rows = [f"{i / 100},{500 * np.sin(i / 30)}" for i in range(300)]
+    (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows))
+    said = bwbayes("predict", run, "--record", "plan.csv", "--out", "bands.csv")
+    assert 0 == said.status
+    assert said.err.startswith("bwbayes: plan: the voltage goes from -500 to 500 V, and only -")
+    assert "the bands are an extrapolation" in said.err
+
+
+def test_no_file_is_replaced_unless_that_is_asked_for(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    """A measured record above all."""
+    (tmp_path / "new.csv").write_bytes(lines(HEADER, *ROWS))
+    before = (tmp_path / "new.csv").read_bytes()
+    for command in (
+        ("simulate", "new.csv"),
+        ("predict", run, "--record", "new.csv", "--lead-in", "0.2", "--out", "new.csv"),
+    ):
+        assert_one_line(bwbayes(*command), "new.csv: exists; choose another name, or give --over")
+        assert before == (tmp_path / "new.csv").read_bytes()
+    assert 0 == bwbayes("simulate", "new.csv", "--rate", "100", "--overwrite").status
+    assert before != (tmp_path / "new.csv").read_bytes()
+    (tmp_path / "new.csv").unlink()
+    assert_one_line(bwbayes("simulate", "new.csv"), "new.truth.csv: exists")
 
 
 def test_lead_in_longer_than_the_record_is_refused(

@@ -47,6 +47,27 @@ def folder(tmp_path: Path) -> Path:
 
 RECORD = '[record]\nfile = "record.csv"\n'
 
+# A value for every parameter of the default model.
+KNOWN = {"d": 0.7, "alpha": 0.35, "beta": 0.03, "gamma": 0.01, "exponent": 1.0, "initial": 0.0}
+KNOWN |= {"lag": 0.01, "offset": 0.0, "sensor_sd": 0.5, "discrepancy_sd": 1.0}
+KNOWN |= {"discrepancy_time": 0.5}
+
+
+def test_single_training_window_needs_no_list_of_its_own(folder: Path) -> None:
+    one, other = (of(RECORD + f"train = {text}", folder) for text in ("[0, 2.0]", "[[0, 2.0]]"))
+    assert (slice(0, 200),) == one.posterior.training == other.posterior.training
+
+
+def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> None:
+    generator = np.random.default_rng(1)
+    voltage = np.concatenate([generator.uniform(-50, 50, 300), generator.uniform(-80, 80, 100)])
+    write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
+    text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
+    (remark,) = of(text + "[3.0, 4.0]", folder).remarks
+    assert remark.startswith("rest: the voltage goes from -")
+    assert "V were fitted: beyond that the bands are an extrapolation" in remark
+    assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
+
 
 def by_name(problem: Problem) -> dict[str, Parameter]:
     return {parameter.name: parameter for parameter in problem.parameters}
@@ -171,7 +192,10 @@ def test_integer_is_a_number(folder: Path) -> None:
     [
         ("[parameters.alfa]\nfixed = 1.0", "parameters.alfa: no such parameter here; "
          "did you mean alpha?"),
-        ("[parameters.mass]\nfixed = 1.0", "parameters.mass: no such parameter here; "),
+        ("[parameters.mass]\nfixed = 1.0", "parameters.mass: is not in this model; see"),
+        ("[parameters.d]\nunit = 'nm/V'", "parameters.d.unit: its numbers are in um/V, not nm/V"),
+        ("[parameters]\n" + "\n".join(f"{n} = {{ fixed = {v} }}" for n, v in KNOWN.items()),
+         "parameters: all are fixed"),
         ("[truth]\nalfa = 0.3", "truth.alfa: no such parameter here; did you mean alpha?"),
         ("[model]\ndynamics = 'second-order'", "parameters.mass: has no default prior; give prior"),
         ("[model]\ndynamics = 'second-order'\n[parameters]\nmass = {fixed = 1e-3}",

@@ -29,9 +29,13 @@ SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
 # Drawn points per unit of length, the ranges of voltage and displacement being one each.
 RESOLUTION = 300
 
-# The tip's panel is as high as this many sensor bands; a tenth of it lies beyond the tip.
+# The tip's panel is as high as this many sensor bands, or half the loop if that is less; a tenth of
+# it lies beyond the tip.
 TIP_HEIGHT = 4.0
 BEYOND = 0.1
+
+# Readings up to which their dots are large and dark.
+FEW = 5000
 
 
 def draw_loop(every: Sequence[Bands]) -> Figure:
@@ -67,8 +71,10 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
     panel.plot(voltage, bands.mean[kept], color=MEAN_COLOUR, lw=0.7, label="mean")
     if bands.measured is not None:
         panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
-        dots = panel.plot(bands.voltage, bands.measured, dot, color=MEASURED_COLOUR, alpha=0.25)
-        dots[0].set(markersize=2.0, markeredgewidth=0.0, zorder=1.5)
+        few = bands.measured.size <= FEW
+        dots = panel.plot(bands.voltage, bands.measured, "." if few else dot, color=MEASURED_COLOUR)
+        size, alpha = (3.0, 0.7) if few else (2.0, 0.25)
+        dots[0].set(markersize=size, markeredgewidth=0.0, zorder=1.5, alpha=alpha)
     panel.autoscale_view()
 
 
@@ -101,8 +107,9 @@ def _zoom(whole: Axes, tip: Axes, bands: Bands) -> None:
     """Cut the tip's panel to the tip and mark it on the whole loop."""
     at = int(np.argmax(bands.voltage))
     width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
-    upright = TIP_HEIGHT * width
-    across = (float(np.ptp(bands.voltage)) or 1.0) * upright / max(np.ptp(bands.mean), upright)
+    height = float(np.max(bands.upper["sensor", 95]) - np.min(bands.lower["sensor", 95]))
+    upright = min(TIP_HEIGHT * width, height / 2)
+    across = (float(np.ptp(bands.voltage)) or 1.0) * upright / height
     left = float(bands.voltage[at]) - (1 - BEYOND) * across
     top = float(np.max(bands.upper["sensor", 95][at])) + BEYOND * upright
     tip.set_xlim(left, left + across)

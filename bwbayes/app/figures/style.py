@@ -69,9 +69,9 @@ ZOOM_COLOUR = "#CC79A7"
 
 # From the widest band, drawn first, to the narrowest.
 BAND_COLOURS: Mapping[Kind, str] = {
-    "sensor": "#C6DFF0",
-    "displacement": "#73B1DA",
-    "parameter": "#00507F",
+    "sensor": "#DCEAF4",
+    "displacement": "#ACD0E8",
+    "parameter": "#6FAAD6",
 }
 BAND_NAMES: Mapping[Kind, str] = {
     "sensor": "95 % sensor reading",
