@@ -148,6 +148,23 @@ def test_bands_without_a_measurement_can_be_drawn() -> None:
     assert "band − mean (µm)" == figure.axes[4].get_ylabel()
 
 
+@pytest.mark.parametrize("wider", [1.0, 30.0])
+def test_frame_of_the_tip_lies_within_the_loop(wider: float) -> None:
+    """However wide the bands are."""
+    bands = example.bands()
+    middle = {key: (bands.lower[key] + bands.upper[key]) / 2 for key in bands.lower}
+    bands = dataclasses.replace(
+        bands,
+        lower={key: middle[key] + wider * (bands.lower[key] - middle[key]) for key in middle},
+        upper={key: middle[key] + wider * (bands.upper[key] - middle[key]) for key in middle},
+    )
+    figure = draw_loop([bands])
+    figure.draw_without_rendering()
+    whole, tip = visible(figure)
+    assert np.ptp(tip.get_ylim()) <= 0.55 * np.ptp(whole.get_ylim())
+    assert np.ptp(tip.get_xlim()) <= 0.55 * np.ptp(whole.get_xlim())
+
+
 def test_loop_without_a_measurement_can_be_drawn() -> None:
     draw_loop([example.bands(measured=False)]).draw_without_rendering()
 

@@ -383,6 +383,15 @@ def test_chain_without_draws_predicts_nothing(
         module.finished(made)
 
 
+def test_fit_that_misses_its_own_readings_is_remarked_on(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not any("misses the readings" in text for text in redraw(copy).remarks)
+    monkeypatch.setattr("bwbayes.app.run.POOR", 1e-4)
+    (remark,) = [text for text in redraw(copy).remarks if "misses the readings" in text]
+    assert "% of their range (rms): check the displacement's sign" in remark
+
+
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:
     """A target that is missed takes back the intervals that a lower one had given."""
     steps = ChainFile.read(copy.chain).steps("sampling")

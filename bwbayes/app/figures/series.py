@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
     BAND_NAMES,
+    EDGE_COLOUR,
     LEAD_IN_COLOUR,
     MEAN_COLOUR,
     MEASURED_COLOUR,
@@ -111,7 +112,9 @@ def _draw_ribbons(panel: Axes, bands: Bands, part: slice, about: FloatArray) -> 
         lower = (bands.lower[kind, 95] - about)[part]
         upper = (bands.upper[kind, 95] - about)[part]
         drawn = envelope(bands.time[part], lower, upper)
-        panel.fill_between(*drawn, color=colour, lw=0, label=BAND_NAMES[kind])
+        # Where the sensor's noise is small, its band would not be seen beside the displacement's.
+        edge = 0.8 if kind == "sensor" else 0.0
+        panel.fill_between(*drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, label=BAND_NAMES[kind])
 
 
 def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:

@@ -22,6 +22,7 @@ __all__ = [
     "BAND_COLOURS",
     "BAND_NAMES",
     "COLOURS",
+    "EDGE_COLOUR",
     "LEAD_IN_COLOUR",
     "MEAN_COLOUR",
     "MEASURED_COLOUR",
@@ -73,6 +74,7 @@ BAND_COLOURS: Mapping[Kind, str] = {
     "displacement": "#ACD0E8",
     "parameter": "#6FAAD6",
 }
+EDGE_COLOUR = "#4C7FA6"
 BAND_NAMES: Mapping[Kind, str] = {
     "sensor": "95 % sensor reading",
     "displacement": "95 % displacement",
