@@ -18,7 +18,7 @@ SMALL = Defect(
     "data/record.py",
     "return self.samples * self.interval",
     "return (self.samples - 1) * self.interval",
-    ("tests/data/test_record.py",),
+    ("tests/data/test_record.py::test_samples_duration_and_range_are_those_of_the_voltage",),
 )
 
 
