@@ -91,10 +91,9 @@ def run_tests(tests: Iterable[str], defect: Defect | None = None) -> tuple[int, 
     """Run tests in a copy of the repository, with a defect or without; exit status and output."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
-        # What numba has compiled is copied too: it knows its source by date and size.
-        compiled_by_python = shutil.ignore_patterns("*.pyc", "found.json.*")
+        # What numba has compiled comes along: it knows its source by date and size.
         for part in ("bwbayes", "tests"):
-            shutil.copytree(ROOT / part, copy / part, ignore=compiled_by_python)
+            shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("*.pyc"))
         shutil.copy(ROOT / "pyproject.toml", copy)
         if defect is not None:
             file = copy / "bwbayes" / defect.file
