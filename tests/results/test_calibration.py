@@ -147,6 +147,13 @@ def test_band_holds_one_point_by_its_binomial_tails() -> None:
     assert np.max([below, above]) < 0.05 / 2
 
 
+def test_band_is_the_same_from_either_end() -> None:
+    """Uniform values less than u are as many as values above 1 - u."""
+    for count, level in ((150, 0.05), (500, 2e-4)):
+        band = ecdf_band(count, level)
+        np.testing.assert_allclose(band.lower, 1 - band.upper[::-1], atol=1e-12)
+
+
 # The verdict
 
 
