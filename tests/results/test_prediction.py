@@ -268,6 +268,15 @@ def test_a_lead_in_that_leaves_nothing_is_refused(
         predicted(posterior, draws, made(), Start(lead_in=lead_in))
 
 
+def test_thinning_takes_draws_from_anywhere() -> None:
+    """A thousand of ten thousand: their mean is known to 87, and late ones are among them."""
+    every = np.arange(10_000.0)[:, np.newaxis]
+    kept = thinned(every, np.random.default_rng(0), 1000)
+    assert 5000 == pytest.approx(np.mean(kept), abs=4 * 87)
+    assert np.min(kept) < 100
+    assert np.max(kept) > 9900
+
+
 def test_thinning_takes_each_draw_at_most_once(draws: FloatArray) -> None:
     kept = thinned(draws, np.random.default_rng(0), 100)
     assert len(np.unique(kept, axis=0)) == 100
