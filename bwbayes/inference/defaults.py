@@ -62,8 +62,8 @@ class Ranges:
 
     @classmethod
     def of(cls, voltage: FloatArray, displacement: FloatArray, interval: float) -> Ranges:
-        """Take the ranges of a voltage (samples,) and a displacement (samples,)."""
-        low, high = float(np.min(displacement)), float(np.max(displacement))
+        """Take the ranges of a voltage (samples,) and a displacement (samples,), nan if missing."""
+        low, high = float(np.nanmin(displacement)), float(np.nanmax(displacement))
         return cls(float(np.ptp(voltage)) / 2, (high - low) / 2, (high + low) / 2, interval)
 
 
