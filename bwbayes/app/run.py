@@ -11,7 +11,9 @@ import json
 import platform
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from rich.console import Console
 
 from bwbayes.app.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
+from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
@@ -150,6 +153,7 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
     """
     problem = load_run(folder)
     chain = ChainFile.read(folder.chain)
+    _require_its_own(folder.chain, problem, chain.attributes())
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; go on with `bwbayes resume {folder.path}`")
     as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
@@ -189,10 +193,7 @@ def _chain(
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
     if folder.chain.exists():
-        chain = ChainFile.resume(folder.chain)
-        if chain.attributes()["data_sha256"] != problem.record.sha256:
-            chain.close()
-            raise InputError(f"{folder.chain}: belongs to another record; run again")
+        chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
             if wanted is None:
@@ -208,6 +209,7 @@ def _chain(
     attributes: dict[str, str | int] = {
         "config": dump(config),
         "data_sha256": problem.record.sha256,
+        "posterior": fingerprint(config),
         "versions": json.dumps(versions(posterior.engine)),
         "engine": posterior.engine,
         "platform": platform.platform(),
@@ -216,6 +218,13 @@ def _chain(
     }
     first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
     return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+
+
+def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
+    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
+    if noted.get("data_sha256") != problem.record.sha256:
+        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
+    require_same(noted.get("posterior"), problem.config, path)
 
 
 def _retarget(
@@ -238,6 +247,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     posterior = problem.posterior
     left_open = identifiability.undetermined(posterior, chain.point)
     remarks = [
+        *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
         *(f"the record does not determine {c}: the prior decides there" for c in left_open),
