@@ -23,7 +23,6 @@ from bwbayes.app.config import (
     ParameterConfig,
     RecordConfig,
     SignalConfig,
-    ValidationConfig,
 )
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
@@ -48,11 +47,15 @@ LARGEST = 1e60
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out data: a window (slice) of the training record, or another record and its start."""
+    """Held-out data: a window (slice) of the training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it.
+    """
 
     window: slice | None = None
     record: Record | None = None
     start: Start = field(default_factory=Start)
+    judged: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         others = {
             name: _other_record(config, name, folder)
             for name, validation in config.validation.items()
-            if validation.window is None
+            if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     hold = config.model.hold
@@ -129,9 +132,13 @@ def resolve(config: Config, folder: Path) -> Problem:
     )
     windows = iter(split.held_out)
     validations = {
-        name: Validation(window=next(windows))
-        if v.window is not None
-        else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
+        name: Validation(
+            record=others[name],
+            start=Start(v.from_rest, v.own_offset, v.lead_in, v.lead_in_from),
+            judged=None if v.window is None else (v.window[0], v.window[1]),
+        )
+        if v.another
+        else Validation(window=next(windows))
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
@@ -175,11 +182,23 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
-    if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
+    begin = record.start if source.lead_in_from is None else source.lead_in_from
+    after = begin - record.start + source.lead_in
+    if source.own_offset and not (
+        begin >= record.start - record.interval / 2
+        and round(source.lead_in / record.interval) >= 1
+        and round(after / record.interval) < record.samples
+    ):
+        key = "lead_in" if source.lead_in_from is None else "lead_in_from"
         raise InputError(
-            f"validation.{name}.lead_in: {source.lead_in:g} s is not a part of the record's "
-            f"{record.duration:g} s; choose another one"
+            f"validation.{name}.{key}: {source.lead_in:g} s is not a part of the record's "
+            f"{record.duration:g} s from {begin:g} s on; choose another one"
         )
+    if source.window is not None:
+        try:
+            record.window_slice(source.window[0], source.window[1])
+        except InputError as error:
+            raise InputError(f"validation.{name}.{error}") from None
     return record
 
 
@@ -193,10 +212,10 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 
 def _split(config: Config, record: Record) -> Split:
-    held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
+    held_out = [v.window for v in config.validation.values() if v.window and not v.another]
     train = config.record.train or [[record.start, record.start + record.duration]]
     pairs = [(window[0], window[1]) for window in train]
-    return record.split(pairs, [(window[0], window[1]) for window in held_out.values()])
+    return record.split(pairs, [(window[0], window[1]) for window in held_out])
 
 
 def _parameters(
@@ -321,14 +340,11 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
     validation = {
-        name: v
-        if v.window is not None
-        else ValidationConfig(
-            file=f"records/{name}.h5",
-            from_rest=v.from_rest,
-            own_offset=v.own_offset,
-            lead_in=v.lead_in,
+        name: v.model_copy(
+            update={"file": f"records/{name}.h5", "signal": None, "voltage_is": None}
         )
+        if v.another
+        else v
         for name, v in config.validation.items()
     }
     return config.model_copy(

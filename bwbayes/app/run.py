@@ -7,6 +7,7 @@ the next one needs, so it does not matter in how many pieces a run is done.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 import shutil
@@ -17,6 +18,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config import Config, dump, load, parse
@@ -39,6 +41,7 @@ from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores, score
+from bwbayes.results.verdict import Background, assess
 
 __all__ = [
     "assemble",
@@ -47,13 +50,10 @@ __all__ = [
     "load_run",
     "predictions",
     "redraw",
+    "scoring",
     "start",
     "versions",
 ]
-
-# A root mean square error, in parts of the range, above which something is wrong: a Bouc-Wen model
-# leaves over one or two percent of an actuator's displacement.
-POOR = 0.05
 
 PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
@@ -178,11 +178,14 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
     }
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
     bands = predict_windows(posterior, chosen, problem.record, windows)
-    for name, validation in problem.validations.items():
-        if validation.record is not None:
-            source = generator(seed, f"predict {name}")
+    for name, other in problem.validations.items():
+        if other.record is not None:
+            # By content: the same record under another name gets the same bands.
+            source = generator(seed, f"predict {other.record.sha256}")
             bands.append(
-                predict_record(posterior, chosen, validation.record, validation.start, source, name)
+                predict_record(
+                    posterior, chosen, other.record, other.start, source, name, other.judged
+                )
             )
     return tuple(bands)
 
@@ -266,14 +269,14 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     if not outcome.converged:
         return result
     bands = predictions(problem, result)
-    scores = _scores(problem, bands)
-    missed = max([scores[b.name].nrmse for b in bands if b.training and b.name in scores])
-    if missed > POOR:
-        remarks.append(
-            f"the mean misses the readings that were fitted by {missed:.1%} of their range (rms): "
-            "check the displacement's sign, outliers, and whether this is the right model"
-        )
-    return replace(result, bands=bands, scores=scores, remarks=tuple(remarks))
+    background = Background.of(posterior, result.flat_draws)
+    verdicts = {one.name: assess(one, background) for one in bands}
+    return replace(
+        result,
+        bands=bands,
+        scores=_scores(problem, bands),
+        verdicts={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+    )
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
@@ -302,12 +305,17 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
 
 
 def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
-    seed = problem.config.seed
     return {
-        one.name: score(one, generator(seed, f"score {one.name}"))
+        one.name: score(one, scoring(problem.config.seed, one))
         for one in bands
         if one.measured is not None
     }
+
+
+def scoring(seed: int, bands: Bands) -> np.random.Generator:
+    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    assert bands.measured is not None
+    return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")
 
 
 def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:

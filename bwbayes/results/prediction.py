@@ -65,11 +65,14 @@ class Start:
         the training record, as it is for a planned voltage without a measurement.
     lead_in
         Length of the lead-in, s.
+    lead_in_from
+        Time at which the lead-in begins, s; by default the record's first sample.
     """
 
     from_rest: bool = False
     own_offset: bool = True
     lead_in: float = 1.0
+    lead_in_from: float | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,7 @@ def predict_record(
     start: Start,
     generator: np.random.Generator,
     name: str = "prediction",
+    window: tuple[float, float] | None = None,
 ) -> Bands:
     """Predict another record, or a planned voltage without a measurement.
 
@@ -162,6 +166,10 @@ def predict_record(
         What is known of its start.
     generator
         Draws the initial states.
+    name
+        The bands' name.
+    window
+        Start and stop in s of the part that is predicted and judged; by default the whole record.
 
     Raises
     ------
@@ -190,9 +198,9 @@ def predict_record(
     else:
         chosen = generator.integers(states.shape[0], size=draws.shape[0])
         mixed = _starting_at(posterior, mixed, states[chosen, np.arange(draws.shape[0])])
-    whole = slice(0, record.samples)
-    found = _bands(name, posterior.actuator, mixed, record, whole)
-    return replace(found, scored_from=lead_in)
+    part = slice(0, record.samples) if window is None else record.window_slice(*window)
+    found = _bands(name, posterior.actuator, mixed, record, part)
+    return replace(found, scored_from=max(lead_in - part.start, 0))
 
 
 def _draws(posterior: Posterior, draws: FloatArray) -> _Draws:
