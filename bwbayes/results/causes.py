@@ -21,9 +21,19 @@ from bwbayes.results.bands import Bands
 __all__ = ["Cause", "Kind", "Residuals", "cause", "likeliest"]
 
 Kind = Literal[
-    "sign", "outliers", "lead-in", "start", "offset", "drift", "extrapolation", "gain", "delay", "loop",
-    "noise", "unknown",
-]  # fmt: skip
+    "sign",
+    "outliers",
+    "lead-in",
+    "start",
+    "offset",
+    "drift",
+    "extrapolation",
+    "gain",
+    "delay",
+    "loop",
+    "noise",
+    "unknown",
+]
 
 # A mark that explains this part of the energy is taken for the cause; a later one in the list
 # below must explain more, because it has more to fit with.
@@ -306,7 +316,7 @@ _WORDS: dict[Kind, tuple[str, str, str]] = {
         "empty their cells in the file, at {spikes} s: they are missing readings then",
     ),
     "lead-in": (
-        "a start that the lead-in does not tell: a switch-on transient, a drift, or another actuator",
+        "a start that the lead-in does not tell: a transient, a drift or another actuator",
         "let the lead-in begin later: lead_in_from = {told} in [validation.{name}]",
         "let it begin later: lead_in_from = {told} in [validation.{name}], or predict with "
         "--lead-in-from {told}; a longer --lead-in or a --window may help too",

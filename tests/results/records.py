@@ -54,7 +54,7 @@ def made(
     parameters: float = 0.3,
 ) -> Made:
     """Make a good record of ``length`` seconds; sds of the parts in um."""
-    time = np.arange(round(length / interval)) * interval
+    time = interval * np.arange(round(length / interval), dtype=np.float64)
     frequency = generator.uniform(0.3, 2.0)
     voltage = 100 * np.sin(2 * np.pi * frequency * time) * np.exp(-0.03 * time)
     mean = 0.7 * voltage - hysteresis(voltage, alpha=0.3575, beta=0.0272, gamma=0.0172)[0]

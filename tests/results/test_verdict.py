@@ -19,15 +19,19 @@ FITTED = (-100.0, 100.0)
 Spoil = Callable[[np.random.Generator, Made, float], FloatArray]
 
 
+def one_of(generator: np.random.Generator, *values: float) -> float:
+    return float(generator.choice(values))
+
+
 def good(generator: np.random.Generator, number: int) -> Verdict:
     """Judge a record that its bands describe, of any length and memory."""
-    length = generator.choice([5.0, 8.0, 14.0, 30.0, 60.0])
-    memory = np.exp(generator.uniform(np.log(0.05), 0))
-    discrepancy = generator.choice([0.3, 1.0, 1.5])
-    interval, sensor = generator.choice([0.005, 0.02]), generator.choice([0.1, 0.3, 0.5])
-    parameters = discrepancy * generator.choice([0.05, 0.3, 0.8])
+    length = one_of(generator, 5.0, 8.0, 14.0, 30.0, 60.0)
+    memory = float(np.exp(generator.uniform(np.log(0.05), 0)))
+    discrepancy = one_of(generator, 0.3, 1.0, 1.5)
+    interval, sensor = one_of(generator, 0.005, 0.02), one_of(generator, 0.1, 0.3, 0.5)
+    parameters = discrepancy * one_of(generator, 0.05, 0.3, 0.8)
     record = made(generator, length, interval, memory, discrepancy, sensor, parameters)
-    believed = Background(memory * generator.choice([0.8, 1.0, 1.5]), 0.0, FITTED)
+    believed = Background(memory * one_of(generator, 0.8, 1.0, 1.5), 0.0, FITTED)
     verdict = assess(bands_of(record, training=bool(number % 2)), believed)
     assert verdict is not None
     return verdict
@@ -61,12 +65,13 @@ def outliers(generator: np.random.Generator, record: Made, _: float) -> FloatArr
 
 
 def beyond(_: np.random.Generator, record: Made, sd: float) -> FloatArray:
-    far = np.maximum(np.abs(record.voltage) - 60, 0)
-    return 0.02 * sd * far**2 * np.sign(record.voltage)
+    far: FloatArray = np.maximum(np.abs(record.voltage) - 60, 0)
+    spoilt: FloatArray = 0.02 * sd * far**2 * np.sign(record.voltage)
+    return spoilt
 
 
 def late(_: np.random.Generator, record: Made, sd: float) -> FloatArray:
-    change = np.gradient(record.mean)
+    change: FloatArray = np.gradient(record.mean)
     return -4 * sd * change / np.std(change)
 
 
@@ -90,10 +95,10 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
     causes = []
     for number in range(50):
         generator = np.random.default_rng([7, number])
-        memory = np.exp(generator.uniform(np.log(0.05), np.log(0.5)))
-        discrepancy = generator.choice([0.3, 1.0, 1.5])
-        length, interval = generator.choice([10.0, 20.0, 30.0]), generator.choice([0.005, 0.02])
-        sensor = generator.choice([0.1, 0.3])
+        memory = float(np.exp(generator.uniform(np.log(0.05), np.log(0.5))))
+        discrepancy = one_of(generator, 0.3, 1.0, 1.5)
+        length, interval = one_of(generator, 10.0, 20.0, 30.0), one_of(generator, 0.005, 0.02)
+        sensor = one_of(generator, 0.1, 0.3)
         record = made(generator, length, interval, memory, discrepancy, sensor, 0.3 * discrepancy)
         spoilt = SPOILT[kind](generator, record, float(record.sds["sensor"].mean()))
         fitted = (-60.0, 60.0) if kind == "extrapolation" else FITTED
