@@ -23,7 +23,6 @@ from bwbayes.app.config import (
     ParameterConfig,
     RecordConfig,
     SignalConfig,
-    ValidationConfig,
 )
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
@@ -49,11 +48,15 @@ LARGEST = 1e60
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out data: a window (slice) of the training record, or another record and its start."""
+    """Held-out data: a window (slice) of the training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it.
+    """
 
     window: slice | None = None
     record: Record | None = None
     start: Start = field(default_factory=Start)
+    judged: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         others = {
             name: _other_record(config, name, folder)
             for name, validation in config.validation.items()
-            if validation.window is None
+            if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     remarks += [f"record: {finding}" for finding in inspect(record)]
@@ -132,9 +135,13 @@ def resolve(config: Config, folder: Path) -> Problem:
     )
     windows = iter(split.held_out)
     validations = {
-        name: Validation(window=next(windows))
-        if v.window is not None
-        else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
+        name: Validation(
+            record=others[name],
+            start=_start(config, name),
+            judged=None if v.window is None else (v.window[0], v.window[1]),
+        )
+        if v.another
+        else Validation(window=next(windows))
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
@@ -179,12 +186,28 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
-    if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
-        raise InputError(
-            f"validation.{name}.lead_in: {source.lead_in:g} s is not a part of the record's "
-            f"{record.duration:g} s; choose another one"
-        )
+    try:
+        _start(config, name).window(record)
+    except InputError as error:
+        raise InputError(f"validation.{name}.lead_in: {error}") from None
+    if source.window is not None:
+        try:
+            record.window_slice(source.window[0], source.window[1])
+        except InputError as error:
+            raise InputError(f"validation.{name}.{error}") from None
     return record
+
+
+def _start(config: Config, name: str) -> Start:
+    """Return what a config knows of another record's start; its hold is its own, unless given."""
+    source, hold = config.validation[name], config.model.hold
+    return Start(
+        source.from_rest,
+        source.own_offset,
+        source.lead_in,
+        source.lead_in_from,
+        None if hold == "auto" else hold,
+    )
 
 
 def _stand(config: Config) -> VirtualTestStand:
@@ -197,7 +220,7 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 
 def _split(config: Config, record: Record) -> Split:
-    held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
+    held_out = {n: v.window for n, v in config.validation.items() if v.window and not v.another}
     if config.record.train is None:
         first, last = np.flatnonzero(record.has_reading)[[0, -1]]
         train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
@@ -342,14 +365,11 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
     validation = {
-        name: v
-        if v.window is not None
-        else ValidationConfig(
-            file=f"records/{name}.h5",
-            from_rest=v.from_rest,
-            own_offset=v.own_offset,
-            lead_in=v.lead_in,
+        name: v.model_copy(
+            update={"file": f"records/{name}.h5", "signal": None, "voltage_is": None}
         )
+        if v.another
+        else v
         for name, v in config.validation.items()
     }
     return config.model_copy(
@@ -361,7 +381,7 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
             ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
-                hold=posterior.actuator.hold,
+                hold=config.model.hold,
                 noise=config.model.noise,
             ),
             "parameters": {p.name: _as_config(p) for p in prior.parameters},
