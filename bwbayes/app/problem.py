@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -209,11 +210,14 @@ def _parameters(
     voltage, displacement = record.voltage[rows], record.displacement[rows]
     if np.ptp(voltage) == 0 or np.ptp(displacement) == 0:
         raise InputError("record.train: voltage or displacement is constant there; widen it")
-    ranges = Ranges.of(voltage, displacement, record.interval)
-    exponent = _fixed(config, "exponent", 1.0)
-    stiffness = _fixed(config, "stiffness", None)
     given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
-    return [_parameter(name, given[name], ranges, exponent, stiffness) for name in names]
+    defaults = _Defaults(
+        Ranges.of(record.voltage, record.displacement, record.interval, training),
+        _exponent(config),
+        _fixed(config, "stiffness", None),
+        _fixed(config, "gamma", None) is None,
+    )
+    return [_parameter(name, given[name], defaults) for name in names]
 
 
 def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
@@ -230,23 +234,48 @@ def _fixed(config: Config, name: str, default: float | None) -> float | None:
     return default if given is None or given.fixed is None else given.fixed
 
 
-def _parameter(
-    name: str,
-    given: ParameterConfig,
-    ranges: Ranges,
-    exponent: float | None,
-    stiffness: float | None,
-) -> Parameter:
+def _exponent(config: Config) -> float | Distribution:
+    """Return the exponent's value, or its prior if the config frees it."""
+    given = config.parameters.get("exponent")
+    if given is not None and given.prior is not None:
+        return _distribution("exponent", given.prior)
+    value = _fixed(config, "exponent", 1.0)
+    return 1.0 if value is None else value
+
+
+class _Defaults(NamedTuple):
+    """What default priors depend on."""
+
+    ranges: Ranges
+    exponent: float | Distribution
+    stiffness: float | None
+    gamma_free: bool
+
+    def of(self, name: str) -> tuple[Distribution | None, float | None]:
+        """Return a parameter's default prior, or the value at which it is fixed by default."""
+        try:
+            found = default_prior(
+                name, self.ranges, self.exponent, self.stiffness, gamma_free=self.gamma_free
+            )
+        except KeyError:
+            raise InputError(
+                f"parameters.{name}: has no default prior; give prior or fixed (a record shows "
+                "mass and stiffness only through the damping)"
+            ) from None
+        return (found, None) if isinstance(found, Distribution) else (None, found)
+
+
+def _parameter(name: str, given: ParameterConfig, defaults: _Defaults) -> Parameter:
     """Put what the config says of a parameter before what the defaults say."""
     meaning = CATALOGUE[name]
     prior, fixed = None, given.fixed
     if given.prior is not None:
         prior = _distribution(name, given.prior)
     elif fixed is None:
-        prior, fixed = _default(name, ranges, exponent or 1.0, stiffness)
+        prior, fixed = defaults.of(name)
     _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
     unit = meaning.unit
-    if name in ("beta", "gamma") and exponent != 1.0:
+    if name in ("beta", "gamma") and defaults.exponent != 1.0:
         unit = "um^(1-n)/V"
     if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
         raise InputError(
@@ -278,19 +307,6 @@ def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
         return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"parameters.{name}.prior: {error}") from None
-
-
-def _default(
-    name: str, ranges: Ranges, exponent: float, stiffness: float | None
-) -> tuple[Distribution | None, float | None]:
-    try:
-        found = default_prior(name, ranges, exponent, stiffness)
-    except KeyError:
-        raise InputError(
-            f"parameters.{name}: has no default prior; give prior or fixed (a record shows mass "
-            "and stiffness only through the damping)"
-        ) from None
-    return (found, None) if isinstance(found, Distribution) else (None, found)
 
 
 # Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
