@@ -15,8 +15,9 @@ from bwbayes.data import Record, read_record
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
+from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands
-from bwbayes.results.prediction import Start, beyond_training, predict_record, thinned
+from bwbayes.results.prediction import Start, predict_record, thinned
 from bwbayes.results.scores import score
 
 __all__ = ["predict"]
@@ -60,7 +61,7 @@ def predict(
     posterior = problem.posterior
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     chosen = thinned(flat, generator(seed, "draws"))
-    if remark := beyond_training(posterior, other.voltage):
+    for remark in beyond_training(posterior, other.voltage, other.interval):
         click.echo(f"bwbayes: {name}: {remark}", err=True)
     bands = predict_record(
         posterior, chosen, other, start, generator(seed, f"predict {name}"), name

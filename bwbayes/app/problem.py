@@ -39,7 +39,8 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import Start, beyond_training
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -136,9 +137,10 @@ def resolve(config: Config, folder: Path) -> Problem:
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
-        voltage = record.voltage[one.window] if one.record is None else one.record.voltage
-        if remark := beyond_training(posterior, voltage):
-            remarks.append(f"{name}: {remark}")
+        other = one.record or record
+        voltage = other.voltage[one.window or slice(None)]
+        leaving = beyond_training(posterior, voltage, other.interval)
+        remarks += [f"{name}: {remark}" for remark in leaving]
     explicit = _explicit(config, posterior, truth)
     plan = _plan(config, posterior)
     return Problem(explicit, record, posterior, plan, validations, tuple(remarks))

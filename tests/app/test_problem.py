@@ -63,9 +63,11 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     voltage = np.concatenate([generator.uniform(-50, 50, 300), generator.uniform(-80, 80, 100)])
     write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
-    (remark,) = of(text + "[3.0, 4.0]", folder).remarks
+    # Jumps of up to 160 V are also faster than those of up to 100 V.
+    remark, faster = of(text + "[3.0, 4.0]", folder).remarks
     assert remark.startswith("rest: the voltage goes from -")
     assert "V were fitted: beyond that the bands are an extrapolation" in remark
+    assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
     assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
 
 
