@@ -40,6 +40,8 @@ def white(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Run the same with white noise alone."""
     folder = tmp_path_factory.mktemp("white")
     text = (ROOT / "runs/measured_stack.toml").read_text(encoding="utf-8")
+    start = text.index("[parameters.discrepancy_time]")
+    text = text[:start] + text[text.index("[sampling]") :]
     config = folder / "white.toml"
     config.write_text(text.replace('hold = "first"', 'hold = "first"\nnoise = "white"'))
     return run(folder / "out", config)
