@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from bwbayes.data.checks import require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
@@ -67,6 +66,8 @@ class Problem:
     plan: SamplingPlan
     validations: Mapping[str, Validation]
     remarks: tuple[str, ...] = ()
+    defaults: Mapping[str, Distribution] = field(default_factory=dict)
+    """What the default priors of this record would be, by name."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -116,7 +117,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     actuator = Actuator(config.model.dynamics, hold, record.interval)
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
-    prior = JointPrior(_parameters(config, names, record, split.training))
+    defaults = _defaults(config, record, split.training)
+    prior = JointPrior(_parameters(config, names, defaults))
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -143,7 +145,9 @@ def resolve(config: Config, folder: Path) -> Problem:
         remarks += [f"{name}: {remark}" for remark in leaving]
     explicit = _explicit(config, posterior, truth)
     plan = _plan(config, posterior)
-    return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
+    return Problem(
+        explicit, record, posterior, plan, validations, tuple(remarks), defaults.priors(names)
+    )
 
 
 def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, float]]:
@@ -202,24 +206,25 @@ def _split(config: Config, record: Record) -> Split:
     return record.split(pairs, [(window[0], window[1]) for window in held_out.values()])
 
 
-def _parameters(
-    config: Config, names: tuple[str, ...], record: Record, training: tuple[slice, ...]
-) -> list[Parameter]:
+def _parameters(config: Config, names: tuple[str, ...], defaults: Defaults) -> list[Parameter]:
     _require_known("parameters", config.parameters, names)
     _require_known("truth", config.truth, CATALOGUE)
+    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
+    return [_parameter(name, given[name], defaults) for name in names]
+
+
+def _defaults(config: Config, record: Record, training: tuple[slice, ...]) -> Defaults:
     rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
     assert record.displacement is not None
     voltage, displacement = record.voltage[rows], record.displacement[rows]
     if np.ptp(voltage) == 0 or np.ptp(displacement) == 0:
         raise InputError("record.train: voltage or displacement is constant there; widen it")
-    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
-    defaults = _Defaults(
+    return Defaults(
         Ranges.of(record.voltage, record.displacement, record.interval, training),
         _exponent(config),
         _fixed(config, "stiffness", None),
         _fixed(config, "gamma", None) is None,
     )
-    return [_parameter(name, given[name], defaults) for name in names]
 
 
 def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
@@ -245,36 +250,24 @@ def _exponent(config: Config) -> float | Distribution:
     return 1.0 if value is None else value
 
 
-class _Defaults(NamedTuple):
-    """What default priors depend on."""
-
-    ranges: Ranges
-    exponent: float | Distribution
-    stiffness: float | None
-    gamma_free: bool
-
-    def of(self, name: str) -> tuple[Distribution | None, float | None]:
-        """Return a parameter's default prior, or the value at which it is fixed by default."""
-        try:
-            found = default_prior(
-                name, self.ranges, self.exponent, self.stiffness, gamma_free=self.gamma_free
-            )
-        except KeyError:
-            raise InputError(
-                f"parameters.{name}: has no default prior; give prior or fixed (a record shows "
-                "mass and stiffness only through the damping)"
-            ) from None
-        return (found, None) if isinstance(found, Distribution) else (None, found)
-
-
-def _parameter(name: str, given: ParameterConfig, defaults: _Defaults) -> Parameter:
+def _parameter(name: str, given: ParameterConfig, defaults: Defaults) -> Parameter:
     """Put what the config says of a parameter before what the defaults say."""
     meaning = CATALOGUE[name]
     prior, fixed = None, given.fixed
     if given.prior is not None:
         prior = _distribution(name, given.prior)
     elif fixed is None:
-        prior, fixed = defaults.of(name)
+        try:
+            default = defaults.of(name)
+        except KeyError:
+            raise InputError(
+                f"parameters.{name}: has no default prior; give prior or fixed (a record shows "
+                "mass and stiffness only through the damping)"
+            ) from None
+        if isinstance(default, Distribution):
+            prior = default
+        else:
+            fixed = default
     _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
     unit = meaning.unit
     if name in ("beta", "gamma") and defaults.exponent != 1.0:

@@ -19,7 +19,7 @@ priors, not the record, say how large β is, and leave room for the value that a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.drive import time_between_turns
 
-__all__ = ["CATALOGUE", "Meaning", "Ranges", "default_prior"]
+__all__ = ["CATALOGUE", "Defaults", "Meaning", "Ranges", "default_prior"]
 
 
 class Meaning(NamedTuple):
@@ -147,6 +147,30 @@ def default_prior(
     if stiffness is not None:
         priors["damping"] = _lognormal(0.01 * time * stiffness, 2.0)
     return priors[name]
+
+
+@dataclass(frozen=True)
+class Defaults:
+    """The default priors of one record and model; the arguments are :func:`default_prior`'s."""
+
+    ranges: Ranges
+    exponent: float | Distribution = 1.0
+    stiffness: float | None = None
+    gamma_free: bool = True
+
+    def of(self, name: str) -> Distribution | float:
+        """Return a parameter's default, as :func:`default_prior` does."""
+        return default_prior(
+            name, self.ranges, self.exponent, self.stiffness, gamma_free=self.gamma_free
+        )
+
+    def priors(self, names: Collection[str]) -> dict[str, Distribution]:
+        """Return the default priors of those of the parameters that have one."""
+        without = {"exponent", "mass", "stiffness"}
+        if self.stiffness is None:
+            without.add("damping")
+        known = {name: self.of(name) for name in names if name not in without}
+        return {name: prior for name, prior in known.items() if isinstance(prior, Distribution)}
 
 
 # Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
