@@ -85,8 +85,12 @@ class _Source(_Table):
 
 
 class RecordConfig(_Source):
-    """The training record: its source, the part to use, and the windows to fit (default: all)."""
+    """The training record: its source, the part to use, and the windows to fit (default: all).
 
+    ``from_rest``: it starts with a demagnetised actuator at rest.
+    """
+
+    from_rest: bool = False
     start: float | None = None
     stop: float | None = None
     decimate: Annotated[int, Field(ge=1)] = 1

@@ -130,6 +130,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         noise,
         prior,
         choose(config.sampling.engine),
+        config.record.from_rest,
     )
     windows = iter(split.held_out)
     validations = {
@@ -210,6 +211,8 @@ def _parameters(config: Config, names: tuple[str, ...], defaults: Defaults) -> l
     _require_known("parameters", config.parameters, names)
     _require_known("truth", config.truth, CATALOGUE)
     given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
+    if config.record.from_rest:
+        given |= {"initial": config.parameters.get("initial", ParameterConfig(fixed=0.0))}
     return [_parameter(name, given[name], defaults) for name in names]
 
 
@@ -344,7 +347,11 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     }
     return config.model_copy(
         update={
-            "record": RecordConfig(file="records/record.h5", train=config.record.train),
+            "record": RecordConfig(
+                file="records/record.h5",
+                train=config.record.train,
+                from_rest=config.record.from_rest,
+            ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
                 hold=posterior.actuator.hold,

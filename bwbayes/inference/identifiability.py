@@ -100,14 +100,14 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     sds = posterior.noise.marginal_sd(theta[:, len(posterior.actuator.parameters) :])
-    floor = DISCREPANCY * float(np.ptp(posterior.displacement[rows]))
+    floor = DISCREPANCY * float(np.ptp(posterior.readings.values))
     weights, duration = _stretches(posterior.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sds[1][0], floor, duration / 2]])
     total = np.zeros((slopes.shape[0], slopes.shape[0]))
     for window in windows:
-        white = noise.whiten(values, slopes[:, window])
+        (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])
         total += (white * weights[window]) @ white.T
     return total
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -12,7 +14,7 @@ from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator
+from bwbayes.model.actuator import Actuator, State
 from tests.inference.problems import posterior_of, short_posterior, truth
 
 CASES = ("white", "discrepancy", "lag")
@@ -103,9 +105,15 @@ def test_the_mode_is_the_first_optimum(fits: Fits, name: str) -> None:
 class MirrorActuator(Actuator):
     """A model that cannot tell the sign of its offset."""
 
-    def displacement(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:  # type: ignore[override]
+    def advance(  # type: ignore[override]
+        self,
+        theta: FloatArray,
+        voltage: FloatArray,
+        state: State | None = None,
+        unrest: FloatArray | None = None,
+    ) -> tuple[FloatArray, State]:
         """Return the displacement, its offset taken as a size."""
-        return super().displacement(np.abs(theta), voltage)
+        return super().advance(np.abs(theta), voltage, state, unrest)
 
 
 def test_several_optima_are_reported_as_distinct() -> None:
@@ -142,11 +150,22 @@ def test_noise_alone_can_be_fitted() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(residual**2)), sensor, rtol=0.01)
 
 
+class Impossible(WhiteNoise):
+    """A noise that no residual can have."""
+
+    def whiten(
+        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return innovations under an infinite determinant."""
+        white, log_determinant = super().whiten(theta, series, skipped)
+        return white, log_determinant + np.inf
+
+
 def test_without_a_finite_density_there_is_no_fit() -> None:
     usual = short_posterior("white", 50)
     posterior = posterior_of(
         usual.voltage, usual.displacement, usual.actuator, "white", {"initial": 0.0}
     )
-    posterior.displacement[10] = np.nan
+    posterior = replace(posterior, noise=Impossible())
     with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
         fit(posterior, np.random.default_rng(9))
