@@ -238,12 +238,11 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     posterior = problem.posterior
     sampled = draws(posterior, chain)
     flat = sampled.reshape(-1, sampled.shape[-1])
-    left_open = identifiability.undetermined(posterior, chain.point)
     remarks = [
         *problem.remarks,
         *outcome.remarks,
         *conflict.conflicts(posterior.prior, flat, problem.defaults),
-        *(f"the record does not determine {c}: the prior decides there" for c in left_open),
+        *identifiability.remarks(posterior, chain.point, flat),
     ]
     result = Result(
         name=problem.config.name or "run",

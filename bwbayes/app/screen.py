@@ -121,15 +121,11 @@ def show_check(config: Config, folder: Path, console: Console) -> None:
     show_priors(posterior.prior, console, dict(zip(posterior.names, free[0], strict=True)))
     likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
     conflicts = conflict.conflicts(posterior.prior, likely, problem.defaults)
-    left_open = identifiability.undetermined(posterior, point)
+    untold = identifiability.remarks(posterior, point, likely)
     for remark in (*problem.remarks, *conflicts):
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
-    for combination in left_open:
-        console.print(
-            f"warning: the record does not determine {combination}: the prior decides there",
-            highlight=False,
-            soft_wrap=True,
-        )
+    for remark in untold:
+        console.print(f"warning: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def show_priors(
