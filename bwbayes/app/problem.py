@@ -27,6 +27,7 @@ from bwbayes.app.config import (
 )
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
+from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
@@ -111,6 +112,7 @@ def resolve(config: Config, folder: Path) -> Problem:
             if validation.window is None
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    remarks += [f"record: {finding}" for finding in inspect(record)]
     hold = config.model.hold
     if hold == "auto":
         hold = "zero" if record.voltage_is == "command" else "first"
@@ -162,10 +164,11 @@ def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, fl
         waveform = sampled_waveform(source.signal)
         record = _named(stand.run(waveform, generator(config.seed, "record")), source.signal)
         truth = stand.parameters() | truth
+    if source.exclude is not None:
+        record = record.exclude([(window[0], window[1]) for window in source.exclude])
     if source.start is not None or source.stop is not None:
-        end = record.start + record.duration
-        start = record.start if source.start is None else source.start
-        record = record.window(start, end if source.stop is None else source.stop)
+        end = record.start + record.duration if source.stop is None else source.stop
+        record = record.upto(end, source.start)
     if source.decimate > 1:
         record = record.decimate(source.decimate)
     require_readable(record, "record")
@@ -202,9 +205,24 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 def _split(config: Config, record: Record) -> Split:
     held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
-    train = config.record.train or [[record.start, record.start + record.duration]]
-    pairs = [(window[0], window[1]) for window in train]
-    return record.split(pairs, [(window[0], window[1]) for window in held_out.values()])
+    if config.record.train is None:
+        first, last = np.flatnonzero(record.has_reading)[[0, -1]]
+        train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
+    else:
+        train = [(window[0], window[1]) for window in config.record.train]
+    split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
+    parts = [("record.train", window) for window in split.training]
+    parts += [
+        (f"validation.{name}.window", w) for name, w in zip(held_out, split.held_out, strict=True)
+    ]
+    for place, part in parts:
+        if not record.has_reading[part].any():
+            begin, end = record.time[part][[0, -1]]
+            raise InputError(
+                f"{place}: no readings from {begin:g} to {end:g} s; choose another window, or see "
+                "start, exclude and decimate in [record]"
+            )
+    return split
 
 
 def _parameters(config: Config, names: tuple[str, ...], defaults: Defaults) -> list[Parameter]:
@@ -220,7 +238,7 @@ def _defaults(config: Config, record: Record, training: tuple[slice, ...]) -> De
     rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
     assert record.displacement is not None
     voltage, displacement = record.voltage[rows], record.displacement[rows]
-    if np.ptp(voltage) == 0 or np.ptp(displacement) == 0:
+    if np.ptp(voltage) == 0 or np.nanmax(displacement) == np.nanmin(displacement):
         raise InputError("record.train: voltage or displacement is constant there; widen it")
     return Defaults(
         Ranges.of(record.voltage, record.displacement, record.interval, training),

@@ -173,7 +173,8 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
         for i, window in enumerate(training)
     }
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    bands = predict_windows(posterior, chosen, problem.record, windows)
+    source = generator(seed, "predict windows")
+    bands = predict_windows(posterior, chosen, problem.record, windows, source)
     for name, validation in problem.validations.items():
         if validation.record is not None:
             source = generator(seed, f"predict {name}")

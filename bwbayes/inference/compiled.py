@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["moments"]
 
+# Elements (models x samples) of h that is worked out beforehand, at a time.
+LARGEST = 1 << 23
+
 
 def moments(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return what :meth:`Likelihood.moments` does, at θ (models, parameters) with its initial h."""
@@ -37,15 +40,16 @@ def moments(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Floa
     free = 0 if likelihood.from_rest else actuator.unknowns
     offset = 1 if likelihood.offset_sd else 0
     sums = np.empty((kernels.SUMS, len(theta)))
-    for rows in (closed, ~closed):
-        if rows.any():
-            known = np.empty((int(rows.sum()), 0))
-            if rows is not closed:
-                names = ("alpha", "beta", "gamma", "exponent", "initial")
-                known = hysteresis(voltage, **{name: column[name][rows] for name in names})
-            sums[:, rows] = kernels.sums(
-                voltage, likelihood.values, likelihood.skipped, models[rows], known, offset, free
-            )
+    record = voltage, likelihood.values, likelihood.skipped
+    if closed.any():
+        unknown = np.empty((int(closed.sum()), 0))
+        sums[:, closed] = kernels.sums(*record, models[closed], unknown, offset, free)
+    others = np.flatnonzero(~closed)
+    size = max(LARGEST // voltage.size, 1)
+    for rows in (others[i : i + size] for i in range(0, others.size, size)):
+        names = ("alpha", "beta", "gamma", "exponent", "initial")
+        known = hysteresis(voltage, **{name: column[name][rows] for name in names})
+        sums[:, rows] = kernels.sums(*record, models[rows], known, offset, free)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):

@@ -53,11 +53,14 @@ class Moments(NamedTuple):
 class LinearStart(NamedTuple):
     """The normal posterior of a record's unknown start, given all other parameters.
 
-    ``log_density`` (models,) of the readings, the start integrated out; ``mean`` (models, unknowns)
-    and ``covariance`` (models, unknowns, unknowns), um and um².
+    ``log_density`` (models,) of the readings, the start integrated out; ``squares`` (models,), the
+    squared distance of the readings from what is expected, which has a χ² distribution if the
+    model is right; ``mean`` (models, unknowns) and ``covariance`` (models, unknowns, unknowns), um
+    and um².
     """
 
     log_density: FloatArray
+    squares: FloatArray
     mean: FloatArray
     covariance: FloatArray
 
@@ -136,7 +139,7 @@ class Likelihood:
         logs = log_determinant + np.linalg.slogdet(precision)[1]
         density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
-        return LinearStart(density, sd * mean, covariance)
+        return LinearStart(density, squares, sd * mean, covariance)
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""

@@ -152,13 +152,44 @@ def test_resolved_config_resolves_to_the_same_numbers(
     np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
 
 
-def test_part_of_a_record_is_resolved_once(folder: Path) -> None:
-    text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\ntrain = [[1.0, 2.0]]\n"
+@pytest.mark.parametrize("train", ["train = [[1.0, 2.0]]\n", ""])
+def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
+    folder: Path, train: str
+) -> None:
+    text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\nexclude = [1.5, 1.7]\n" + train
     first = of(text, folder)
-    assert (100, 0.02, 1.0) == (first.record.samples, first.record.interval, first.record.start)
+    assert (300, 0.01, 0.0) == (first.record.samples, first.record.interval, first.record.start)
+    np.testing.assert_array_equal(record().voltage[:300], first.posterior.voltage)
+    assert [*range(100, 150, 2), *range(170, 300, 2)] == np.flatnonzero(
+        first.record.has_reading
+    ).tolist()
+    assert (slice(100, 200 if train else 299),) == first.posterior.training
     again = load_run(RunFolder.create(folder / "run", first, overwrite=False))
-    assert (again.record.samples, again.record.sha256) == (100, first.record.sha256)
+    assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
+    assert again.posterior.training == first.posterior.training
     assert again.parameters == first.parameters
+    assert again.config == first.config
+
+
+def test_default_priors_come_from_the_readings_there_are(folder: Path) -> None:
+    whole, some = (of(RECORD + text, folder) for text in ("", "exclude = [[1.0, 3.5]]"))
+    assert by_name(whole)["offset"] == by_name(some)["offset"]
+    made = record()
+    assert made.displacement is not None
+    wild = np.where(np.arange(400) == 200, 1e4, made.displacement)
+    write_record(replace(made, displacement=wild), folder / "record.csv")
+    assert by_name(some) == by_name(of(RECORD + "exclude = [[1.0, 3.5]]", folder))
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("train = [[0.5, 0.9], [1.2, 2.0]]", "record.train: no readings from 0.5 to 0.89 s"),
+        ("[validation.a]\nwindow = [0.0, 0.5]", "validation.a.window: no readings from 0 to"),
+    ],
+)
+def test_windows_without_readings_are_refused(folder: Path, text: str, place: str) -> None:
+    assert place in refused(RECORD + "start = 1.0\n" + text, folder)
 
 
 def test_run_folder_can_be_moved(tmp_path: Path) -> None:
@@ -255,7 +286,7 @@ def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said
         ("train = [[0.0, 2.0], [1.0, 3.0]]", "overlaps the training window 0 to 2 s"),
         ("train = [[0.0, 9.0]]", "reaches outside the record"),
         ("start = 3.0\nstop = 2.0", "holds no sample"),
-        ("decimate = 1000", "record: too short, samples: 1;"),
+        ("decimate = 1000", "record: displacement_um: too few readings: 1;"),
         ("stop = 0.09", "record: too short, samples: 9; give at least 10"),
     ],
 )

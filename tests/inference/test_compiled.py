@@ -73,6 +73,19 @@ def test_windows_start_anywhere() -> None:
     assert_engines_agree(posterior, prior_draws(posterior, 40))
 
 
+@pytest.mark.parametrize("discrepancy_sd", [0.05, 0.2])
+def test_engines_agree_on_a_start_that_is_long_remembered(discrepancy_sd: float) -> None:
+    """A small discrepancy of long memory in a large noise: the filter settles in 200 samples or so.
+
+    What is off by a large constant, as for a bad model, keeps pulling at the start all that time.
+    """
+    posterior = short_posterior(samples=6000, dynamics="lag", fixed={})
+    theta = changed(
+        posterior, sensor_sd=1.0, discrepancy_sd=discrepancy_sd, discrepancy_time=20.0, offset=30.0
+    )
+    assert_engines_agree(posterior, theta)
+
+
 def test_a_general_exponent_is_left_to_numpy() -> None:
     posterior = short_posterior(dynamics="lag", fixed={"initial": 2.0})
     theta = np.repeat(truth(posterior), 5, axis=0)

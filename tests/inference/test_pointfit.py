@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -102,8 +102,11 @@ def test_the_mode_is_the_first_optimum(fits: Fits, name: str) -> None:
     assert 1 == len(point.optima)
 
 
+@dataclass(frozen=True)
 class MirrorActuator(Actuator):
-    """A model that cannot tell the sign of its offset."""
+    """A model that tells the sign of its offset only by ``worse`` um from sample to sample."""
+
+    worse: float = 0.0
 
     def advance(  # type: ignore[override]
         self,
@@ -113,31 +116,57 @@ class MirrorActuator(Actuator):
         unrest: FloatArray | None = None,
     ) -> tuple[FloatArray, State]:
         """Return the displacement, its offset taken as a size."""
-        return super().advance(np.abs(theta), voltage, state, unrest)
+        moved, end = super().advance(np.abs(theta), voltage, state, unrest)
+        jagged = self.worse * (-1.0) ** np.arange(voltage.size)
+        return moved + jagged * (theta[:, -1:] < 0), end
 
 
-def test_several_optima_are_reported_as_distinct() -> None:
-    """A model with two mirrored solutions gives both, once each."""
+def mirrored(worse: float = 0.0) -> Posterior:
+    """Return a posterior with optima at offsets of 6 um and, worse or not, of -6 um."""
     usual = short_posterior(
         "white",
         200,
         fixed={"initial": 0.0, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172},
         priors={"offset": Distribution("normal", {"mean": 0.0, "sd": 10.0})},
     )
-    mirrored = Posterior(
+    return Posterior(
         usual.voltage,
         usual.displacement + 6.0,
         usual.training,
-        MirrorActuator("none", "first", 0.01),
+        MirrorActuator("none", "first", 0.01, worse),
         WhiteNoise(),
         usual.prior,
     )
-    point = fit(mirrored, np.random.default_rng(7))
-    assert ("d", "offset", "sensor_sd") == mirrored.names
-    free, _ = mirrored.prior.constrain(point.optima)
+
+
+def test_several_optima_are_reported_as_distinct() -> None:
+    """A model with two mirrored solutions gives both, once each."""
+    posterior = mirrored()
+    point = fit(posterior, np.random.default_rng(7))
+    assert ("d", "offset", "sensor_sd") == posterior.names
+    free, _ = posterior.prior.constrain(point.optima)
     np.testing.assert_allclose([-6.0, 6.0], np.sort(free[:, 1]), atol=0.15)
-    density = mirrored.log_density(point.optima)
+    density = posterior.log_density(point.optima)
     np.testing.assert_allclose(density[0], density[1], atol=1e-3)
+
+
+def test_the_mode_is_the_best_of_the_optima_and_one_not_much_worse_is_kept() -> None:
+    """The other is some nats worse: the sum of squares is 200 x 0.1^2 larger, at an sd of 0.3."""
+    posterior = mirrored(worse=0.1)
+    point = fit(posterior, np.random.default_rng(7))
+    free, _ = posterior.prior.constrain(point.optima)
+    np.testing.assert_allclose([6.0, -6.0], free[:, 1], atol=0.15)
+    density = posterior.log_density(point.optima)
+    assert density[0] == point.log_density
+    assert 3 < density[0] - density[1] < 30
+
+
+def test_an_optimum_that_is_much_worse_is_no_place_to_start_from() -> None:
+    """With residuals of 2 um instead of 0.3: two nats per sample."""
+    posterior = mirrored(worse=2.0)
+    point = fit(posterior, np.random.default_rng(7))
+    free, _ = posterior.prior.constrain(point.optima)
+    np.testing.assert_allclose([6.0], free[:, 1], atol=0.15)
 
 
 def test_noise_alone_can_be_fitted() -> None:

@@ -252,7 +252,7 @@ def test_another_sampling_interval_gives_the_same_bands(
     posterior: Posterior, draws: FloatArray
 ) -> None:
     fine = replace(made(), displacement=None, truth=None)
-    coarse = fine.decimate(2)
+    coarse = replace(fine, voltage=fine.voltage[::2], interval=2 * fine.interval)
     expected = predicted(posterior, draws, fine, Start(from_rest=True))
     got = predicted(posterior, draws, coarse, Start(from_rest=True))
     # Straight lines between every second sample leave a little of the sine out.
@@ -266,6 +266,15 @@ def test_a_lead_in_that_leaves_nothing_is_refused(
 ) -> None:
     with pytest.raises(InputError, match="lead-in"):
         predicted(posterior, draws, made(), Start(lead_in=lead_in))
+
+
+def test_thinning_takes_draws_from_anywhere() -> None:
+    """A thousand of ten thousand: their mean is known to 87, and late ones are among them."""
+    every = np.arange(10_000.0)[:, np.newaxis]
+    kept = thinned(every, np.random.default_rng(0), 1000)
+    assert 5000 == pytest.approx(np.mean(kept), abs=4 * 87)
+    assert np.min(kept) < 100
+    assert np.max(kept) > 9900
 
 
 def test_thinning_takes_each_draw_at_most_once(draws: FloatArray) -> None:
