@@ -386,16 +386,14 @@ def sums(
     """
     count = models.shape[0]
     result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
-    state = _aligned(STATE)
-    known = np.empty((LANES, hysteretic.shape[1]))
+    state, known = _aligned(STATE), np.empty((LANES, hysteretic.shape[1]))
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            for t in range(hysteretic.shape[1]):
-                known[i, t] = hysteretic[model, t]
+            known[i] = hysteretic[model]
         _group(state, voltage, displacement, skipped, known, offset, free, part)
         last = min(first + LANES, count)
         result[:, first:last] = part[:, : last - first]

@@ -28,7 +28,7 @@ from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.start import Start, Started, fitted, started
 
-__all__ = ["DRAWS", "Start", "beyond_training", "predict_record", "predict_windows", "thinned"]
+__all__ = ["DRAWS", "Start", "predict_record", "predict_windows", "thinned"]
 
 # Posterior draws in the mixture.
 DRAWS = 1000
@@ -36,9 +36,6 @@ DRAWS = 1000
 # Samples that are simulated and summarised at once. Not a power of two: rows of draws that far
 # apart would take each other's place in the cache.
 PIECE = 4000
-
-# Part of the fitted voltages' range that others may lie beyond it: a sensor's noise.
-SLACK = 0.02
 
 # Threads that summarise pieces, while this one simulates the next.
 THREADS = 2
@@ -67,22 +64,6 @@ def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAW
     if draws.shape[0] <= count:
         return draws
     return draws[generator.choice(draws.shape[0], count, replace=False)]
-
-
-def beyond_training(posterior: Posterior, voltage: FloatArray) -> str | None:
-    """Say, in one line, where a voltage (samples,) leaves the range in which the model was fitted.
-
-    There the bands know the parameters' uncertainty, and nothing of what the actuator does else.
-    """
-    fitted = np.concatenate([posterior.voltage[window] for window in posterior.training])
-    low, high = float(np.min(fitted)), float(np.max(fitted))
-    slack = SLACK * (high - low)
-    if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
-        return None
-    return (
-        f"the voltage goes from {np.min(voltage):.4g} to {np.max(voltage):.4g} V, and only "
-        f"{low:.4g} to {high:.4g} V were fitted: beyond that the bands are an extrapolation"
-    )
 
 
 def predict_windows(
