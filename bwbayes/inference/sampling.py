@@ -3,9 +3,9 @@
 The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
 short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
 away. Then draws count, and the chain is judged (:mod:`bwbayes.inference.diagnostics`), until two
-judgements in a row find nothing missing, or the budget of steps is used up. To judge costs as much
-as some steps, so each judgement predicts how long the chain must become, and the next one waits
-until then.
+judgements in a row find nothing missing, the second on a fifth more draws at least, or the budget
+of steps is used up. To judge costs as much as some steps, so each judgement predicts how long the
+chain must become, and the next one waits until then.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
@@ -55,6 +55,10 @@ TUNING_BLOCKS = 2
 FIRST_CHECK = 4
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
+
+# How much longer a chain is at the second of the two checks that it must pass: checks of nearly
+# the same draws would be one. The first may have that many fewer effective draws.
+APART = 1.2
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -168,7 +172,7 @@ def _sampled(
     judge = _Judge(posterior, plan, chain)
     # A chain may be longer than its budget, if that was made smaller.
     most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
-    blocks, passed = FIRST_CHECK, False
+    blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
     while True:
         blocks = min(blocks, most)
         while chain.blocks("sampling") < blocks:
@@ -177,31 +181,32 @@ def _sampled(
         watcher("sampling", now)
         missing = now.shortcomings(plan.ess)
         at_end = blocks == chain.blocks("sampling")
-        if not missing and passed and at_end:
+        # One whose target was made smaller has converged before its end.
+        done = not missing and 0 < APART * passed <= blocks
+        if done and at_end:
             return Outcome(True, "converged on two checks in a row", now)
         if blocks == most:
             why = "; ".join(missing) or "only the last check passed"
             return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
         if not now.covered and at_end:
             return None
-        # One whose target was made smaller has converged before its end.
-        done = not missing and passed
-        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, now)
-        passed = not missing
+        first = not now.shortcomings(plan.ess / APART)
+        passed = (passed or blocks) if first else 0
+        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, found: Check) -> int:
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may mend what
-    else is missing; and after a check that found nothing missing comes another at once.
+    else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
-    if not found.shortcomings(plan.ess):
-        return blocks + 1
+    least = APART * passed
+    aim = plan.ess if passed else plan.ess / APART
     fewest = np.min([found.ess_bulk, found.ess_tail])
     with np.errstate(divide="ignore"):
-        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = steps / plan.block
+        steps = np.maximum(found.steps * aim / fewest, LENGTH * np.max(found.autocorrelation))
+    wanted = max(steps / plan.block, least)
     if not wanted > blocks:  # nan too
         wanted = LEAST_STRETCH * blocks
     return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
