@@ -45,8 +45,11 @@ from bwbayes.inference.proposals import StudentMixture
 
 __all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample"]
 
-# Nested R-hat of the pilot's second half below which its ensembles have found each other.
+# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# many steps it is enough if each stays where it is: in modes far apart differential evolution would
+# keep them for ever, and a proposal fitted to all of them will not.
 PILOT_RHAT = 1.1
+APART_STEPS = 500
 
 TUNING_BLOCKS = 2
 
@@ -293,7 +296,16 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
     second_half = _constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
-    return bool((nested_rhat(second_half) < PILOT_RHAT).all())
+    if (nested_rhat(second_half) < PILOT_RHAT).all():
+        return True
+    return steps >= APART_STEPS and all(_stays(each) for each in np.moveaxis(second_half, 1, 0))
+
+
+def _stays(draws: FloatArray) -> bool:
+    """Tell whether the halves of an ensemble's draws (steps, walkers, free) agree."""
+    half = len(draws) // 2
+    halves = np.stack([draws[:half], draws[len(draws) - half :]], axis=1)
+    return bool((nested_rhat(halves) < PILOT_RHAT).all())
 
 
 def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:

@@ -80,6 +80,7 @@ class OneWay(SnookerMove):
     def get_proposal(
         self, moving: FloatArray, others: list[FloatArray], random: Any
     ) -> tuple[FloatArray, FloatArray]:
+        """Propose as :class:`SnookerMove` did once."""
         z, z1, z2 = (split[random.randint(len(split), size=len(moving))] for split in others)
         distance = np.linalg.norm(moving - z, axis=1, keepdims=True)
         direction = (moving - z) / distance
