@@ -107,11 +107,15 @@ class RecordConfig(_Source):
 
 
 class ModelConfig(_Table):
-    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output."""
+    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output.
+
+    ``passive``: |gamma| <= beta, and not only beta + gamma >= 0.
+    """
 
     dynamics: Literal["none", "lag", "second-order"] = "lag"
     hold: Literal["auto", "first", "zero"] = "auto"
     noise: Literal["discrepancy", "white"] = "discrepancy"
+    passive: bool = True
 
 
 class ParameterConfig(_Table):

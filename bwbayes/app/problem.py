@@ -114,7 +114,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     actuator = Actuator(config.model.dynamics, hold, record.interval)
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
-    prior = JointPrior(_parameters(config, names, record, split.training))
+    parameters = _parameters(config, names, record, split.training)
+    prior = JointPrior(parameters, passive=config.model.passive)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -338,6 +339,7 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
                 dynamics=config.model.dynamics,
                 hold=posterior.actuator.hold,
                 noise=config.model.noise,
+                passive=prior.passive,
             ),
             "parameters": {p.name: _as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(

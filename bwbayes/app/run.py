@@ -29,6 +29,7 @@ from bwbayes.inference import identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.parameters import passive_remark
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
 from bwbayes.results.bands import Bands
@@ -242,11 +243,14 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *outcome.remarks,
         *(f"the record does not determine {c}: the prior decides there" for c in left_open),
     ]
+    every = draws(posterior, chain)
+    if remark := passive_remark(posterior.prior, every):
+        remarks.append(remark)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
         parameters=problem.parameters,
-        draws=draws(posterior, chain),
+        draws=every,
         log_density=chain.log_density("sampling"),
         moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),
