@@ -31,7 +31,7 @@ from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import passive_remark
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.results.bands import Bands
 from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
@@ -251,7 +251,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         outcome=outcome,
         parameters=problem.parameters,
         draws=every,
-        log_density=chain.log_density("sampling"),
+        log_density=log_densities(chain),
         moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),
         remarks=tuple(remarks),

@@ -116,7 +116,7 @@ def _told(value: float, limit: float, digits: int = 0) -> str:
     return text
 
 
-def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
+def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> Check:
     """Judge the draws of a sampling.
 
     Parameters
@@ -127,13 +127,17 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
         (blocks, ensembles, walkers) accepted moves in each block.
     block
         Steps in a block.
+    thin
+        Of how many steps the draws are one.
     """
-    steps, _, _, free = draws.shape
+    free = draws.shape[-1]
     with ThreadPoolExecutor(THREADS) as executor:
         each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
         rhat, bulk, tail, mean, autocorrelation, walker_rhat = np.array([*each]).T
+    # A thinned series does not tell times below its own step.
+    autocorrelation = thin * autocorrelation
     return Check(
-        steps=steps,
+        steps=len(accepted) * block,
         rhat=rhat,
         ess_bulk=bulk,
         ess_tail=tail,

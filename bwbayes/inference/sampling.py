@@ -28,7 +28,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.chain import Chain, Phase
+from bwbayes.inference.chain import MOST_DRAWS, Chain, Phase, thinning
 from bwbayes.inference.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
@@ -43,7 +43,15 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentMixture
 
-__all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample"]
+__all__ = [
+    "Outcome",
+    "SamplingPlan",
+    "Watcher",
+    "draws",
+    "first_chain",
+    "log_densities",
+    "sample",
+]
 
 # Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
 # many steps it is enough if each stays where it is: in modes far apart differential evolution would
@@ -157,12 +165,21 @@ def sample(
         chain.freeze("sampling", _fitted(chain, "tuning"))
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
         chain.fall_back(chain.blocks("sampling"))
-    return replace(outcome, remarks=_remarks(chain))
+    return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
 def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
-    """Return a chain's draws in their own units, (steps, ensembles, walkers, free)."""
-    return _constrained(posterior, chain.coordinates(phase))
+    """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
+
+    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
+    """
+    thin = thinning(chain.draws(phase))
+    return _constrained(posterior, chain.coordinates(phase, thin))
+
+
+def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return the log density of :func:`draws`, (steps, ensembles, walkers), nats."""
+    return chain.log_density(phase, thinning(chain.draws(phase)))
 
 
 def _sampled(
@@ -216,31 +233,53 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> i
 
 
 class _Judge:
-    """Judges the first blocks that count, each of which it prepares once."""
+    """Judges the first blocks that count, each of which it prepares once; more of them each time.
+
+    Of many draws it takes every second step, or every fourth, and so on, to bound its memory. How
+    many is a function of the blocks that it judges, so that a run that goes on judges the same.
+    """
 
     def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain) -> None:
         self.posterior, self.plan, self.chain = posterior, plan, chain
         self.proposal = chain.proposal_in_use("sampling")
+        self.prepared, self.thin = 0, 1
         self.draws: list[FloatArray] = []
         self.log_weights: list[FloatArray] = []
 
     def __call__(self, blocks: int) -> Check:
         """Judge the first ``blocks`` blocks."""
-        for number in range(len(self.draws), blocks):
-            self._prepare(self.chain.block_of("sampling", number))
-        accepted = self.chain.accepted("sampling")[:blocks]
-        found = check(np.concatenate(self.draws[:blocks]), accepted, self.plan.block)
+        plan = self.plan
+        # Far more draws than are to be effective, so that none is missed.
+        most = max(MOST_DRAWS, round(4 * plan.ess))
+        thin = thinning(blocks * plan.block * plan.ensembles * plan.walkers, most)
+        while self.thin < thin:
+            self.thin *= 2
+            for kept in (self.draws, self.log_weights):
+                kept[:] = [values[1::2] for values in self._joined(kept)]
+        for number in range(self.prepared, blocks):
+            self._prepare(number)
+        self.prepared = blocks
+        (every,) = self.draws = self._joined(self.draws)
+        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
         if self.proposal is None:
             return found
-        return replace(found, pareto_k=pareto_k(np.concatenate(self.log_weights[:blocks])))
+        (weights,) = self.log_weights = self._joined(self.log_weights)
+        return replace(found, pareto_k=pareto_k(weights.ravel()))
 
-    def _prepare(self, blocks: tuple[Block, ...]) -> None:
-        coordinates = np.stack([block.coordinates for block in blocks], axis=1)
+    @staticmethod
+    def _joined(kept: list[FloatArray]) -> list[FloatArray]:
+        return [np.concatenate(kept)] if kept else []
+
+    def _prepare(self, number: int) -> None:
+        blocks = self.chain.block_of("sampling", number)
+        steps = slice(-(number * self.plan.block + 1) % self.thin, None, self.thin)
+        coordinates = np.stack([block.coordinates[steps] for block in blocks], axis=1)
         self.draws.append(_constrained(self.posterior, coordinates))
         if self.proposal is not None:
             flat = coordinates.reshape(-1, coordinates.shape[-1])
-            density = np.stack([block.log_density for block in blocks], axis=1).ravel()
-            self.log_weights.append(density - self.proposal.log_density(flat))
+            density = np.stack([block.log_density[steps] for block in blocks], axis=1)
+            proposed = self.proposal.log_density(flat).reshape(density.shape)
+            self.log_weights.append(density - proposed)
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
@@ -261,6 +300,14 @@ def _remarks(chain: Chain) -> tuple[str, ...]:
         f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
         f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
     )
+
+
+def _thinned(chain: Chain) -> tuple[str, ...]:
+    """Say that a long chain is not used as a whole."""
+    thin = thinning(chain.draws("sampling"))
+    if thin == 1:
+        return ()
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
 
 
 def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
