@@ -84,8 +84,19 @@ class Check:
     def shortcomings(self, ess: float) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
-        Every comparison is written so that nan fails it.
+        First what more draws need not cure. Every comparison is written so that nan fails it.
         """
+        found = self.disagreements()
+        fewest = np.min([self.ess_bulk, self.ess_tail])
+        if not fewest >= ess:
+            found.append(f"ESS {_told(fewest, ess)} has not reached {ess:g}")
+        times = self.steps / np.max(self.autocorrelation)
+        if not times >= LENGTH:
+            found.append(f"{_told(times, LENGTH)} autocorrelation times are fewer than {LENGTH}")
+        return found
+
+    def disagreements(self) -> list[str]:
+        """Say what is wrong with the draws that there are; empty if nothing is."""
         found = []
         if not (self.rhat < LARGEST_RHAT).all():
             rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
@@ -93,12 +104,6 @@ class Check:
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
             rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
             found.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
-        fewest = np.min([self.ess_bulk, self.ess_tail])
-        if not fewest >= ess:
-            found.append(f"ESS {_told(fewest, ess)} has not reached {ess:g}")
-        times = self.steps / np.max(self.autocorrelation)
-        if not times >= LENGTH:
-            found.append(f"{_told(times, LENGTH)} autocorrelation times are fewer than {LENGTH}")
         if self.stuck:
             found.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
