@@ -81,18 +81,22 @@ class Check:
         """Whether the proposal, if there is one, covers the draws."""
         return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
-    def shortcomings(self, ess: float) -> list[str]:
+    def shortcomings(self, ess: float, part: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
-        First what more draws need not cure. Every comparison is written so that nan fails it.
+        First what more draws need not cure. Of effective draws, and of autocorrelation times, a
+        ``part`` is enough. Every comparison is written so that nan fails it.
         """
         found = self.disagreements()
         fewest = np.min([self.ess_bulk, self.ess_tail])
-        if not fewest >= ess:
-            found.append(f"ESS {_told(fewest, ess)} has not reached {ess:g}")
+        if not fewest >= part * ess:
+            found.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
         times = self.steps / np.max(self.autocorrelation)
-        if not times >= LENGTH:
-            found.append(f"{_told(times, LENGTH)} autocorrelation times are fewer than {LENGTH}")
+        if not times >= part * LENGTH:
+            least = f"{part * LENGTH:g}"
+            found.append(
+                f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
+            )
         return found
 
     def disagreements(self) -> list[str]:

@@ -3,9 +3,10 @@
 The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
 short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
 away. Then draws count, and the chain is judged (:mod:`bwbayes.inference.diagnostics`), until two
-judgements in a row find nothing missing, the second on a fifth more draws at least, or the budget
-of steps is used up. To judge costs as much as some steps, so each judgement predicts how long the
-chain must become, and the next one waits until then.
+judgements in a row find nothing wrong, the first on half the draws that are to be reached, the
+second on all of them and a fifth more than the first at least; or the budget of steps is used up.
+To judge costs as much as some steps, so each judgement predicts how long the chain must become,
+and the next one waits until then.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
@@ -68,8 +69,10 @@ LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
 # How much longer a chain is at the second of the two checks that it must pass: checks of nearly
-# the same draws would be one. The first may have that many fewer effective draws.
+# the same draws would be one. For the first, a part of the draws that are to be reached is enough:
+# so that they are reached at the second.
 APART = 1.2
+FIRST_PART = 0.5
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -210,7 +213,7 @@ def _sampled(
             return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
         if not now.covered and at_end:
             return None
-        first = not now.shortcomings(plan.ess / APART)
+        first = not now.shortcomings(plan.ess, FIRST_PART)
         passed = (passed or blocks) if first else 0
         blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
@@ -221,12 +224,11 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> i
     Effective draws grow with the steps. Once there are enough by that, a fifth more may mend what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
-    least = APART * passed
-    aim = plan.ess if passed else plan.ess / APART
+    part = 1.0 if passed else FIRST_PART
     fewest = np.min([found.ess_bulk, found.ess_tail])
     with np.errstate(divide="ignore"):
-        steps = np.maximum(found.steps * aim / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = max(steps / plan.block, least)
+        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
+    wanted = max(part * steps / plan.block, APART * passed)
     if not wanted > blocks:  # nan too
         wanted = LEAST_STRETCH * blocks
     return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
