@@ -169,6 +169,14 @@ def test_hold_that_is_given_is_kept(folder: Path) -> None:
     assert "first" == of(text, folder).posterior.actuator.hold
 
 
+def test_model_that_need_not_be_passive_stays_so(folder: Path) -> None:
+    assert of(RECORD, folder).posterior.prior.passive
+    problem = of(RECORD + "[model]\npassive = false", folder)
+    assert not problem.posterior.prior.passive
+    assert not problem.config.model.passive
+    assert "passive = false" in dump(problem.config)
+
+
 def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None:
     text = RECORD + (
         "[parameters.d]\nprior = {distribution = 'normal', mean = 0.7, sd = 0.1}\nlower = 0.2\n"
