@@ -89,13 +89,15 @@ class RecordConfig(_Source):
 
     ``start``, ``exclude`` and ``decimate`` leave out readings, never the voltage: the simulation
     runs from the file's first sample. ``stop`` cuts the record. ``from_rest`` says that it starts
-    with a demagnetised actuator at rest.
+    with a demagnetised actuator at rest. ``outliers`` are the times of readings that a run with
+    ``outliers = true`` in its model has set aside.
     """
 
     from_rest: bool = False
     start: float | None = None
     stop: float | None = None
     exclude: Annotated[list[Window], Field(min_length=1)] | None = None
+    outliers: list[float] | None = None
     decimate: Annotated[int, Field(ge=1)] = 1
     train: Annotated[list[Window], Field(min_length=1)] | None = None
 
@@ -114,11 +116,17 @@ class RecordConfig(_Source):
 
 
 class ModelConfig(_Table):
-    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output."""
+    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output.
+
+    ``passive``: |gamma| <= beta, and not only beta + gamma >= 0. ``outliers``: readings far outside
+    of what their neighbours predict are set aside.
+    """
 
     dynamics: Literal["none", "lag", "second-order"] = "lag"
     hold: Literal["auto", "first", "zero"] = "auto"
     noise: Literal["discrepancy", "white"] = "discrepancy"
+    passive: bool = True
+    outliers: bool = False
 
 
 class ParameterConfig(_Table):

@@ -9,7 +9,7 @@ moved, continued and run again by itself.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
+from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
@@ -39,6 +40,9 @@ from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
+
+# Times of outliers that a remark lists.
+MOST_TIMES = 10
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
     defaults = defaults_of(config, record, split.training)
-    prior = JointPrior(parameters_of(config, names, defaults))
+    parameters = parameters_of(config, names, defaults)
+    prior = JointPrior(parameters, passive=config.model.passive)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -131,6 +136,15 @@ def resolve(config: Config, folder: Path) -> Problem:
         choose(config.sampling.engine),
         config.record.from_rest,
     )
+    aside = config.record.outliers
+    if config.model.outliers and aside is None:
+        samples = outliers(posterior, generator(config.seed, "outliers"))
+        aside = record.time[samples].tolist()
+        record = record.without(samples)
+        assert record.displacement is not None
+        posterior = replace(posterior, displacement=record.displacement)
+    if aside is not None:
+        remarks.append(_set_aside(aside))
     windows = iter(split.held_out)
     validations = {
         name: Validation(
@@ -147,7 +161,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         voltage = other.voltage[one.window or slice(None)]
         leaving = beyond_training(posterior, voltage, other.interval)
         remarks += [f"{name}: {remark}" for remark in leaving]
-    explicit = _explicit(config, posterior, truth)
+    explicit = _explicit(config, posterior, truth, aside)
     plan = _plan(config, posterior)
     return Problem(
         explicit, record, posterior, plan, validations, tuple(remarks), defaults.priors(names)
@@ -266,7 +280,22 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
     )
 
 
-def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) -> Config:
+def _set_aside(times: Sequence[float]) -> str:
+    """Say which readings were set aside as outliers."""
+    if not times:
+        return "no reading is an isolated outlier: none was set aside"
+    first = ", ".join(f"{time:g}" for time in times[:MOST_TIMES])
+    more = f" and {len(times) - MOST_TIMES} more" if len(times) > MOST_TIMES else ""
+    plural = "s" if len(times) > 1 else ""
+    return f"{len(times)} reading{plural} set aside as isolated outliers, at {first} s{more}"
+
+
+def _explicit(
+    config: Config,
+    posterior: Posterior,
+    truth: Mapping[str, float],
+    outliers: list[float] | None,
+) -> Config:
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
     validation = {
@@ -283,11 +312,14 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
                 file="records/record.h5",
                 train=config.record.train,
                 from_rest=config.record.from_rest,
+                outliers=outliers,
             ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
                 hold=config.model.hold,
                 noise=config.model.noise,
+                passive=prior.passive,
+                outliers=config.model.outliers,
             ),
             "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(

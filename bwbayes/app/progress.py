@@ -80,11 +80,17 @@ class Progress(_Line):
         self.plan = plan
         self.done = 0
         self.check: Check | None = None
+        self.since = 0  # blocks of ensembles since the check
+        self.end: float | None = None  # when it will be done, by the check; of a monotonic clock
 
     def __call__(self, phase: Phase, found: Check | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
-        self.check = found or self.check
         self.done += found is None
+        self.since += found is None
+        if found is not None:
+            self.check, self.since, self.end = found, 0, None
+        if self.end is None:
+            self.end = self._forecast()
         self.show(self.line(phase), printed=found is not None)
 
     def line(self, phase: Phase) -> str:
@@ -99,22 +105,32 @@ class Progress(_Line):
         cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
             f"sampling  {check.steps:6d} steps   {rate:6.0f} models/s   "
-            f"ETA {self._remaining(steps / elapsed)}   acceptance {check.acceptance:.2f}   "
+            f"ETA {self._remaining()}   acceptance {check.acceptance:.2f}   "
             f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}   "
             f"{cover}"
         )
 
-    def _remaining(self, steps_per_second: float) -> str:
-        """Guess from the effective draws per step so far, and from the autocorrelation time."""
-        assert self.check is not None
+    def _remaining(self) -> str:
+        """Count down to the end that was forecast at the last check."""
+        return "unknown" if self.end is None else _minutes(self.end - time.monotonic())
+
+    def _forecast(self) -> float | None:
+        """Guess the end from the effective draws per step so far and the autocorrelation time.
+
+        There is none while the draws disagree, which more of them may or may not cure; and a run
+        that goes on is judged before its first step.
+        """
+        if self.check is None or not self.done or self.check.disagreements():
+            return None
         fewest = float(np.min([self.check.ess_bulk, self.check.ess_tail]))
         wanted = self.check.steps * self.plan.ess / fewest if fewest > 0 else np.inf
         wanted = max(wanted, LENGTH * float(np.max(self.check.autocorrelation)))
-        left = min(wanted, self.plan.most_steps) - self.check.steps
-        # A run that goes on is judged before its first step.
-        if not (np.isfinite(left) and steps_per_second > 0):
-            return "unknown"
-        return _minutes(left / steps_per_second)
+        if not np.isfinite(wanted):
+            return None
+        each = self.plan.block / self.plan.ensembles
+        left = min(wanted, self.plan.most_steps) - self.check.steps - self.since * each
+        now = time.monotonic()
+        return now + max(left, 0) * (now - self.begun) / (self.done * each)
 
 
 def _minutes(seconds: float) -> str:

@@ -34,8 +34,9 @@ from bwbayes.inference import conflict, identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.parameters import passive_remark
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.results.bands import Bands
 from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
@@ -258,12 +259,14 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *conflict.conflicts(posterior.prior, flat, problem.defaults),
         *identifiability.remarks(posterior, chain.point, flat),
     ]
+    if remark := passive_remark(posterior.prior, sampled):
+        remarks.append(remark)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
         parameters=problem.parameters,
         draws=sampled,
-        log_density=chain.log_density("sampling"),
+        log_density=log_densities(chain),
         moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),
         remarks=tuple(remarks),

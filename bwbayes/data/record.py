@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
 
 __all__ = ["Record", "Split", "VoltageIs", "Window", "require_voltage_is"]
@@ -172,13 +172,21 @@ class Record:
         """
         end = self.window_slice(self.start if first_reading is None else first_reading, stop)
         part = self._part(slice(0, end.stop))
-        return part if first_reading is None else part._without(slice(0, end.start))
+        return part if first_reading is None else part.without(slice(0, end.start))
+
+    def without(self, left_out: slice | BoolArray | IntArray) -> Record:
+        """Return the record without the readings at the samples `left_out`, a slice or index."""
+        if self.displacement is None:
+            return self
+        displacement = self.displacement.copy()
+        displacement[left_out] = np.nan
+        return replace(self, displacement=displacement)
 
     def exclude(self, windows: Sequence[Window]) -> Record:
         """Return the record without the readings in `windows`, pairs (start, stop) in s."""
         left = self
         for window in windows:
-            left = left._without(self.window_slice(*window))
+            left = left.without(self.window_slice(*window))
         return left
 
     def decimate(self, factor: int) -> Record:
@@ -192,7 +200,7 @@ class Record:
         kept = np.flatnonzero(self.has_reading)[:: int(factor)]
         left_out = np.ones(self.samples, dtype=np.bool_)
         left_out[kept] = False
-        return self._without(left_out)
+        return self.without(left_out)
 
     def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
         """Return training windows, in order of time, and held-out ones as slices of this record.
@@ -227,14 +235,6 @@ class Record:
             truth=None if self.truth is None else self.truth[part],
             start=self.start + self.interval * part.start,
         )
-
-    def _without(self, left_out: slice | BoolArray) -> Record:
-        """Return the record with the readings at `left_out` missing."""
-        if self.displacement is None:
-            return self
-        displacement = self.displacement.copy()
-        displacement[left_out] = np.nan
-        return replace(self, displacement=displacement)
 
 
 def require_voltage_is(text: str) -> VoltageIs:

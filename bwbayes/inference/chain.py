@@ -17,10 +17,22 @@ from bwbayes.inference.ensemble import Block, EnsembleState
 from bwbayes.inference.moves import MOVES
 from bwbayes.inference.proposals import StudentMixture
 
-__all__ = ["PHASES", "Chain", "Phase"]
+__all__ = ["MOST_DRAWS", "PHASES", "Chain", "Phase", "thinning"]
+
+# Draws of all walkers that are judged and reported at most; of more, every second or fourth step
+# is used, and so on. Chains get that long because their steps tell little that is new.
+MOST_DRAWS = 2**19
 
 Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
+
+
+def thinning(draws: int, most: int = MOST_DRAWS) -> int:
+    """Return of how many steps one is used where a chain has so many draws: a power of two."""
+    thin = 1
+    while draws > most * thin:
+        thin *= 2
+    return thin
 
 
 class Chain:
@@ -84,13 +96,17 @@ class Chain:
         done = [blocks for phase in PHASES for blocks in self._blocks[phase]]
         return tuple(block.end for block in done[-1]) if done else self.starts
 
-    def coordinates(self, phase: Phase) -> FloatArray:
-        """Return (steps, ensembles, walkers, free), unconstrained."""
-        return self._joined(phase, "coordinates")
+    def draws(self, phase: Phase) -> int:
+        """Return how many draws all walkers have made."""
+        return sum(b.log_density.size for blocks in self._counting(phase) for b in blocks)
 
-    def log_density(self, phase: Phase) -> FloatArray:
-        """Return (steps, ensembles, walkers), nats."""
-        return self._joined(phase, "log_density")
+    def coordinates(self, phase: Phase, thin: int = 1) -> FloatArray:
+        """Return (steps, ensembles, walkers, free), unconstrained, of every ``thin``-th step."""
+        return self._joined(phase, "coordinates", thin)
+
+    def log_density(self, phase: Phase, thin: int = 1) -> FloatArray:
+        """Return (steps, ensembles, walkers), nats, of every ``thin``-th step."""
+        return self._joined(phase, "log_density", thin)
 
     def accepted(self, phase: Phase) -> IntArray:
         """Return the accepted moves of each block, (blocks, ensembles, walkers)."""
@@ -112,10 +128,11 @@ class Chain:
         """Return the blocks that count."""
         return self._blocks[phase][self.set_aside if phase == "sampling" else 0 :]
 
-    def _joined(self, phase: Phase, name: str) -> FloatArray:
-        return np.concatenate(
-            [
-                np.stack([getattr(block, name) for block in blocks], axis=1)
-                for blocks in self._counting(phase)
-            ]
-        )
+    def _joined(self, phase: Phase, name: str, thin: int) -> FloatArray:
+        parts, done = [], 0
+        for blocks in self._counting(phase):
+            each = [getattr(block, name) for block in blocks]
+            first = -(done + 1) % thin  # of steps counted from one, those that thin divides
+            parts.append(np.stack([values[first::thin] for values in each], axis=1))
+            done += len(each[0])
+        return np.concatenate(parts)

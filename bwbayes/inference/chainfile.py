@@ -21,6 +21,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from hashlib import file_digest
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -121,16 +122,14 @@ class ChainFile(Chain):
         before = None
         while True:
             try:
-                content = path.read_bytes()
+                chain, damage = cls._load(path)
+                # One that was written while it was read may look damaged; at rest it does not.
+                if not damage or before == (before := _digest(path)):
+                    break
             except FileNotFoundError:
                 raise InputError(f"{path}: the chain does not exist; run again") from None
             except OSError as error:
                 raise InputError(f"{path}: {error.strerror}; make it readable") from None
-            chain, damage = cls._load(path, content)
-            # One that was written while it was read may look damaged; at rest it does not.
-            if not damage or content == before:
-                break
-            before = content
         if chain is None:
             raise InputError(f"{path}: the chain cannot be read ({damage}); run again")
         if damage:
@@ -246,21 +245,22 @@ class ChainFile(Chain):
         self._file.flush()
 
     @classmethod
-    def _load(cls, path: Path, content: bytes) -> tuple[ChainFile | None, str]:
-        """Return what can be read of a file's content, and what ails the rest, if anything."""
+    def _load(cls, path: Path) -> tuple[ChainFile | None, str]:
+        """Return what can be read of a file, and what ails the rest, if anything."""
         loaded, damage, set_aside = None, "", 0
-        try:
-            with h5py.File(Image(content), "r") as file:
-                loaded = cls._begun(path, file)
-                committed = _either(file["committed"])
-                set_aside = int(committed[SET_ASIDE])
-                for place, phase in enumerate(PHASES):
-                    if committed[len(PHASES) + place]:
-                        loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
-                    for number in range(committed[place]):
-                        Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
-        except DAMAGE as error:
-            damage = " ".join(str(error.args[-1] if error.args else error).split())
+        with Image(path) as image:
+            try:
+                with h5py.File(image, "r") as file:
+                    loaded = cls._begun(path, file)
+                    committed = _either(file["committed"])
+                    set_aside = int(committed[SET_ASIDE])
+                    for place, phase in enumerate(PHASES):
+                        if committed[len(PHASES) + place]:
+                            loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
+                        for number in range(committed[place]):
+                            Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
+            except DAMAGE as error:
+                damage = " ".join(str(error.args[-1] if error.args else error).split())
         if loaded is not None and set_aside <= len(loaded.history("sampling")):
             loaded.set_aside = set_aside
         return loaded, damage
@@ -281,6 +281,11 @@ class ChainFile(Chain):
         return cls(
             path, point, [EnsembleState(*s) for s in zip(*parts, strict=True)], block, attributes
         )
+
+
+def _digest(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").digest()
 
 
 def _either(dataset: Any) -> Any:

@@ -34,6 +34,9 @@ LARGEST_WALKER_RHAT = 1.05
 # Above this a proposal does not cover the draws.
 LARGEST_PARETO_K = 0.7
 
+# Log weights that differ by less than this, nats, are equal: the proposal is the posterior itself.
+EQUAL = 1e-6
+
 # Steps in autocorrelation times, before which no estimate of it can be trusted.
 LENGTH = 50
 
@@ -43,6 +46,9 @@ STILL = 25
 
 TAIL = (0.05, 0.95)
 
+# Digits behind the point beyond which a number is not told from its limit.
+MOST_DIGITS = 9
+
 # Threads that judge parameters side by side: their sorting and transforms leave Python free.
 THREADS = 2
 
@@ -51,8 +57,9 @@ THREADS = 2
 class Check:
     """The state of a sampling; arrays are (free,).
 
-    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk`` and ``ess_tail`` are
-    totals; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
+    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk``, of the ranks, and
+    ``ess_tail`` are totals, and so is ``ess_mean``, which the Monte Carlo error of the mean hangs
+    on; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
     ``stuck`` counts the walkers that have not moved for the last ``STILL`` autocorrelation times;
     ``pareto_k`` is that of the proposal at these draws, None if there is no proposal;
     ``walker_rhat`` is the largest R-hat with each walker a chain.
@@ -62,6 +69,7 @@ class Check:
     rhat: FloatArray
     ess_bulk: FloatArray
     ess_tail: FloatArray
+    ess_mean: FloatArray
     autocorrelation: FloatArray
     acceptance: float
     stuck: int
@@ -73,32 +81,51 @@ class Check:
         """Whether the proposal, if there is one, covers the draws."""
         return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
-    def shortcomings(self, ess: float) -> list[str]:
+    def shortcomings(self, ess: float, part: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
-        Every comparison is written so that nan fails it.
+        First what more draws need not cure. Of effective draws, and of autocorrelation times, a
+        ``part`` is enough. Every comparison is written so that nan fails it.
         """
+        found = self.disagreements()
+        fewest = np.min([self.ess_bulk, self.ess_tail])
+        if not fewest >= part * ess:
+            found.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
+        times = self.steps / np.max(self.autocorrelation)
+        if not times >= part * LENGTH:
+            least = f"{part * LENGTH:g}"
+            found.append(
+                f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
+            )
+        return found
+
+    def disagreements(self) -> list[str]:
+        """Say what is wrong with the draws that there are; empty if nothing is."""
         found = []
         if not (self.rhat < LARGEST_RHAT).all():
-            found.append(f"R-hat {np.max(self.rhat):.3f} is not below {LARGEST_RHAT}")
+            rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
+            found.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
-            found.append(
-                f"R-hat {self.walker_rhat:.3g} of walkers is not below {LARGEST_WALKER_RHAT}"
-            )
-        fewest = np.min([self.ess_bulk, self.ess_tail])
-        if not fewest >= ess:
-            found.append(f"ESS {fewest:.0f} has not reached {ess:.0f}")
-        times = self.steps / np.max(self.autocorrelation)
-        if not times >= LENGTH:
-            found.append(f"{times:.0f} autocorrelation times are fewer than {LENGTH}")
+            rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
+            found.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
         if self.stuck:
             found.append(f"{self.stuck} walkers are stuck")
-        if not self.covered:
-            found.append(f"Pareto k {self.pareto_k:.2f} is not below {LARGEST_PARETO_K}")
+        if self.pareto_k is not None and not self.covered:
+            shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
+            found.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
         return found
 
 
-def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
+def _told(value: float, limit: float, digits: int = 0) -> str:
+    """Write a value with so many digits, or as many as tell it from the limit that it misses."""
+    text = f"{value:.{digits}f}"
+    while digits < MOST_DIGITS and float(text) == float(f"{limit:g}") != value:
+        digits += 1
+        text = f"{value:.{digits}f}"
+    return text
+
+
+def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> Check:
     """Judge the draws of a sampling.
 
     Parameters
@@ -109,16 +136,21 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
         (blocks, ensembles, walkers) accepted moves in each block.
     block
         Steps in a block.
+    thin
+        Of how many steps the draws are one.
     """
-    steps, _, _, free = draws.shape
+    free = draws.shape[-1]
     with ThreadPoolExecutor(THREADS) as executor:
         each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
-        rhat, bulk, tail, autocorrelation, walker_rhat = np.array([*each]).T
+        rhat, bulk, tail, mean, autocorrelation, walker_rhat = np.array([*each]).T
+    # A thinned series does not tell times below its own step.
+    autocorrelation = thin * autocorrelation
     return Check(
-        steps=steps,
+        steps=len(accepted) * block,
         rhat=rhat,
         ess_bulk=bulk,
         ess_tail=tail,
+        ess_mean=mean,
         autocorrelation=autocorrelation,
         acceptance=float(accepted.sum() / (accepted.size * block)),
         walker_rhat=float(np.max(walker_rhat)),
@@ -126,15 +158,16 @@ def check(draws: FloatArray, accepted: IntArray, block: int) -> Check:
     )
 
 
-def _one_parameter(values: FloatArray) -> tuple[float, float, float, float, float]:
+def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     """Judge the draws (steps, ensembles, walkers) of one parameter.
 
-    R-hat, effective draws in bulk and tail, autocorrelation time, and R-hat of the walkers.
+    R-hat, effective draws in bulk and tail and for the mean, autocorrelation time, and R-hat of
+    the walkers.
     """
     steps, ensembles, walkers = values.shape
     draws = np.ascontiguousarray(values)[..., np.newaxis]
     scores, folded = _scores(draws)
-    bulk, tail = _effective_draws(draws, scores)
+    bulk, tail, mean = (float(ess[0]) for ess in _effective_draws(draws, scores))
     half = steps // 2
     halves, folded_halves = (
         np.concatenate([s[..., :half], s[..., steps - half :]], axis=1) for s in (scores, folded)
@@ -142,7 +175,7 @@ def _one_parameter(values: FloatArray) -> tuple[float, float, float, float, floa
     # np.maximum keeps a nan of either.
     rhat = np.maximum(_rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles))
     time = autocorrelation_time(draws.reshape(steps, ensembles * walkers, 1))
-    return float(rhat[0]), float(bulk[0]), float(tail[0]), float(time[0]), _walker_rhat(scores)
+    return float(rhat[0]), bulk, tail, mean, float(time[0]), _walker_rhat(scores)
 
 
 def _stuck(accepted: IntArray, blocks: float) -> int:
@@ -157,11 +190,15 @@ def pareto_k(log_weights: FloatArray) -> float:
     Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
     draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
     k' = k / (1 − k), so k = k' / (1 + k'). Places count once, however long a walker stayed: else
-    one walker at a large weight would make the tail by itself. It is infinite without a tail.
+    one walker at a large weight would make the tail by itself. Weights that are all equal have no
+    tail to fear, k = 0: the proposal is the posterior. Too few of them to see a tail give infinity.
     """
+    with np.errstate(invalid="ignore"):
+        if log_weights.size and np.ptp(log_weights) < EQUAL:
+            return 0.0
     try:
         shape = float(array_stats.psislw(-np.unique(log_weights))[1])
-    except (ValueError, IndexError):  # nothing, or a single place
+    except (ValueError, IndexError):  # nothing
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
 
@@ -188,14 +225,18 @@ def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     W independent walkers has a W-th of the variance, so n effective means are worth n times the
     ratio of the variances.
     """
-    return _effective_draws(draws, _scores(draws)[0])
+    bulk, tail, _ = _effective_draws(draws, _scores(draws)[0])
+    return bulk, tail
 
 
-def _effective_draws(draws: FloatArray, scores: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _effective_draws(
+    draws: FloatArray, scores: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Effective draws, given the normal scores of the draws too.
 
     Of the means of the scores and of being in a tail: what arviz calls bulk and tail, which would
-    rank the draws three times more.
+    rank the draws three times more. And of the mean of the draws as they are: those of a heavy
+    tail are worth another number.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = _ensemble_mean_ess(draws)
@@ -203,7 +244,10 @@ def _effective_draws(draws: FloatArray, scores: FloatArray) -> tuple[FloatArray,
         # A comparison would take what is not a number for a draw beyond the tail.
         low, high = (np.where(np.isnan(scores), np.nan, scores <= ndtri(part)) for part in TAIL)
         tails = [array_stats.ess(tail, method="mean") for tail in (low, high)]
-    return np.minimum(np.atleast_1d(bulk), cap), np.minimum(np.atleast_1d(np.min(tails, 0)), cap)
+        mean = array_stats.ess(_series(draws), method="mean")
+    every = bulk, np.min(tails, axis=0), mean
+    bulk, tail, mean = (np.minimum(np.atleast_1d(ess), cap) for ess in every)
+    return bulk, tail, mean
 
 
 def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> FloatArray:

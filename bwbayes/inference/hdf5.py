@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import errno
 import os
-from io import SEEK_END, SEEK_SET, BytesIO
+from io import SEEK_END, SEEK_SET, FileIO
+from pathlib import Path
 from typing import Any
 
 __all__ = ["DAMAGE", "FULL", "Image", "reserve"]
@@ -29,14 +30,15 @@ OVERHEAD = 2**16
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class Image(BytesIO):
-    """A file's content at one moment, to be read by HDF5 even if its end was cut off."""
+class Image(FileIO):
+    """A file to be read by HDF5 even if its end was cut off."""
 
-    def __init__(self, content: bytes) -> None:
-        super().__init__(content)
-        self._end = len(content)
-        if content[VERSION] in NEW:
-            self._end = max(self._end, min(int.from_bytes(content[STORED_END], "little"), LARGEST))
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        head = self.read(STORED_END.stop)
+        self._end = super().seek(0, SEEK_END)
+        if head[VERSION] in NEW:
+            self._end = max(self._end, min(int.from_bytes(head[STORED_END], "little"), LARGEST))
 
     def seek(self, place: int, whence: int = SEEK_SET) -> int:
         """Move to a place; the end is where the file says that it should be."""
@@ -44,10 +46,12 @@ class Image(BytesIO):
 
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer, or say that what should be there is missing."""
-        size = super().readinto(buffer)
-        if size < len(buffer):
+        view, done = memoryview(buffer), 0
+        while done < len(view) and (more := super().readinto(view[done:])):
+            done += more
+        if done < len(view):
             raise OSError("its end is missing")
-        return size
+        return done
 
 
 def reserve(file: Any, size: int) -> None:

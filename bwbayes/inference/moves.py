@@ -31,7 +31,9 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
 
         x' = x + 1.7 e (e·z₁ − e·z₂),   log factor (p − 1) log(|x' − z| / |x − z|),
 
-    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. It stands in for
+    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. Which split gives which
+    of the three is drawn at each step: the way back swaps z₁ and z₂, and must be as likely as the
+    way there. It stands in for
     ``emcee.moves.DESnookerMove``, which in emcee up to 3.1.6 takes half of the logarithm and makes
     a posterior of nine parameters a fifth too narrow.
     """
@@ -44,7 +46,10 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
         self, moving: FloatArray, others: list[FloatArray], random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
         """Propose for ``moving`` (walkers, free), given the walkers of the other three splits."""
-        z, z1, z2 = (split[random.randint(len(split), size=len(moving))] for split in others)
+        z, z1, z2 = (
+            others[role][random.randint(len(others[role]), size=len(moving))]
+            for role in random.permutation(3)
+        )
         away = moving - z
         distance = np.linalg.norm(away, axis=1, keepdims=True)
         direction = away / distance

@@ -2,7 +2,9 @@
 
 Each parameter is either fixed or has a prior. The priors are independent but for the physical
 constraints, which cut the joint prior: 0 < α < d, |γ| ≤ β, an initial state inside the hysteresis
-ceiling. :class:`JointPrior` draws from the cut prior and gives its log density, up to the one
+ceiling. With |γ| ≤ β the hysteresis is passive, taking no energy from nowhere on any path; some
+published actuators have larger γ, and that constraint can be left at β + γ ≥ 0, without which h
+runs away. :class:`JointPrior` draws from the cut prior and gives its log density, up to the one
 constant that the cut leaves. It also maps parameters to coordinates without bounds and back: the
 normal scores of each prior between the bounds that hold there. In them every prior is nearly a
 standard normal, whatever its scale and bounds, and so a posterior has Gaussian tails even where it
@@ -22,9 +24,9 @@ from bwbayes.errors import InputError
 from bwbayes.inference.distributions import Distribution
 from bwbayes.model.boucwen import ceiling
 
-__all__ = ["COORDINATES", "JointPrior", "Parameter"]
+__all__ = ["COORDINATES", "FLOORS", "POSITIVE", "JointPrior", "Parameter", "passive_remark"]
 
-# Version of the map from coordinates to parameters. A chain stores coordinates, and notes it.
+# The version of the map from parameters to coordinates: a chain of another one means other draws.
 COORDINATES = 1
 
 Values = dict[str, FloatArray]
@@ -41,6 +43,13 @@ POSITIVE = (
     "discrepancy_sd",
     "discrepancy_time",
 )
+
+# No parameter may be lower. What is positive does not reach its floor, an exponent of one does.
+FLOORS = {**dict.fromkeys(POSITIVE, 0.0), "exponent": 1.0}
+
+# γ presses against β when more than this share of draws lies within the margin below it.
+PRESSING_SHARE = 0.25
+PRESSING_MARGIN = 0.05
 
 # Normal scores beyond this have no probability that a float can hold.
 FARTHEST = 37.0
@@ -82,17 +91,18 @@ class Parameter:
     def _check_fixed(self, value: float) -> None:
         if not np.isfinite(value) or not self.lower <= value <= self.upper:
             raise InputError(f"{self.name}: fixed at {value}; give a finite value in its bounds")
-        low = 1.0 if self.name == "exponent" else 0.0
-        if (self.name in POSITIVE and value <= 0) or (self.name == "exponent" and value < 1):
-            raise InputError(f"{self.name}: fixed at {value:g}; must be above {low:g}")
+        if not _above_floor(self.name, np.array(value)):
+            least = "above" if self.name in POSITIVE else "at least"
+            raise InputError(
+                f"{self.name}: fixed at {value:g}; must be {least} {FLOORS[self.name]:g}"
+            )
 
     @cached_property
     def support(self) -> tuple[float, float]:
         """Where prior, bounds and sign allow the parameter."""
         assert self.prior is not None
         low, high = self.prior.support
-        floor = 0.0 if self.name in POSITIVE else 1.0 if self.name == "exponent" else -np.inf
-        return max(low, self.lower, floor), min(high, self.upper)
+        return max(low, self.lower, FLOORS.get(self.name, -np.inf)), min(high, self.upper)
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
@@ -110,10 +120,13 @@ class JointPrior:
     parameters
         All parameters of the model and the noise, in the order of θ's columns; α after d, γ after
         β, and the initial state after both, because their bounds depend on those.
+    passive
+        Whether |γ| ≤ β, and not only β + γ ≥ 0.
     """
 
-    def __init__(self, parameters: Iterable[Parameter]) -> None:
+    def __init__(self, parameters: Iterable[Parameter], *, passive: bool = True) -> None:
         self.parameters = tuple(parameters)
+        self.passive = passive
         self.names = tuple(p.name for p in self.parameters)
         self.free = tuple(p for p in self.parameters if p.fixed is None)
         self.free_names = tuple(p.name for p in self.free)
@@ -124,8 +137,12 @@ class JointPrior:
         fixed = self._fixed
         if fixed.get("alpha", 0.0) >= fixed.get("d", np.inf):
             raise InputError("alpha: fixed at or above d; must be below it")
-        if abs(fixed.get("gamma", 0.0)) > fixed.get("beta", np.inf):
-            raise InputError("gamma: fixed beyond beta; must lie between -beta and beta")
+        if fixed.get("beta", np.inf) < self._least_beta(fixed.get("gamma", 0.0)):
+            demand = "must lie between -beta and beta" if self.passive else "must be above -beta"
+            raise InputError(f"gamma: fixed beyond beta; {demand}")
+
+    def _least_beta(self, gamma: float) -> float:
+        return abs(gamma) if self.passive else -gamma
 
     @property
     def dimensions(self) -> int:
@@ -149,6 +166,7 @@ class JointPrior:
             assert parameter.prior is not None
             result += parameter.prior.frozen.logpdf(values[parameter.name])
             inside &= self._inside(parameter, values)
+        inside &= self._start_holds(values)
         return np.where(inside, result, -np.inf)
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
@@ -166,7 +184,8 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                raise InputError("priors: hardly a draw has 0 < alpha < d and |gamma| <= beta")
+                bound = "|gamma| <= beta" if self.passive else "beta + gamma >= 0"
+                raise InputError(f"priors: hardly a draw has 0 < alpha < d and {bound}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
@@ -198,8 +217,9 @@ class JointPrior:
             bounds = self._limits(parameter, values)
             x, between = parameter.prior.from_normal(z, *bounds)
             # Rounding may put a positive parameter on its open bound, where there is no model.
-            room = room * np.where((x > 0) | (parameter.name not in POSITIVE), between, 0)
+            room = room * np.where(_above_floor(parameter.name, x), between, 0)
             values[parameter.name] = x
+        room = np.where(self._start_holds(values), room, 0)
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
         log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
@@ -223,24 +243,68 @@ class JointPrior:
             case "alpha" if "d" in values:
                 high = np.minimum(high, values["d"])
             case "beta" if "gamma" in self._fixed:
-                low = np.maximum(low, abs(self._fixed["gamma"]))
+                low = np.maximum(low, self._least_beta(self._fixed["gamma"]))
             case "gamma" if "beta" in values:
-                low, high = np.maximum(low, -values["beta"]), np.minimum(high, values["beta"])
+                low = np.maximum(low, -values["beta"])
+                high = np.minimum(high, values["beta"]) if self.passive else high
             case "initial":
-                # Not a number where |γ| > β, which is outside already.
-                with np.errstate(invalid="ignore"):
-                    top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
-                top = np.minimum(top, HIGHEST_CEILING)
+                top = _ceiling(values)
                 low, high = np.maximum(low, -top), np.minimum(high, top)
         return low, high
 
     def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
         low, high = self._limits(parameter, values)
         x = values[parameter.name]
-        inside: BoolArray = (low <= x) & (x <= high)
+        inside: BoolArray = (low <= x) & (x <= high) & _above_floor(parameter.name, x)
         if parameter.name in ("d", "alpha"):
-            inside &= (x > 0) & (values["alpha"] < values["d"])
+            inside &= values["alpha"] < values["d"]
         return inside
+
+    def _start_holds(self, values: Values) -> BoolArray | np.bool_:
+        """Tell where h does not run away from an initial state that is fixed: γ ≤ β or below top.
+
+        A free one has its bounds.
+        """
+        start = abs(self._fixed.get("initial", 0.0))
+        if self.passive or start == 0 or "gamma" not in values:
+            return np.True_
+        return (values["gamma"] <= values["beta"]) | (start <= _ceiling(values))
+
+
+def passive_remark(prior: JointPrior, draws: FloatArray) -> str | None:
+    """Say that a posterior presses against γ ≤ β, if it does.
+
+    Parameters
+    ----------
+    prior
+        The prior of the draws.
+    draws
+        (..., free), parameters in their own units.
+    """
+    if not prior.passive or "gamma" not in prior.free_names:
+        return None
+    values = dict(zip(prior.names, prior.theta(draws.reshape(-1, prior.dimensions)).T, strict=True))
+    share = float(np.mean(values["gamma"] > (1 - PRESSING_MARGIN) * values["beta"]))
+    if not share > PRESSING_SHARE:
+        return None
+    return (
+        f"the posterior presses against |gamma| <= beta ({share:.0%} of the draws have gamma "
+        f"within {PRESSING_MARGIN:.0%} of beta); if the actuator need not be passive, set "
+        "[model] passive = false"
+    )
+
+
+def _above_floor(name: str, x: FloatArray) -> BoolArray:
+    floor = FLOORS.get(name, -np.inf)
+    return np.asarray(x > floor if name in POSITIVE else x >= floor)
+
+
+def _ceiling(values: Values) -> FloatArray:
+    """Highest |h| (models,), um, not beyond a number that can be worked with."""
+    # Not a number where β + γ < 0 or α = 0, which is outside already; fmin prefers the number.
+    with np.errstate(invalid="ignore"):
+        top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
+    return np.fmin(top, HIGHEST_CEILING)
 
 
 def _draw_single(parameter: Parameter, generator: np.random.Generator, size: int) -> FloatArray:

@@ -25,8 +25,9 @@ STARTS = 8
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
 RESIDUALS = 1000
 
-# An optimum less probable than the best by this much (nats per sample) is no place to start from.
-WORSE_PER_SAMPLE = 0.5
+# An optimum less probable than the best by this much, nats, is no place to start from: it holds
+# nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
+HOPELESS = 30.0
 
 # Optima whose sums of squares and coordinates agree to this part are one.
 SAME = 1e-2
@@ -69,8 +70,8 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     modes = [_mode(posterior, _with_noise(posterior, v, noise), spread) for v in valleys]
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
-    worst = best.log_density - WORSE_PER_SAMPLE * least_squares.samples
-    optima = _distinct([m.place for m in modes if m.log_density > worst], best.covariance)
+    worth = [m.place for m in modes if m.log_density > best.log_density - HOPELESS]
+    optima = _distinct(worth, best.covariance)
     return PointFit(best.place, best.covariance, best.log_density, optima, spread)
 
 
@@ -107,7 +108,6 @@ class _LeastSquares:
         self.posterior, self.centre, self.spread = posterior, centre, spread
         self.physical = np.array([n in posterior.actuator.parameters for n in posterior.names])
         rows = posterior.readings.rows
-        self.samples = rows.size
         self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
         self.target = posterior.displacement[self.rows]
         # A hundredth of the range is about what a Bouc-Wen model leaves over.

@@ -24,7 +24,8 @@ COMPONENTS = len(CUTS) + 1
 
 ROUNDS = 50
 
-# Part of the whole covariance that every component keeps: the draws of a pilot are few.
+# Part of the covariance of all components together that each keeps: the draws of a pilot are few.
+# That of all draws would be far too wide where components are modes apart.
 SHRINKAGE = 0.1
 
 # Share of every draw that every component keeps, so that none starves.
@@ -77,7 +78,10 @@ class StudentProposal:
         numpy.linalg.LinAlgError
             The draws do not span the space.
         """
-        return cls(np.mean(draws, axis=0), np.linalg.cholesky(_covariance(draws)))
+        _require_spread(draws)
+        return cls(
+            np.mean(draws, axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(draws, rowvar=False)))
+        )
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (count,) at coordinates (count, free), up to one constant for every fit."""
@@ -141,7 +145,7 @@ class StudentMixture:
         numpy.linalg.LinAlgError
             The draws do not span the space.
         """
-        whole = _covariance(draws)
+        _require_spread(draws)
         shape = np.asarray(skew(draws, axis=0))
         most = int(np.argmax(np.abs(shape)))
         # Ranks from the body of the distribution to its longer tail.
@@ -149,7 +153,7 @@ class StudentMixture:
         start = np.searchsorted(np.quantile(along, CUTS), along)
         share = _kept_alive(np.equal.outer(np.arange(COMPONENTS), start))
         for _ in range(ROUNDS):
-            mixture = cls(share.mean(axis=1), tuple(_components(draws, share, whole)))
+            mixture = cls(share.mean(axis=1), tuple(_components(draws, share)))
             parts = [_gaussian(component, draws) for component in mixture.components]
             logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
             density = np.exp(logs - np.max(logs, axis=0))
@@ -179,14 +183,12 @@ class StudentMixture:
         return proposed, old - new
 
 
-def _covariance(draws: FloatArray) -> FloatArray:
-    """Covariance (free, free) of draws (count, free) that span the space."""
+def _require_spread(draws: FloatArray) -> None:
+    """Refuse draws (count, free) that do not span the space."""
     # Rounding leaves some variance to draws that lie in a plane, or do not differ at all.
     plane = np.column_stack([np.ones(len(draws)), draws])
     if np.linalg.matrix_rank(plane) < plane.shape[1]:
         raise np.linalg.LinAlgError("the draws do not span the space")
-    covariance: FloatArray = np.atleast_2d(np.cov(draws, rowvar=False))
-    return covariance
 
 
 def _kept_alive(share: FloatArray) -> FloatArray:
@@ -195,15 +197,15 @@ def _kept_alive(share: FloatArray) -> FloatArray:
     return kept
 
 
-def _components(draws: FloatArray, share: FloatArray, whole: FloatArray) -> list[StudentProposal]:
+def _components(draws: FloatArray, share: FloatArray) -> list[StudentProposal]:
     """Weighted means and covariances, one component for each row of ``share``."""
-    found = []
-    for part in share / share.sum(axis=1, keepdims=True):
-        centre = part @ draws
-        away = (draws - centre).T
-        covariance = (1 - SHRINKAGE) * (part * away) @ away.T + SHRINKAGE * whole
-        found.append(StudentProposal(centre, np.linalg.cholesky(covariance)))
-    return found
+    parts = share / share.sum(axis=1, keepdims=True)
+    centres = parts @ draws
+    apart = [(draws - centre).T for centre in centres]
+    own = np.stack([(part * away) @ away.T for part, away in zip(parts, apart, strict=True)])
+    together = np.average(own, axis=0, weights=share.mean(axis=1))
+    factors = np.linalg.cholesky((1 - SHRINKAGE) * own + SHRINKAGE * together)
+    return [StudentProposal(*pair) for pair in zip(centres, factors, strict=True)]
 
 
 def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:

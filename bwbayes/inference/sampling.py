@@ -3,9 +3,10 @@
 The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
 short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
 away. Then draws count, and the chain is judged (:mod:`bwbayes.inference.diagnostics`), until two
-judgements in a row find nothing missing, or the budget of steps is used up. To judge costs as much
-as some steps, so each judgement predicts how long the chain must become, and the next one waits
-until then.
+judgements in a row find nothing wrong, the first on half the draws that are to be reached, the
+second on all of them and a fifth more than the first at least; or the budget of steps is used up.
+To judge costs as much as some steps, so each judgement predicts how long the chain must become,
+and the next one waits until then.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
@@ -28,7 +29,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.chain import Chain, Phase
+from bwbayes.inference.chain import MOST_DRAWS, Chain, Phase, thinning
 from bwbayes.inference.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
@@ -43,10 +44,21 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentMixture
 
-__all__ = ["Outcome", "SamplingPlan", "Watcher", "draws", "first_chain", "sample"]
+__all__ = [
+    "Outcome",
+    "SamplingPlan",
+    "Watcher",
+    "draws",
+    "first_chain",
+    "log_densities",
+    "sample",
+]
 
-# Nested R-hat of the pilot's second half below which its ensembles have found each other.
+# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# many steps it is enough if each stays where it is: in modes far apart differential evolution would
+# keep them for ever, and a proposal fitted to all of them will not.
 PILOT_RHAT = 1.1
+APART_STEPS = 500
 
 TUNING_BLOCKS = 2
 
@@ -55,6 +67,12 @@ TUNING_BLOCKS = 2
 FIRST_CHECK = 4
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
+
+# How much longer a chain is at the second of the two checks that it must pass: checks of nearly
+# the same draws would be one. For the first, a part of the draws that are to be reached is enough:
+# so that they are reached at the second.
+APART = 1.2
+FIRST_PART = 0.5
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -150,12 +168,21 @@ def sample(
         chain.freeze("sampling", _fitted(chain, "tuning"))
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
         chain.fall_back(chain.blocks("sampling"))
-    return replace(outcome, remarks=_remarks(chain))
+    return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
 def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
-    """Return a chain's draws in their own units, (steps, ensembles, walkers, free)."""
-    return _constrained(posterior, chain.coordinates(phase))
+    """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
+
+    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
+    """
+    thin = thinning(chain.draws(phase))
+    return _constrained(posterior, chain.coordinates(phase, thin))
+
+
+def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return the log density of :func:`draws`, (steps, ensembles, walkers), nats."""
+    return chain.log_density(phase, thinning(chain.draws(phase)))
 
 
 def _sampled(
@@ -168,7 +195,7 @@ def _sampled(
     judge = _Judge(posterior, plan, chain)
     # A chain may be longer than its budget, if that was made smaller.
     most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
-    blocks, passed = FIRST_CHECK, False
+    blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
     while True:
         blocks = min(blocks, most)
         while chain.blocks("sampling") < blocks:
@@ -177,62 +204,84 @@ def _sampled(
         watcher("sampling", now)
         missing = now.shortcomings(plan.ess)
         at_end = blocks == chain.blocks("sampling")
-        if not missing and passed and at_end:
+        # One whose target was made smaller has converged before its end.
+        done = not missing and 0 < APART * passed <= blocks
+        if done and at_end:
             return Outcome(True, "converged on two checks in a row", now)
         if blocks == most:
             why = "; ".join(missing) or "only the last check passed"
             return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
         if not now.covered and at_end:
             return None
-        # One whose target was made smaller has converged before its end.
-        done = not missing and passed
-        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, now)
-        passed = not missing
+        first = not now.shortcomings(plan.ess, FIRST_PART)
+        passed = (passed or blocks) if first else 0
+        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, found: Check) -> int:
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may mend what
-    else is missing; and after a check that found nothing missing comes another at once.
+    else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
-    if not found.shortcomings(plan.ess):
-        return blocks + 1
+    part = 1.0 if passed else FIRST_PART
     fewest = np.min([found.ess_bulk, found.ess_tail])
     with np.errstate(divide="ignore"):
         steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = steps / plan.block
+    wanted = max(part * steps / plan.block, APART * passed)
     if not wanted > blocks:  # nan too
         wanted = LEAST_STRETCH * blocks
     return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
 class _Judge:
-    """Judges the first blocks that count, each of which it prepares once."""
+    """Judges the first blocks that count, each of which it prepares once; more of them each time.
+
+    Of many draws it takes every second step, or every fourth, and so on, to bound its memory. How
+    many is a function of the blocks that it judges, so that a run that goes on judges the same.
+    """
 
     def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain) -> None:
         self.posterior, self.plan, self.chain = posterior, plan, chain
         self.proposal = chain.proposal_in_use("sampling")
+        self.prepared, self.thin = 0, 1
         self.draws: list[FloatArray] = []
         self.log_weights: list[FloatArray] = []
 
     def __call__(self, blocks: int) -> Check:
         """Judge the first ``blocks`` blocks."""
-        for number in range(len(self.draws), blocks):
-            self._prepare(self.chain.block_of("sampling", number))
-        accepted = self.chain.accepted("sampling")[:blocks]
-        found = check(np.concatenate(self.draws[:blocks]), accepted, self.plan.block)
+        plan = self.plan
+        # Far more draws than are to be effective, so that none is missed.
+        most = max(MOST_DRAWS, round(4 * plan.ess))
+        thin = thinning(blocks * plan.block * plan.ensembles * plan.walkers, most)
+        while self.thin < thin:
+            self.thin *= 2
+            for kept in (self.draws, self.log_weights):
+                kept[:] = [values[1::2] for values in self._joined(kept)]
+        for number in range(self.prepared, blocks):
+            self._prepare(number)
+        self.prepared = blocks
+        (every,) = self.draws = self._joined(self.draws)
+        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
         if self.proposal is None:
             return found
-        return replace(found, pareto_k=pareto_k(np.concatenate(self.log_weights[:blocks])))
+        (weights,) = self.log_weights = self._joined(self.log_weights)
+        return replace(found, pareto_k=pareto_k(weights.ravel()))
 
-    def _prepare(self, blocks: tuple[Block, ...]) -> None:
-        coordinates = np.stack([block.coordinates for block in blocks], axis=1)
+    @staticmethod
+    def _joined(kept: list[FloatArray]) -> list[FloatArray]:
+        return [np.concatenate(kept)] if kept else []
+
+    def _prepare(self, number: int) -> None:
+        blocks = self.chain.block_of("sampling", number)
+        steps = slice(-(number * self.plan.block + 1) % self.thin, None, self.thin)
+        coordinates = np.stack([block.coordinates[steps] for block in blocks], axis=1)
         self.draws.append(_constrained(self.posterior, coordinates))
         if self.proposal is not None:
             flat = coordinates.reshape(-1, coordinates.shape[-1])
-            density = np.stack([block.log_density for block in blocks], axis=1).ravel()
-            self.log_weights.append(density - self.proposal.log_density(flat))
+            density = np.stack([block.log_density[steps] for block in blocks], axis=1)
+            proposed = self.proposal.log_density(flat).reshape(density.shape)
+            self.log_weights.append(density - proposed)
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
@@ -253,6 +302,14 @@ def _remarks(chain: Chain) -> tuple[str, ...]:
         f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
         f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
     )
+
+
+def _thinned(chain: Chain) -> tuple[str, ...]:
+    """Say that a long chain is not used as a whole."""
+    thin = thinning(chain.draws("sampling"))
+    if thin == 1:
+        return ()
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
 
 
 def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
@@ -288,7 +345,16 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
     second_half = _constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
-    return bool((nested_rhat(second_half) < PILOT_RHAT).all())
+    if (nested_rhat(second_half) < PILOT_RHAT).all():
+        return True
+    return steps >= APART_STEPS and all(_stays(each) for each in np.moveaxis(second_half, 1, 0))
+
+
+def _stays(draws: FloatArray) -> bool:
+    """Tell whether the halves of an ensemble's draws (steps, walkers, free) agree."""
+    half = len(draws) // 2
+    halves = np.stack([draws[:half], draws[len(draws) - half :]], axis=1)
+    return bool((nested_rhat(halves) < PILOT_RHAT).all())
 
 
 def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:

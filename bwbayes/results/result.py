@@ -131,7 +131,7 @@ def _parameters(result: Result) -> dict[str, dict[str, object]]:
             "ess_bulk": float(check.ess_bulk[i]),
             "ess_tail": float(check.ess_tail[i]),
             "rhat": float(check.rhat[i]),
-            "mcse_mean": float(sd[i] / np.sqrt(check.ess_bulk[i])),
+            "mcse_mean": float(sd[i] / np.sqrt(check.ess_mean[i])),
             "unit": parameter.unit,
         }
         if parameter.name in result.truth:

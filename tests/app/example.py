@@ -93,6 +93,7 @@ def check(steps: int) -> Check:
         rhat=1.001 + 0.001 * each,
         ess_bulk=2100 + each,
         ess_tail=2200 + each,
+        ess_mean=2300 + each,
         autocorrelation=np.ones(4),
         acceptance=0.28,
         stuck=0,

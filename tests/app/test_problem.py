@@ -64,11 +64,12 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
     # Jumps of up to 160 V are also faster than those of up to 100 V.
-    remark, faster = of(text + "[3.0, 4.0]", folder).remarks
+    _, remark, faster = of(text + "[3.0, 4.0]", folder).remarks
     assert remark.startswith("rest: the voltage goes from -")
     assert "V were fitted: beyond that the bands are an extrapolation" in remark
     assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
-    assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
+    (coarse,) = of(RECORD + "train = [[0, 4.0]]", folder).remarks
+    assert coarse.startswith("record: coarse sampling")
 
 
 def by_name(problem: Problem) -> dict[str, Parameter]:
@@ -224,6 +225,14 @@ def test_hold_that_is_given_is_kept(folder: Path) -> None:
     assert "first" == of(text, folder).posterior.actuator.hold
 
 
+def test_model_that_need_not_be_passive_stays_so(folder: Path) -> None:
+    assert of(RECORD, folder).posterior.prior.passive
+    problem = of(RECORD + "[model]\npassive = false", folder)
+    assert not problem.posterior.prior.passive
+    assert not problem.config.model.passive
+    assert "passive = false" in dump(problem.config)
+
+
 def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None:
     text = RECORD + (
         "[parameters.d]\nprior = {distribution = 'normal', mean = 0.7, sd = 0.1}\nlower = 0.2\n"
@@ -357,3 +366,20 @@ def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
     config = small.config(("from_rest = true", f"lead_in = {lead_in}"))
     with pytest.raises(InputError, match=r"validation\.sine\.lead_in: "):
         resolve(config, tmp_path)
+
+
+def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
+    """What is stored has none of them, and resolves to the same problem without another search."""
+    generator_ = np.random.default_rng(2)
+    voltage = 50 * np.sin(np.arange(600) / 30)
+    reading = 0.5 * voltage + 0.05 * generator_.standard_normal(600)
+    reading[[100, 333]] += (20, -20)
+    write_record(Record(voltage, reading, 0.01), folder / "record.csv")
+    problem = of(RECORD + "[model]\noutliers = true\n", folder)
+    assert [100, 333] == np.flatnonzero(np.isnan(problem.posterior.displacement)).tolist()
+    assert "2 readings set aside as isolated outliers, at 1, 3.33 s" in problem.remarks
+    assert [1.0, 3.33] == pytest.approx(problem.config.record.outliers)
+    (folder / "records").mkdir()
+    write_record(problem.record, folder / "records" / "record.h5")
+    again = resolve(problem.config, folder)
+    assert problem.posterior.readings.rows.tolist() == again.posterior.readings.rows.tolist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.defaults import CATALOGUE, Ranges
 from bwbayes.inference.distributions import Distribution
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.parameters import JointPrior, Parameter, passive_remark
 from bwbayes.model.boucwen import ceiling
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 
@@ -44,6 +45,11 @@ def cut_prior(**fixed: float) -> JointPrior:
     return joint_prior(HYSTERESIS, RANGES, fixed, WIDE)
 
 
+def active(prior: JointPrior) -> JointPrior:
+    """Return a prior without the constraint that gamma lies below beta."""
+    return JointPrior(prior.parameters, passive=False)
+
+
 PRIORS = {
     "default": joint_prior(ALL, RANGES, {}),
     "cut": cut_prior(),
@@ -52,6 +58,10 @@ PRIORS = {
     "gamma fixed": cut_prior(gamma=-0.03),
     "beta fixed": cut_prior(beta=0.01),
     "exponent fixed": cut_prior(exponent=1.0),
+    "active": active(cut_prior()),
+    "active, gamma fixed": active(cut_prior(gamma=0.03)),
+    "active, beta fixed": active(cut_prior(beta=0.01)),
+    "active, initial fixed": active(cut_prior(initial=9.0)),
 }
 
 
@@ -61,6 +71,10 @@ def test_coordinates_and_parameters_have_one_density(name: str) -> None:
     prior = PRIORS[name]
     z = 1.2 * np.random.default_rng(1).standard_normal((200, prior.dimensions))
     free, log_prior = prior.constrain(z)
+    # Only an initial state that is fixed beyond the ceiling is outside.
+    inside = np.isfinite(log_prior)
+    np.testing.assert_array_equal(inside, np.isfinite(prior.log_density(free)))
+    assert np.sum(inside) > 50
     step = 1e-4
     jacobians = np.empty((200, prior.dimensions, prior.dimensions))
     for column in range(prior.dimensions):
@@ -68,7 +82,8 @@ def test_coordinates_and_parameters_have_one_density(name: str) -> None:
         difference = prior.constrain(z + move)[0] - prior.constrain(z - move)[0]
         jacobians[:, :, column] = difference / (2 * step)
     # Rows and columns differ in scale by many powers of ten; the determinant does not care.
-    difference = prior.log_density(free) + np.linalg.slogdet(jacobians)[1] - log_prior
+    volume = np.linalg.slogdet(jacobians[inside])[1]
+    difference = prior.log_density(free[inside]) + volume - log_prior[inside]
     np.testing.assert_allclose(difference, np.median(difference), atol=2e-5)
 
 
@@ -84,9 +99,11 @@ def violations(prior: JointPrior, free: FloatArray) -> list[str]:
     top = ceiling(v["alpha"], v["beta"], v["gamma"], v["exponent"])
     allowed = {
         "0 < alpha < d": (v["alpha"] > 0) & (v["alpha"] <= v["d"]),
-        "|gamma| <= beta": np.abs(v["gamma"]) <= v["beta"],
+        "|gamma| <= beta": (np.abs(v["gamma"]) <= v["beta"])
+        | (np.array(not prior.passive) & (v["gamma"] >= -v["beta"])),
         "exponent": v["exponent"] >= 1,
-        "initial": np.abs(v["initial"]) <= top * (1 + 1e-12),
+        "initial": (np.abs(v["initial"]) <= top * (1 + 1e-12))
+        | (("initial" not in prior.free_names) & (v["gamma"] <= v["beta"])),
     }
     return [name for name, holds in allowed.items() if not holds.all()]
 
@@ -120,6 +137,53 @@ def test_outside_the_constraints_the_density_is_zero() -> None:
         outside = inside.copy()
         outside[column] = value
         assert -np.inf == prior.log_density(outside[np.newaxis])[0]
+
+
+# A published actuator, whose gamma is larger than its beta.
+PUBLISHED = {"d": 0.347, "alpha": 0.226, "beta": 0.0185, "gamma": 0.0252, "exponent": 1.0}
+
+
+def test_gamma_beyond_beta_is_outside_unless_the_model_need_not_be_passive() -> None:
+    prior = cut_prior(exponent=1.0)
+    published = np.array([[*(PUBLISHED[n] for n in ("d", "alpha", "beta", "gamma")), 1.0]])
+    assert -np.inf == prior.log_density(published)[0]
+    free = active(prior)
+    assert np.isfinite(free.log_density(published)[0])
+    np.testing.assert_allclose(published, free.constrain(free.unconstrain(published))[0], rtol=1e-9)
+    published[0, 3] = -0.0186
+    assert -np.inf == free.log_density(published)[0]
+    assert np.mean(free.draw(np.random.default_rng(13), 2000)[:, 3] > 0.02) > 0.1
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+def test_every_draw_of_a_prior_that_need_not_be_passive_has_a_likelihood(engine: Any) -> None:
+    for fixed in ({}, {"initial": 8.0, "exponent": 1.0}, {"exponent": 1.0}):
+        usual = short_posterior(samples=60, fixed=fixed, priors=WIDE)
+        posterior = replace(usual, prior=active(usual.prior), engine=engine)
+        draws = posterior.prior.draw(np.random.default_rng(14), 2000)
+        theta = posterior.prior.theta(draws)
+        assert np.mean(theta[:, 3] > theta[:, 2]) > 0.2
+        assert np.isfinite(posterior.log_density(posterior.prior.unconstrain(draws))).all()
+
+
+@pytest.mark.parametrize("ratio", [0.9, 0.99, 1.0])
+def test_a_posterior_that_presses_against_the_passive_bound_says_so(ratio: float) -> None:
+    prior = cut_prior(exponent=1.0)
+    draws = np.tile([0.7, 0.36, 0.027, 0.027 * ratio, 0.5], (2, 3, 4, 1))
+    remark = passive_remark(prior, draws)
+    assert (ratio > 0.95) == (remark is not None)
+    assert remark is None or "[model] passive = false" in remark
+    assert passive_remark(active(prior), draws) is None
+    assert passive_remark(cut_prior(gamma=0.01), draws) is None
+
+
+def test_a_quarter_of_the_draws_near_the_bound_is_no_remark() -> None:
+    prior = cut_prior(exponent=1.0)
+    draws = np.tile([0.7, 0.36, 0.027, 0.0, 0.5], (1000, 1))
+    draws[:250, 3] = 0.027
+    assert passive_remark(prior, draws) is None
+    draws[:260, 3] = 0.027
+    assert passive_remark(prior, draws) is not None
 
 
 def test_far_coordinates_have_no_density() -> None:
@@ -216,7 +280,7 @@ def test_theta_puts_fixed_parameters_in_their_columns() -> None:
         ("d", {"prior": Distribution("uniform", {"lower": -2, "upper": -1})}, "leave nothing"),
         ("d", {"fixed": 0.0}, "must be above 0"),
         ("sensor_sd", {"fixed": -1.0}, "must be above 0"),
-        ("exponent", {"fixed": 0.5}, "must be above 1"),
+        ("exponent", {"fixed": 0.5}, "must be at least 1"),
     ],
 )
 def test_a_parameter_that_cannot_be_is_refused(name: str, what: Any, says: str) -> None:
