@@ -143,7 +143,11 @@ if __name__ == "__main__":
         every = studied(case, 100)
         print(
             case,
-            [f"{100 * covered(every, n).mean():.1f} ({errors_off(covered(every, n), n):+.1f})" for n in LEVELS],
-            "p<.01:", np.mean([b.lead_in.p_value < 0.01 for b in every]),
+            [
+                f"{100 * covered(every, n).mean():.1f} ({errors_off(covered(every, n), n):+.1f})"
+                for n in LEVELS
+            ],
+            "p<.01:",
+            np.mean([b.lead_in.p_value < 0.01 for b in every]),
             flush=True,
         )
