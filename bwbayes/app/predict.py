@@ -61,11 +61,11 @@ def predict(
     posterior = problem.posterior
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     chosen = thinned(flat, generator(seed, "draws"))
-    for remark in beyond_training(posterior, other.voltage, other.interval):
-        click.echo(f"bwbayes: {name}: {remark}", err=True)
     bands = predict_record(
         posterior, chosen, other, start, generator(seed, f"predict {name}"), name
     )
+    for remark in beyond_training(posterior, other.voltage, other.interval):
+        click.echo(f"bwbayes: {name}: {remark}", err=True)
     target = out or folder.path / "predictions" / f"{name}.csv"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
