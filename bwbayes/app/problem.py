@@ -8,10 +8,8 @@ moved, continued and run again by itself.
 
 from __future__ import annotations
 
-import difflib
-import re
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,18 +18,16 @@ import numpy as np
 from bwbayes.app.config import (
     Config,
     ModelConfig,
-    ParameterConfig,
     RecordConfig,
     SignalConfig,
-    ValidationConfig,
 )
+from bwbayes.app.parameters import as_config, defaults_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
@@ -44,17 +40,18 @@ from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
-# No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
-LARGEST = 1e60
-
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out data: a window (slice) of the training record, or another record and its start."""
+    """Held-out data: a window (slice) of the training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it.
+    """
 
     window: slice | None = None
     record: Record | None = None
     start: Start = field(default_factory=Start)
+    judged: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         others = {
             name: _other_record(config, name, folder)
             for name, validation in config.validation.items()
-            if validation.window is None
+            if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     remarks += [f"record: {finding}" for finding in inspect(record)]
@@ -119,8 +116,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     actuator = Actuator(config.model.dynamics, hold, record.interval)
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
-    defaults = _defaults(config, record, split.training)
-    prior = JointPrior(_parameters(config, names, defaults))
+    defaults = defaults_of(config, record, split.training)
+    prior = JointPrior(parameters_of(config, names, defaults))
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -136,9 +133,13 @@ def resolve(config: Config, folder: Path) -> Problem:
     )
     windows = iter(split.held_out)
     validations = {
-        name: Validation(window=next(windows))
-        if v.window is not None
-        else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
+        name: Validation(
+            record=others[name],
+            start=_start(config, name),
+            judged=None if v.window is None else (v.window[0], v.window[1]),
+        )
+        if v.another
+        else Validation(window=next(windows))
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
@@ -186,12 +187,28 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
-    if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
-        raise InputError(
-            f"validation.{name}.lead_in: {source.lead_in:g} s is not a part of the record's "
-            f"{record.duration:g} s; choose another one"
-        )
+    try:
+        _start(config, name).window(record)
+    except InputError as error:
+        raise InputError(f"validation.{name}.lead_in: {error}") from None
+    if source.window is not None:
+        try:
+            record.window_slice(source.window[0], source.window[1])
+        except InputError as error:
+            raise InputError(f"validation.{name}.{error}") from None
     return record
+
+
+def _start(config: Config, name: str) -> Start:
+    """Return what a config knows of another record's start; its hold is its own, unless given."""
+    source, hold = config.validation[name], config.model.hold
+    return Start(
+        source.from_rest,
+        source.own_offset,
+        source.lead_in,
+        source.lead_in_from,
+        None if hold == "auto" else hold,
+    )
 
 
 def _stand(config: Config) -> VirtualTestStand:
@@ -204,7 +221,7 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 
 def _split(config: Config, record: Record) -> Split:
-    held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
+    held_out = {n: v.window for n, v in config.validation.items() if v.window and not v.another}
     if config.record.train is None:
         first, last = np.flatnonzero(record.has_reading)[[0, -1]]
         train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
@@ -223,106 +240,6 @@ def _split(config: Config, record: Record) -> Split:
                 "start, exclude and decimate in [record]"
             )
     return split
-
-
-def _parameters(config: Config, names: tuple[str, ...], defaults: Defaults) -> list[Parameter]:
-    _require_known("parameters", config.parameters, names)
-    _require_known("truth", config.truth, CATALOGUE)
-    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
-    if config.record.from_rest:
-        given |= {"initial": config.parameters.get("initial", ParameterConfig(fixed=0.0))}
-    return [_parameter(name, given[name], defaults) for name in names]
-
-
-def _defaults(config: Config, record: Record, training: tuple[slice, ...]) -> Defaults:
-    rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
-    assert record.displacement is not None
-    voltage, displacement = record.voltage[rows], record.displacement[rows]
-    if np.ptp(voltage) == 0 or np.nanmax(displacement) == np.nanmin(displacement):
-        raise InputError("record.train: voltage or displacement is constant there; widen it")
-    return Defaults(
-        Ranges.of(record.voltage, record.displacement, record.interval, training),
-        _exponent(config),
-        _fixed(config, "stiffness", None),
-        _fixed(config, "gamma", None) is None,
-    )
-
-
-def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
-    for name in given:
-        if name not in known:
-            if name in CATALOGUE:
-                raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
-
-
-def _fixed(config: Config, name: str, default: float | None) -> float | None:
-    given = config.parameters.get(name)
-    return default if given is None or given.fixed is None else given.fixed
-
-
-def _exponent(config: Config) -> float | Distribution:
-    """Return the exponent's value, or its prior if the config frees it."""
-    given = config.parameters.get("exponent")
-    if given is not None and given.prior is not None:
-        return _distribution("exponent", given.prior)
-    value = _fixed(config, "exponent", 1.0)
-    return 1.0 if value is None else value
-
-
-def _parameter(name: str, given: ParameterConfig, defaults: Defaults) -> Parameter:
-    """Put what the config says of a parameter before what the defaults say."""
-    meaning = CATALOGUE[name]
-    prior, fixed = None, given.fixed
-    if given.prior is not None:
-        prior = _distribution(name, given.prior)
-    elif fixed is None:
-        try:
-            default = defaults.of(name)
-        except KeyError:
-            raise InputError(
-                f"parameters.{name}: has no default prior; give prior or fixed (a record shows "
-                "mass and stiffness only through the damping)"
-            ) from None
-        if isinstance(default, Distribution):
-            prior = default
-        else:
-            fixed = default
-    _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
-    unit = meaning.unit
-    if name in ("beta", "gamma") and defaults.exponent != 1.0:
-        unit = "um^(1-n)/V"
-    if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
-        raise InputError(
-            f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
-        )
-    return Parameter(
-        name,
-        given.unit or unit,
-        given.label or meaning.label,
-        given.description or meaning.description,
-        prior,
-        fixed,
-        -np.inf if given.lower is None else given.lower,
-        np.inf if given.upper is None else given.upper,
-    )
-
-
-def _require_in_proportion(name: str, values: Collection[float]) -> None:
-    """Refuse numbers of which the model's products and quotients are too large or small to hold."""
-    for value in values:
-        if value and not 1 / LARGEST < abs(value) < LARGEST:
-            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
-
-
-def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
-    arguments = {key: value for key, value in prior.items() if key != "distribution"}
-    try:
-        # The distribution itself refuses arguments that are no numbers.
-        return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
-    except InputError as error:
-        raise InputError(f"parameters.{name}.prior: {error}") from None
 
 
 # Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
@@ -353,14 +270,11 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
     validation = {
-        name: v
-        if v.window is not None
-        else ValidationConfig(
-            file=f"records/{name}.h5",
-            from_rest=v.from_rest,
-            own_offset=v.own_offset,
-            lead_in=v.lead_in,
+        name: v.model_copy(
+            update={"file": f"records/{name}.h5", "signal": None, "voltage_is": None}
         )
+        if v.another
+        else v
         for name, v in config.validation.items()
     }
     return config.model_copy(
@@ -372,29 +286,14 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
             ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
-                hold=posterior.actuator.hold,
+                hold=config.model.hold,
                 noise=config.model.noise,
             ),
-            "parameters": {p.name: _as_config(p) for p in prior.parameters},
+            "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
                 update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}
             ),
             "validation": validation,
             "truth": {n: v for n, v in truth.items() if n in prior.names},
         }
-    )
-
-
-def _as_config(parameter: Parameter) -> ParameterConfig:
-    prior: dict[str, str | float] | None = None
-    if parameter.prior is not None:
-        prior = {"distribution": parameter.prior.name, **parameter.prior.arguments}
-    return ParameterConfig(
-        prior=prior,
-        fixed=parameter.fixed,
-        lower=parameter.lower if np.isfinite(parameter.lower) else None,
-        upper=parameter.upper if np.isfinite(parameter.upper) else None,
-        unit=parameter.unit,
-        label=parameter.label,
-        description=parameter.description,
     )

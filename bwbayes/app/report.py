@@ -23,6 +23,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
+from bwbayes.results.verdict import Verdict
 
 __all__ = ["Symbol", "digits", "picture", "render", "symbol", "template"]
 
@@ -95,6 +96,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
     check = result.outcome.check
     return template("report.html.j2").render(
         name=result.name,
+        failed=[_verdict(verdict) for verdict in result.failed],
         converged=result.outcome.converged,
         stop_reason=result.outcome.stop_reason,
         sampling=f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted.",
@@ -231,7 +233,10 @@ def _stated(parameter: Parameter) -> str:
 def _validation(result: Result) -> dict[str, Any]:
     """Return the validation table: a column for each of the bands, a row for each score."""
     judged = [bands for bands in result.bands if bands.name in result.scores]
-    columns = [list(_scores(result.scores[bands.name])) for bands in judged]
+    columns = [
+        [("Holds", _held(result, bands.name)), *_scores(result.scores[bands.name])]
+        for bands in judged
+    ]
     rows = [
         {
             "title": row[0][0],
@@ -242,6 +247,25 @@ def _validation(result: Result) -> dict[str, Any]:
         for row in zip(*columns, strict=True)
     ]
     return {"titles": [title(bands) for bands in judged], "rows": rows}
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    """Return a verdict that says no, in words."""
+    cause = verdict.cause
+    return {
+        "name": verdict.name,
+        "what": "fitted" if verdict.training else "not fitted",
+        "reasons": verdict.reasons,
+        "cause": cause.text if cause else UNKNOWN,
+        "remedy": cause.remedy if cause else UNKNOWN,
+    }
+
+
+def _held(result: Result, name: str) -> str:
+    verdict = result.verdicts.get(name)
+    if verdict is None:
+        return UNKNOWN
+    return {True: "yes", False: "NO", None: "cannot be told"}[verdict.holds]
 
 
 def _scores(scores: Scores) -> Iterator[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -18,8 +18,16 @@ from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
+from bwbayes.results.verdict import Verdict
 
-__all__ = ["show_calibration", "show_check", "show_priors", "show_result", "show_scores"]
+__all__ = [
+    "show_calibration",
+    "show_check",
+    "show_priors",
+    "show_result",
+    "show_scores",
+    "show_verdicts",
+]
 
 
 # Probability by which constraints must move a quantile to be shown: more than draws do.
@@ -28,6 +36,7 @@ CHANGED = 0.03
 
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
     """Show a finished run; without intervals, if it has not converged."""
+    show_verdicts(result.verdicts.values(), console)
     numbers = summary(result)["parameters"]
     if isinstance(numbers, Mapping):
         table = Table("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
@@ -43,11 +52,19 @@ def show_result(result: Result, folder: RunFolder, console: Console) -> None:
                 f"{row['rhat']:.3f}",
             )
         console.print(table)
-        show_scores(result.scores, console)
+        show_scores(result.scores, console, result.verdicts)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
     for remark in result.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
     console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_verdicts(verdicts: Iterable[Verdict], console: Console) -> None:
+    """Show first what does not hold, with its cause and what helps."""
+    for verdict in verdicts:
+        if verdict.holds is False:
+            line = f"[bold red]DOES NOT HOLD[/]: {escape(verdict.line)}"
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def _sampling(result: Result) -> str:
@@ -58,14 +75,26 @@ def _sampling(result: Result) -> str:
     return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
 
 
-def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
+def show_scores(
+    scores: Mapping[str, Scores], console: Console, verdicts: Mapping[str, Verdict] | None = None
+) -> None:
     """Show how predictions turned out."""
-    table = Table("prediction", "NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
+    table = Table(
+        "prediction",
+        *(["holds"] if verdicts else []),
+        "NRMSE",
+        "max error",
+        "CRPS",
+        "95 % width",
+        "sensor band covers",
+    )
     for name, one in scores.items():
         covered = one.coverage["sensor"] or {}
         error = one.coverage_error["sensor"] or {}
+        held = [_held(verdicts[name])] if verdicts else []
         table.add_row(
             name,
+            *held,
             f"{one.nrmse:.2%}",
             f"{one.max_error_um:.2f} um",
             f"{one.crps_um:.3f} um",
@@ -73,6 +102,10 @@ def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
             ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
         )
     console.print(table)
+
+
+def _held(verdict: Verdict) -> str:
+    return {True: "yes", False: "[bold red]NO[/]", None: "unknown"}[verdict.holds]
 
 
 def show_calibration(calibration: Calibration, folder: CalibrationFolder, console: Console) -> None:

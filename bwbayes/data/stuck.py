@@ -80,7 +80,7 @@ def _returns(values: FloatArray, least: float) -> bool:
     parts = (values[:third], values[third : values.size - third], values[values.size - third :])
     left, middle, right = (float(part.mean()) for part in parts)
     noise = scatter(np.diff(values)) / np.sqrt(third)
-    return min(middle - left, middle - right) > max(least, 3 * noise)
+    return bool(min(middle - left, middle - right) > max(least, 3 * noise))
 
 
 def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:

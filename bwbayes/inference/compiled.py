@@ -9,18 +9,15 @@ rest of the work is compiled still.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import kernels
-from bwbayes.inference.noise import SteadyState
+from bwbayes.inference import kernels, lanes
+from bwbayes.inference.noise import Noise, SteadyState
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.linear import Recursion
-
-if TYPE_CHECKING:
-    from bwbayes.inference.likelihood import Likelihood
 
 __all__ = ["moments"]
 
@@ -28,19 +25,37 @@ __all__ = ["moments"]
 LARGEST = 1 << 23
 
 
-def moments(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return what :meth:`Likelihood.moments` does, at θ (models, parameters) with its initial h."""
-    actuator, readings = likelihood.actuator, likelihood.readings
-    column = dict(zip((*actuator.parameters, *likelihood.noise.parameters), theta.T, strict=True))
-    spaced = likelihood.noise.at(actuator.interval * readings.stride)
-    steady = spaced.steady_state(theta[:, len(actuator.parameters) :])
-    voltage = likelihood.voltage[: readings.samples]
+def moments(
+    theta: FloatArray,
+    voltage: FloatArray,
+    displacement: FloatArray,
+    skipped: FloatArray,
+    actuator: Actuator,
+    noise: Noise,
+    offset: int,
+    free: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return products and log determinants as :class:`~bwbayes.inference.likelihood.Moments` does.
+
+    Parameters
+    ----------
+    theta
+        (models, parameters), those of the actuator and of the noise, inside the model's domain.
+    voltage, displacement
+        (samples,), V and um, from the record's first sample to its last reading.
+    skipped
+        (samples,) readings that are missing just before one; −1 where there is none.
+    actuator, noise
+        The model; the noise for the interval between readings.
+    offset, free
+        How many offsets and free responses of the dynamics are unknown.
+    """
+    column = dict(zip((*actuator.parameters, *noise.parameters), theta.T, strict=True))
+    steady = noise.steady_state(theta[:, len(actuator.parameters) :])
     models = _models(column, float(voltage[0]), actuator.recursion(column), steady)
     closed = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
-    free = 0 if likelihood.from_rest else actuator.unknowns
-    offset = 1 if likelihood.offset_sd else 0
-    sums = np.empty((kernels.SUMS, len(theta)))
-    record = voltage, likelihood.values, likelihood.skipped
+    sums = np.empty((lanes.SUMS, len(theta)))
+    record = voltage, displacement, skipped
     if closed.any():
         unknown = np.empty((int(closed.sum()), 0))
         sums[:, closed] = kernels.sums(*record, models[closed], unknown, offset, free)
@@ -55,7 +70,8 @@ def moments(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Floa
     for i in range(size):
         for j in range(i + 1):
             products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
-    log_determinant = readings.rows.size * np.log(steady.variance) + sums[kernels.LOG_RATIO]
+    readings = np.count_nonzero(skipped >= 0)
+    log_determinant = readings * np.log(steady.variance) + sums[lanes.LOG_RATIO]
     return products, log_determinant
 
 
@@ -99,4 +115,4 @@ def _models(
         "free_21": free[:, 1, 0],
         "free_22": free[:, 1, 1],
     }
-    return np.stack([rows[name] for name in kernels.PARAMETERS], axis=1)
+    return np.stack([rows[name] for name in lanes.PARAMETERS], axis=1)

@@ -11,8 +11,8 @@ The second stage has two forms. Most of a record passes :func:`_settled`: each s
 and the filter is in its steady state. Where readings are missing, or the filter is not settled, or
 still hears of the unknown start, the samples pass :func:`_exact`.
 
-The state of all models is one flat array of rows of ``LANES`` numbers, because a compiler can tell
-that rows of one array do not overlap. This module needs numba; it knows arrays and nothing else.
+The state of all models is one flat array, laid out in :mod:`bwbayes.inference.lanes`. This module
+needs numba; it knows arrays and nothing else.
 """
 
 from __future__ import annotations
@@ -24,44 +24,21 @@ from numba import njit
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["LANES", "LOG_RATIO", "PARAMETERS", "SUMS", "sums"]
+# isort: off
+# fmt: off
+from bwbayes.inference.lanes import (
+    A1, A2, AGAINST, AHEAD, ALPHA, B0, B1, B2, BEFORE, D, DECAY, ESTIMATE, FREE, GAIN, H,
+    INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS,
+    PHI, PREDICTED, PRODUCTS, RATE, RATIO, REST, SQUARES, STATE, SUMS, SURPLUS, TRUST, UNSURE,
+    VALUE, VARIANCE, X1, X2, Z,
+)
+# fmt: on
+# isort: on
 
-# Models side by side: four vector registers of eight numbers, which hide each other's latency.
-LANES = 32
+__all__ = ["sums"]
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
-
-# Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
-PARAMETERS = (
-    "initial", "alpha", "against", "ahead", "d", "rest", "level",
-    "b0", "b1", "b2", "a1", "a2",
-    "kept", "decay", "gain", "predicted", "variance", "surplus", "rate",
-    "free_11", "free_12", "free_21", "free_22",
-)  # fmt: skip
-(
-    H, ALPHA, AGAINST, AHEAD, D, REST, LEVEL, B0, B1, B2, A1, A2,
-    KEPT, DECAY, GAIN, PREDICTED, VARIANCE, SURPLUS, RATE, FREE,
-) = (LANES * row for row in range(20))  # fmt: skip
-MEMORY = 11
-(
-    X1, X2, UNSURE, SQUARES, RATIO, INVERSE, TRUST, BEFORE, Z, PHI, LOG,
-) = (LANES * (len(PARAMETERS) + row) for row in range(MEMORY))  # fmt: skip
-
-# The series that are filtered: the residual, the record's own offset, two free responses. Each has
-# a value, an estimate, an innovation; the free responses two numbers that their recursion keeps.
-SERIES = 4
-VALUE, ESTIMATE, INNOVATION, KEEP_1, KEEP_2 = (
-    LANES * (len(PARAMETERS) + MEMORY + SERIES * row) for row in range(5)
-)
-
-# Sums of products of innovations over their variances, of each pair of series; and the log of the
-# variances over that of the steady state.
-PRODUCTS = LANES * (len(PARAMETERS) + MEMORY + SERIES * 5)
-PAIRS = SERIES * (SERIES + 1) // 2
-LOG_RATIO = PAIRS
-SUMS = PAIRS + 1
-STATE = PRODUCTS + LANES * PAIRS
 
 # φ(z) = (1 − exp(−z)) / z by its series, to 3e-14 of itself up to this z; doubled beyond.
 SHORT = 0.1
@@ -177,14 +154,13 @@ def _given(
     voltage: FloatArray,
     first: int,
     last: int,
-    hysteretic: FloatArray,
+    known: FloatArray,
     out: FloatArray,
 ) -> None:
     """Write w − w₀ for h (lanes, samples) that is known already."""
     for t in range(first, last):
         for i in range(LANES):
-            w = state[D + i] * voltage[t] - hysteretic[i, t]
-            out[(t - first) * LANES + i] = w - state[REST + i]
+            out[(t - first) * LANES + i] = state[D + i] * voltage[t] - known[i, t] - state[REST + i]
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -295,10 +271,8 @@ def _take_logs(state: FloatArray) -> None:
 @njit(nogil=True, cache=True)
 def _is_settled(state: FloatArray) -> bool:
     """Tell whether all models' filters are in their steady state."""
-    settled = True
-    for i in range(LANES):
-        settled = settled and state[UNSURE + i] <= FORGOTTEN * state[VARIANCE + i]
-    return settled
+    unsure, variance = state[UNSURE : UNSURE + LANES], state[VARIANCE : VARIANCE + LANES]
+    return bool(np.max(unsure / variance) <= FORGOTTEN)
 
 
 @njit(nogil=True, cache=True)
@@ -306,11 +280,10 @@ def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
     """Tell whether any model's filter still hears of the unknown start."""
     if offset > 0:
         return True
-    for k in range(1, 1 + free):
-        for i in range(k * LANES, (k + 1) * LANES):
-            left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
-            if left > FORGOTTEN:
-                return True
+    for i in range(LANES, (1 + free) * LANES):
+        left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
+        if left > FORGOTTEN:
+            return True
     return False
 
 
@@ -350,15 +323,18 @@ def _group(
     now, settled, heard = 0, False, True
     while now < voltage.size:
         last = min(now + PIECE, voltage.size)
-        dense = skipped[now] == 0.0
-        if settled and not heard and dense:
+        plain = settled and not heard and skipped[now] == 0.0
+        if plain:
             # As far as every sample has a reading.
-            last = _ends(skipped, now, last)
+            end = now
+            while end < last and skipped[end] == 0.0:
+                end += 1
+            last = end
         if hysteretic.shape[1] > 0:
             _given(state, voltage, now, last, hysteretic, drive)
         else:
             _drive(state, voltage, now, last, steepest, drive)
-        if settled and not heard and dense:
+        if plain:
             _settled(state, displacement, now, last, drive)
         else:
             followed = free if heard else 0
@@ -371,15 +347,6 @@ def _group(
         for pair in range(PAIRS):
             result[pair, i] = state[PRODUCTS + pair * LANES + i]
         result[LOG_RATIO, i] = state[LOG + i]
-
-
-@njit(nogil=True, cache=True)
-def _ends(skipped: FloatArray, first: int, last: int) -> int:
-    """Return where the samples that have a reading each, from ``first`` on, end."""
-    end = first
-    while end < last and skipped[end] == 0.0:
-        end += 1
-    return end
 
 
 @njit(nogil=True, cache=True)
@@ -418,20 +385,16 @@ def sums(
         h, (models, samples), um, if it is known; (models, 0) to be worked out for n = 1.
     """
     count = models.shape[0]
-    result = np.empty((SUMS, count))
-    state = _aligned(STATE)
-    part = np.empty((SUMS, LANES))
-    known = np.empty((LANES, hysteretic.shape[1]))
+    result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
+    state, known = _aligned(STATE), np.empty((LANES, hysteretic.shape[1]))
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            for t in range(hysteretic.shape[1]):
-                known[i, t] = hysteretic[model, t]
+            known[i] = hysteretic[model]
         _group(state, voltage, displacement, skipped, known, offset, free, part)
-        for total in range(SUMS):
-            for i in range(min(LANES, count - first)):
-                result[total, first + i] = part[total, i]
+        last = min(first + LANES, count)
+        result[:, first:last] = part[:, : last - first]
     return result

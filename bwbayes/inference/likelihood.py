@@ -151,6 +151,11 @@ class Likelihood:
         return sd
 
     @property
+    def spaced(self) -> Noise:
+        """The noise for the interval between readings."""
+        return self.noise.at(self.actuator.interval * self.readings.stride)
+
+    @property
     def unknown(self) -> bool:
         """Tell whether anything is unknown of the start."""
         return bool(self.offset_sd) or not (self.from_rest or self.actuator.unknowns == 0)
@@ -168,7 +173,18 @@ class Likelihood:
             # Here, because numba may not be installed, and takes half a second to load.
             from bwbayes.inference import compiled  # noqa: PLC0415
 
-            return Moments(*compiled.moments(self, theta))
+            return Moments(
+                *compiled.moments(
+                    theta,
+                    self.voltage[: self.readings.samples],
+                    self.values,
+                    self.skipped,
+                    self.actuator,
+                    self.spaced,
+                    int(self.offset_sd > 0),
+                    0 if self.from_rest else self.actuator.unknowns,
+                )
+            )
         pieces = batches(len(theta), self.readings.samples)
         parts = [self._moments(theta[piece]) for piece in pieces]
         return Moments(*(np.concatenate(each) for each in zip(*parts, strict=True)))
@@ -179,7 +195,7 @@ class Likelihood:
         model, noise = theta[:, :size], theta[:, size:]
         simulated = self.actuator.displacement(model, self.voltage[: readings.samples])
         residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
-        spaced = self.noise.at(self.actuator.interval * readings.stride)
+        spaced = self.spaced
         responses = self._responses(model, spaced.steady_state(noise).log_decay)
         skipped, heard = readings.skipped, responses.shape[2]
         parts = []

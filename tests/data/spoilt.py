@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -50,7 +51,8 @@ def _run(
     amplitudes: tuple[float, ...] = (10.0, 30.0, 60.0, 100.0),
 ) -> Record:
     rate = float(generator.choice([100.0, 250.0, 1000.0]))
-    stand = VirtualTestStand(generator.choice(["none", "process", "structural"]), rate)
+    kinds: tuple[Literal["none", "process", "structural"], ...] = ("none", "process", "structural")
+    stand = VirtualTestStand(kinds[int(generator.integers(3))], rate)
     wanted = drive(float(generator.choice(amplitudes)), rate, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import engine, kernels
+from bwbayes.inference import engine
 from bwbayes.inference.engine import choose
+from bwbayes.inference.lanes import LANES
 from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Dynamics
@@ -61,7 +62,7 @@ def test_engines_agree_on_either_hold(hold: Hold) -> None:
     assert_engines_agree(posterior, prior_draws(posterior, 40))
 
 
-@pytest.mark.parametrize("count", [1, kernels.LANES - 1, kernels.LANES, kernels.LANES + 1, 100])
+@pytest.mark.parametrize("count", [1, LANES - 1, LANES, LANES + 1, 100])
 def test_any_number_of_models_fits_the_lanes(count: int) -> None:
     posterior = short_posterior(dynamics="lag")
     assert_engines_agree(posterior, prior_draws(posterior, count))

@@ -18,7 +18,7 @@ from bwbayes.data.record import Record
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator, Dynamics
-from bwbayes.results.bands import LEVELS, Bands
+from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record
 from tests.inference.problems import posterior_of
 
@@ -128,26 +128,3 @@ def covered(every: list[Bands], level: int, width: float = 1.0) -> FloatArray:
 def errors_off(parts: FloatArray, level: int) -> float:
     """Distance of the mean coverage from nominal, in standard errors between records."""
     return float((parts.mean() - level / 100) / (parts.std(ddof=1) / np.sqrt(parts.size)))
-
-
-if __name__ == "__main__":
-    import itertools
-
-    for (dynamics, lag), sd, lead, cut in itertools.product(
-        (("lag", 3.8e-3), ("lag", 38e-3), ("second-order", 0.0)),
-        (0.3, 1.5),
-        (0.3, 1.0, 3.0),
-        ("any", "turn", "speed", "knocked"),
-    ):
-        case = Case(dynamics, lag, sd, lead, cut)  # type: ignore[arg-type]
-        every = studied(case, 100)
-        print(
-            case,
-            [
-                f"{100 * covered(every, n).mean():.1f} ({errors_off(covered(every, n), n):+.1f})"
-                for n in LEVELS
-            ],
-            "p<.01:",
-            np.mean([b.lead_in.p_value < 0.01 for b in every]),
-            flush=True,
-        )

@@ -99,7 +99,9 @@ def test_readings_are_judged_by_the_sensors_distribution(
 ) -> None:
     """Its sd is the root of both squares; the discrepancy's alone is less than a third of it."""
     record = Record(posterior.voltage, posterior.displacement + 0.5, INTERVAL)
-    bands = predict_windows(posterior, draw, record, {"all": slice(0, record.samples)})[0]
+    bands = predict_windows(
+        posterior, draw, record, {"all": slice(0, record.samples)}, np.random.default_rng(2)
+    )[0]
     sd = float(np.hypot(SENSOR, DISCREPANCY))
     assert_scores_are_of(bands, bands.mean, sd)
     np.testing.assert_allclose(sd, sds(bands, "sensor"), rtol=2e-3)
@@ -141,9 +143,10 @@ def test_twin_the_training_intervals_noise_would_be_seen(posterior: Posterior) -
 def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     posterior: Posterior, draw: FloatArray, sign: float
 ) -> None:
-    """At the end of the voltage's range h is near its ceiling: the last drive went there.
+    """At the end of the voltage's range the last drive went there: h has that sign.
 
-    Any other drive would leave h anywhere between both ceilings, 0 on average.
+    It lies between none, after ever smaller loops, and the ceiling; any other drive would leave h
+    anywhere between both ceilings, 0 on average.
     """
     named = dict(zip(posterior.prior.names, posterior.prior.theta(draw)[0], strict=True))
     top = named["alpha"] / (named["beta"] + named["gamma"])
@@ -151,7 +154,7 @@ def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     bands = predict_record(posterior, np.repeat(draw, 400, axis=0), held, Start(), _seeded())
     # Late, when the dynamics have settled; h stays as the voltage does.
     h = named["d"] * held.voltage[-1] + named["offset"] - bands.mean[-1]
-    assert sign * top == pytest.approx(h, abs=0.05 * top)
+    assert sign * top / 2 == pytest.approx(h, abs=0.05 * top)
 
 
 def _seeded() -> np.random.Generator:
