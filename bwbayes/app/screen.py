@@ -30,6 +30,10 @@ __all__ = [
 ]
 
 
+# Probability by which constraints must move a quantile to be shown: more than draws do.
+CHANGED = 0.03
+
+
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
     """Show a finished run; without intervals, if it has not converged."""
     show_verdicts(result.verdicts.values(), console)
@@ -166,20 +170,23 @@ def show_priors(
 ) -> None:
     """Show every prior and fixed value as numbers, with the point fit if there is one.
 
-    Beside each stated prior stands what the physical constraints leave of it: median and 95 %
-    interval under the joint prior.
+    Below a stated prior that the physical constraints change stands what they leave of it: median
+    and 95 % interval under the joint prior.
     """
     quantiles = conflict.effective(prior, generator(0, "effective priors"))
     left = dict(zip(prior.free_names, quantiles.T, strict=True))
-    header = ["parameter", "prior", "in effect: median, 95 %"]
-    table = Table(*header, *(["point fit"] if fitted else []), "unit")
+    table = Table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
     for parameter in prior.parameters:
-        known = str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"
-        row = [parameter.name, known, "", escape(parameter.unit)]
-        if parameter.name in left:
+        if parameter.prior is None:
+            known = f"fixed at {parameter.fixed:g}"
+        else:
+            known = str(parameter.prior)
             low, middle, high = left[parameter.name]
-            row[2] = f"{middle:.3g}, {low:.2g} to {high:.2g}"
+            shares = parameter.prior.frozen.cdf([low, middle, high])
+            if max(abs(shares - [0.025, 0.5, 0.975])) > CHANGED:
+                known += f"\n  in effect {middle:.3g} ({low:.2g} to {high:.2g})"
+        row = [parameter.name, known]
         if fitted:
-            row.insert(3, f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
-        table.add_row(*row)
+            row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
+        table.add_row(*row, escape(parameter.unit))
     console.print(table)

@@ -2,10 +2,10 @@
 
 With Y half the range of the displacement, U half the range of the voltage and T the typical time
 from one turning point of the drive to the next, every scale of the model is known to within a
-factor of a few: d is Y/U or twice that, α a part of it, β near 1/U, a lag some hundredth of T, the
-sensor's noise some thousandth of the range, and what the model leaves over anything from nothing to
-a tenth of it, correlated over about half a stretch from turn to turn. The sampling rate does not
-enter: a record and its every k-th sample have the same priors.
+factor of a few: d is Y/U or twice that, α a part of it, β near 1/U, a lag some thousandths of T,
+the sensor's noise some thousandth of the range, and what the model leaves over anything from
+nothing to a tenth of it, correlated over about half a stretch from turn to turn. The sampling rate
+does not enter: a record and its every k-th sample have the same priors.
 
 The ranges are those of the training data, displacement included, so strictly the data are used
 twice: once for these scales, once for the fit. The priors are wide enough that this does not show
@@ -109,7 +109,7 @@ def default_prior(
     """Return a parameter's default prior, or the value at which it is fixed by default.
 
     The exponent is one unless a config frees it. ``exponent``, its value or its prior, sets the
-    scale of β and γ; ``stiffness`` the damping that gives a lag of some hundredth of T; mass and
+    scale of β and γ; ``stiffness`` the damping that gives such a lag; mass and
     stiffness have no default (a record shows at most their ratio to the damping). ``gamma_free``:
     whether γ has a prior, which cuts β's.
 
@@ -133,7 +133,7 @@ def default_prior(
         "gamma": Distribution("normal", {"mean": 0.0, "sd": _round(GAMMA * _exp(max(low, high)))}),
         "exponent": 1.0,
         "initial": Distribution("normal", {"mean": 0.0, "sd": _round(0.3 * reach)}),
-        "lag": _lognormal(0.01 * time, 2.0),
+        "lag": _lognormal(LAG * time, LAG_SIGMA),
         "offset": Distribution(
             "normal",
             {"mean": _round(ranges.middle, displacement), "sd": _round(reach)},
@@ -145,7 +145,7 @@ def default_prior(
         "discrepancy_time": _lognormal(0.5 * time, 0.8),
     }
     if stiffness is not None:
-        priors["damping"] = _lognormal(0.01 * time * stiffness, 2.0)
+        priors["damping"] = _lognormal(LAG * time * stiffness, LAG_SIGMA)
     return priors[name]
 
 
@@ -172,6 +172,9 @@ class Defaults:
         known = {name: self.of(name) for name in names if name not in without}
         return {name: prior for name, prior in known.items() if isinstance(prior, Distribution)}
 
+
+# Of T: drives are mostly slow for the actuator. Wide, because its lag does not follow the drive.
+LAG, LAG_SIGMA = 0.005, 2.3
 
 # Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
 # what is left for β has its median a little above 1/U, and room for a factor of thirty either way.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -53,7 +54,12 @@ def test_priors_are_shown_as_the_constraints_leave_them(
     console = Console(file=StringIO(), width=200)
     show_priors(problem.posterior.prior, console)
     assert isinstance(console.file, StringIO)
-    (row,) = (line for line in console.file.getvalue().splitlines() if "beta" in line)
-    median, low, _ = (float(x) for x in row.split("│")[3].replace(",", "").split() if x != "to")
+    lines = console.file.getvalue().splitlines()
+    (place,) = (i for i, line in enumerate(lines) if "beta" in line)
+    numbers = re.findall(r"[\d.]+", lines[place + 1])
+    median, low, _ = (float(x) for x in numbers)
     assert low > 0.0172
     assert median > 0.02
+    # Nothing cuts that of the offset.
+    (place,) = (i for i, line in enumerate(lines) if "offset" in line)
+    assert "in effect" not in lines[place + 1]

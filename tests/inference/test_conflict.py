@@ -94,11 +94,11 @@ def test_default_that_does_not_fit_is_widened() -> None:
     ("name", "given", "times"),
     [
         ("d", lognormal(700.0, 0.3), "7e+02"),
-        ("lag", lognormal(4.0, 1.0), "8e+02"),
+        ("lag", lognormal(4.0, 1.0), "2e+03"),
         ("sensor_sd", lognormal(500.0, 1.0), "1e+03"),
         ("beta", lognormal(27.0, 1.0), "2e+04"),
         ("discrepancy_sd", lognormal(1500.0, 0.5), "3e+06"),
-        ("lag", 4.0, "8e+02"),
+        ("lag", 4.0, "2e+03"),
         ("d", 7e-7, "7e-07"),
     ],
 )

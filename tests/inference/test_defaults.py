@@ -76,14 +76,19 @@ def test_the_same_drive_ten_times_slower_has_ten_times_the_times() -> None:
         assert abs(factor) < 1e-9, name
 
 
+def test_lag_of_1_ms_is_not_improbable_after_a_slow_drive() -> None:
+    """A fit of 0.1 Hz must leave room for what a 5 Hz record shows."""
+    assert abs(score("lag", 1e-3, Ranges(100.0, 60.0, 0.0, time=5.0))) < 1.5
+
+
 @pytest.mark.parametrize("rate", [25.0, 5000.0])
 def test_times_of_a_1_hz_drive_are_those_that_actuators_show(rate: float) -> None:
-    """A lag of 0.5 to 50 ms lies within 1.3 sds, a discrepancy's 0.1 to 0.7 s within 1.5."""
+    """A lag of 0.5 to 50 ms lies within 1.4 sds, a discrepancy's 0.1 to 0.7 s within 1.5."""
     voltage = drive(interval=1 / rate)
     ranges = Ranges.of(voltage, displacement(voltage, 1 / rate), 1 / rate)
     for lag in (0.5e-3, 5e-3, 20e-3, 50e-3):
-        assert abs(score("lag", lag, ranges)) < 1.3
-        assert abs(score("damping", 4.1e5 * lag, ranges)) < 1.3
+        assert abs(score("lag", lag, ranges)) < 1.4
+        assert abs(score("damping", 4.1e5 * lag, ranges)) < 1.4
     for time in (0.1, 0.25, 0.5, 0.7):
         assert abs(score("discrepancy_time", time, ranges)) < 1.5
     assert prior("discrepancy_time", ranges).frozen.median() == pytest.approx(0.25, rel=0.05)
