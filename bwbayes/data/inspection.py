@@ -32,11 +32,10 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 
 # A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
-DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 8.0, 0.05, 2.0
+DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 10.0, 0.1, 2.0
 TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
 LONG_DECAY = 0.1  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
-RETURN_SDS, RETURN_PART = 2.0, 0.01  # of the displacement, where the voltage is clipped
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
 MOST_SPIKES = 0.02  # of the readings: more are no outliers
@@ -282,8 +281,7 @@ def _clipped_drive(record: Record, left_out: BoolArray) -> Iterator[Finding]:
         if runs(at_end)[1].max() < SHORTEST_AT_END or (~at_end[rows]).sum() < LEAST_READINGS:
             continue
         loop = fit_loop(record, left_out | at_end)
-        least = max(RETURN_SDS * scatter(loop.residual), RETURN_PART * _extent(displacement))
-        some = clipped_drive(voltage[rows], sign * displacement, least)
+        some = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
         if some is not None:
             text = (
                 f"{some.samples} voltages stay at the {side} value, "
