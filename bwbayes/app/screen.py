@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bwbayes.app.config import Config
 from bwbayes.app.folder import CalibrationFolder, RunFolder
-from bwbayes.app.problem import generator, resolve
-from bwbayes.inference import identifiability, pointfit
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 
-__all__ = ["show_calibration", "show_check", "show_priors", "show_result", "show_scores"]
+__all__ = ["show_calibration", "show_priors", "show_result", "show_scores"]
 
 
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
@@ -97,37 +93,6 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
         highlight=False,
         soft_wrap=True,
     )
-
-
-def show_check(config: Config, folder: Path, console: Console) -> None:
-    """Show a record, the resolved priors, the point fit, and what the record cannot tell.
-
-    Raises
-    ------
-    InputError
-        The config or its record cannot be used.
-    """
-    problem = resolve(config, folder)
-    record, posterior = problem.record, problem.posterior
-    low, high = record.range_voltage
-    console.print(
-        f"record: {escape(record.origin)}, {record.samples} samples every {record.interval:g} s, "
-        f"{low:.4g} to {high:.4g} V ({record.voltage_is})",
-        highlight=False,
-        soft_wrap=True,
-    )
-    point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
-    free, _ = posterior.prior.constrain(point.mode[None])
-    show_priors(problem.parameters, console, dict(zip(posterior.names, free[0], strict=True)))
-    left_open = identifiability.undetermined(posterior, point)
-    for remark in problem.remarks:
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
-    for combination in left_open:
-        console.print(
-            f"warning: the record does not determine {combination}: the prior decides there",
-            highlight=False,
-            soft_wrap=True,
-        )
 
 
 def show_priors(

@@ -32,9 +32,10 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 
 # A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
-DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 10.0, 0.1, 2.0
+DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 10.0, 0.1, 3.0
+START_SDS, START_PART = 15.0, 0.24
 TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
-LONG_DECAY = 0.1  # of the record: a decay that takes longer is a drift
+LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
@@ -295,11 +296,16 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that comes from elsewhere at the start, whatever the voltage does."""
     size, time = loop.decay
     usual, extent = scatter(loop.residual), _extent(_readings(record))
-    velocity = float(np.quantile(np.abs(np.diff(record.voltage)), 0.99)) / record.interval
+    steps = np.abs(np.diff(record.voltage))
+    velocity = float(np.quantile(steps, 0.99)) / record.interval
     left = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
-    if time > LONG_DECAY * record.duration:
-        return  # a drift
-    if abs(size) < max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * left):
+    alone = max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * left)
+    # With another hysteretic state at the start, which steps of the voltage do not show.
+    moving = np.count_nonzero(steps) > steps.size / 2
+    in_all = max(START_SDS * usual, START_PART * extent)
+    if abs(loop.start) > in_all and moving and abs(size) > usual:
+        size = loop.start
+    elif abs(size) < alone or time > LONG_DECAY * record.duration:
         return
     begin = float(record.time[loop.rows[0]])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
