@@ -8,7 +8,6 @@ moved, continued and run again by itself.
 
 from __future__ import annotations
 
-import difflib
 import re
 import warnings
 from collections.abc import Collection, Mapping
@@ -30,7 +29,7 @@ from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
@@ -42,6 +41,23 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.results.prediction import Start, beyond_training
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
+
+# What people call a parameter, and its name here.
+MEANINGS = {
+    "n": "exponent",
+    "h0": "initial",
+    "k": "stiffness",
+    "m": "mass",
+    "b": "damping",
+    "a": "alpha",
+    "tau": "lag",
+    "time_constant": "lag",
+    "y0": "offset",
+    "gain": "d",
+    "d33": "d",
+    "noise": "sensor_sd",
+    "sigma": "discrepancy_sd",
+}
 
 # No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
 LARGEST = 1e60
@@ -239,8 +255,9 @@ def _require_known(table: str, given: Collection[str], known: Collection[str]) -
         if name not in known:
             if name in CATALOGUE:
                 raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
+            raise InputError(
+                f"{table}.{name}: no such parameter here; {suggestion(name, known, MEANINGS)}"
+            )
 
 
 def _fixed(config: Config, name: str, default: float | None) -> float | None:

@@ -18,6 +18,7 @@ __all__ = ["SHORTEST_AT_END", "Stuck", "clipped", "clipped_drive", "held", "repe
 
 SHORTEST_AT_END = 5  # samples in a row at the end of a range
 LEAST_FALL = 0.25  # of what follows a run, in its last quarter
+LEAST_OF_RANGE = 0.01
 FEWEST = 10  # samples that are stuck, in all
 LEAST_PART = 0.005  # of the samples
 LONG_ENOUGH = 20  # samples in a row, of which one run is enough
@@ -85,7 +86,8 @@ def clipped_drive(values: FloatArray, other: FloatArray, usual: float) -> Stuck 
     sure = falls.sum() > 4 * usual * np.sqrt(count)
     if count >= 6:
         sure |= falls.mean() > 4 * falls.std(ddof=1) / np.sqrt(count)
-    if not sure or falls.sum() < LEAST_FALL * (end - after).sum():
+    least = max(LEAST_FALL * float((end - after).sum()), LEAST_OF_RANGE * float(np.ptp(other)))
+    if not sure or falls.sum() < least:
         return None
     return _enough(first, last, np.ones(count, dtype=np.bool_))
 
