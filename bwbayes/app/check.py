@@ -22,7 +22,7 @@ from bwbayes.app.report import picture, symbol, template
 from bwbayes.app.screen import show_priors
 from bwbayes.data import Record
 from bwbayes.data.inspection import Finding, inspect
-from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference import conflict, identifiability, pointfit
 
 __all__ = ["check", "write_page"]
 
@@ -60,13 +60,12 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
     free, _ = posterior.prior.constrain(point.mode[None])
     fitted = dict(zip(posterior.names, free[0], strict=True))
-    left_open = [
-        f"the record does not determine {combination}: the prior decides there"
-        for combination in identifiability.undetermined(posterior, point)
-    ]
+    likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
     # The findings are remarks too, but here they come with what to do.
     remarks = [r for r in problem.remarks if r not in {f"record: {one}" for one in findings}]
-    page = write_page(out, problem, findings, [*remarks, *left_open], fitted)
+    remarks += conflict.conflicts(posterior.prior, likely, problem.defaults)
+    untold = identifiability.remarks(posterior, point, likely)
+    page = write_page(out, problem, findings, [*remarks, *untold], fitted)
 
     def say(text: str) -> None:
         console.print(text, highlight=False, soft_wrap=True)
@@ -76,11 +75,11 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
         say(f"{escape(one.kind)}: {escape(one.text)}\n    what to do: {escape(one.remedy)}")
     if not findings:
         say("nothing wrong shows in the record")
-    show_priors(problem.parameters, console, fitted)
+    show_priors(posterior.prior, console, fitted)
     for remark in remarks:
         say(f"note: {escape(remark)}")
-    for text in left_open:
-        say(f"warning: {text}")
+    for text in untold:
+        say(f"warning: {escape(text)}")
     say(f"pictures: {escape(str(page))}")
     return problem
 

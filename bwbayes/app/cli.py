@@ -1,7 +1,8 @@
 """The command line: a thin layer over the package.
 
-Exit status 0: done, and converged. 2: input that cannot be used, said in one line. 4: finished
-without converging, or a calibration not passed. 130: interrupted; what was computed is kept.
+Exit status 0: done, and converged. 2: input that cannot be used, said in one line. 3: converged,
+but bands do not hold on a record that was measured, fitted or not. 4: finished without converging,
+or a calibration not passed. 130: interrupted; what was computed is kept.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
+DOES_NOT_HOLD = 3
 NOT_CONVERGED = 4
 
 # Replicates of a calibration, unless told otherwise.
@@ -47,7 +49,11 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but err
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="bwbayes")
 def cli() -> None:
-    """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model."""
+    """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
+
+    Exit status: 0 done; 2 input that cannot be used; 3 converged, but the bands do not hold on a
+    record that was measured; 4 not converged, or a calibration not passed; 130 interrupted.
+    """
 
 
 @cli.command()
@@ -85,7 +91,7 @@ def run(
         wanted = wanted.model_copy(update={"name": config.stem})
     folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
     if not quiet:
-        show_priors(load_run(folder).parameters, Console())
+        show_priors(load_run(folder).posterior.prior, Console())
     return _finish(folder.path, workers, quiet)
 
 
@@ -194,8 +200,14 @@ def simulate(
 @click.option(
     "--lead-in", type=float, default=1.0, show_default=True, help="Estimates the offset, s."
 )
+@click.option(
+    "--lead-in-from", type=float, help="Where the lead-in begins, s; default: the record's start."
+)
+@click.option(
+    "--window", type=(float, float), help="Judge and write this part alone: start and stop, s."
+)
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
-@click.option("--out", type=FILE, help="Default: FOLDER/predictions/NAME.csv.")
+@click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
 def predict(
     folder: Path,
@@ -203,11 +215,16 @@ def predict(
     wanted: str | None,
     from_rest: bool,
     lead_in: float,
+    lead_in_from: float | None,
+    window: tuple[float, float] | None,
     same_offset: bool,
     out: Path | None,
     overwrite: bool,
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
+
+    Beside the bands, their scores (JSON) and a picture. Exit status 3: the bands do not hold on
+    the record.
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
@@ -218,8 +235,8 @@ def predict(
         raise InputError("predict: give either --record or --signal")
     if not 0 < lead_in < math.inf:
         raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
-    begin = Start(from_rest, not same_offset, lead_in)
-    return write(folder, record, wanted, begin, out, Console(), overwrite=overwrite)
+    begin = Start(from_rest, not same_offset, lead_in, lead_in_from)
+    return write(folder, record, wanted, begin, out, Console(), window=window, overwrite=overwrite)
 
 
 @cli.command()
@@ -329,6 +346,13 @@ def _finish(
         return INTERRUPTED
     if not quiet:
         show_result(result, folder, Console())
+    if result.failed:
+        first, *others = result.failed
+        more = f", and {len(others)} more" if others else ""
+        # The screen begins with all of them.
+        said = first.line if quiet else f"{first.name}{more}"
+        click.echo(f"DOES NOT HOLD: {said}; see {path}/report.html", err=True)
+        return DOES_NOT_HOLD
     if result.outcome.converged:
         return 0
     click.echo(

@@ -129,9 +129,11 @@ class RecordConfig(_Source):
     """The training record: its source, the readings to use, and the windows to fit (default: all).
 
     ``start``, ``exclude`` and ``decimate`` leave out readings, never the voltage: the simulation
-    runs from the file's first sample. ``stop`` cuts the record.
+    runs from the file's first sample. ``stop`` cuts the record. ``from_rest`` says that it starts
+    with a demagnetised actuator at rest.
     """
 
+    from_rest: bool = False
     start: float | None = None
     stop: float | None = None
     exclude: Annotated[list[Window], Field(min_length=1)] | None = None
@@ -193,18 +195,31 @@ class SamplingConfig(_Table):
 
 
 class ValidationConfig(_Source):
-    """Held-out data: a window of the training record, or another record."""
+    """Held-out data: a window of the training record, or another record.
+
+    Of another record ``window`` is the part to judge. The lead-in of ``lead_in`` s, which tells
+    the record's start, begins at the time ``lead_in_from``, by default with the record.
+    """
 
     window: Window | None = None
     from_rest: bool = False
     own_offset: bool = True
     lead_in: Positive = 1.0
+    lead_in_from: float | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> ValidationConfig:
-        if sum(source is not None for source in (self.window, self.file, self.signal)) != 1:
+        both = self.file is not None and self.signal is not None
+        if both or not (self.another or self.window is not None):
             raise ValueError("give one of window, file and signal")
+        if not self.another and self.lead_in_from is not None:
+            raise ValueError("lead_in_from is for another record; give file or signal with it")
         return self
+
+    @property
+    def another(self) -> bool:
+        """Whether this is another record, and no window of the training record."""
+        return self.file is not None or self.signal is not None
 
 
 class Config(_Table):

@@ -1,25 +1,37 @@
-"""``bwbayes predict``: displacement bands of a finished run for another record or voltage."""
+"""``bwbayes predict``: displacement bands of a finished run for another record or voltage.
+
+Three files come of it: the bands (CSV), and beside them under the same name their scores and
+verdict (JSON) and a picture (PNG). No file is replaced unless that is asked for.
+"""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 from rich.console import Console
 
+from bwbayes.app.figures import draw_alone, save_one
 from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import generator
-from bwbayes.app.run import finished
-from bwbayes.app.screen import show_scores
+from bwbayes.app.problem import Problem, generator
+from bwbayes.app.run import finished, scoring
+from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.data import Record, read_record
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
-from bwbayes.results.files import write_bands
-from bwbayes.results.prediction import Start, beyond_training, predict_record, thinned
-from bwbayes.results.scores import score
+from bwbayes.results.bands import Bands
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.files import write_bands, write_summary
+from bwbayes.results.prediction import Start, predict_record, thinned
+from bwbayes.results.scores import Scores, as_summary, score
+from bwbayes.results.verdict import Background, Verdict, assess
 
-__all__ = ["predict"]
+__all__ = ["DOES_NOT_HOLD", "predict"]
+
+DOES_NOT_HOLD = 3
+NOT_CONVERGED = 4
 
 
 def predict(
@@ -30,48 +42,84 @@ def predict(
     out: Path | None,
     console: Console,
     *,
+    window: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Predict a record or a signal, write the bands, show their scores; return the exit status.
+    """Predict a record or a signal, write and show what came of it; return the exit status.
 
     Raises
     ------
     InputError
-        No such run, a record that cannot be used, or a file ``out`` that is there already.
+        No such run, a record that cannot be used, or a file that is there already.
     """
-    if out is not None and out.exists() and not overwrite:
-        raise InputError(f"{out}: exists; choose another name, or give --overwrite")
     folder = RunFolder.open(path)
+    name = record.stem if record is not None else str(wanted)
+    table = out or folder.path / "predictions" / f"{name}.csv"
+    numbers, picture = table.with_suffix(".json"), table.with_suffix(".png")
+    if table in (numbers, picture):
+        raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
+    for target in (table, numbers, picture):
+        if target.exists() and not overwrite:
+            raise InputError(f"{target}: exists; choose another name, or give --overwrite")
     problem, chain, outcome = finished(folder)
     if not outcome.converged:
         click.echo(
             f"NOT CONVERGED: {path} gives no interval; go on with `bwbayes resume {path}`", err=True
         )
-        return 4
-    if record is not None:
-        other, name = read_record(record, need_displacement=False), record.stem
-    else:
-        assert wanted is not None
-        interval = problem.record.interval
-        _, voltage = signal(wanted).sample(1 / interval)
-        other = Record(voltage, None, interval, origin=f"{wanted} signal")
-        name = wanted
-    seed = problem.config.seed
-    posterior = problem.posterior
+        return NOT_CONVERGED
+    other = _record(problem, record, wanted)
+    posterior, seed = problem.posterior, problem.config.seed
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     chosen = thinned(flat, generator(seed, "draws"))
-    if remark := beyond_training(posterior, other.voltage):
+    remarks = list(beyond_training(posterior, other.voltage, other.interval))
+    source = generator(seed, f"predict {other.sha256}")
+    bands = predict_record(posterior, chosen, other, start, source, name, window)
+    verdict = assess(bands, Background.of(posterior, flat))
+    scores = None if verdict is None else score(bands, scoring(seed, bands))
+    if verdict is not None:
+        show_verdicts([verdict], console)
+    for remark in remarks:
         click.echo(f"bwbayes: {name}: {remark}", err=True)
-    bands = predict_record(
-        posterior, chosen, other, start, generator(seed, f"predict {name}"), name
-    )
-    target = out or folder.path / "predictions" / f"{name}.csv"
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_bands(target, [bands])
+        table.parent.mkdir(parents=True, exist_ok=True)
+        write_bands(table, [bands])
+        write_summary(numbers, _numbers(bands, scores, verdict, remarks))
+        save_one(draw_alone(bands), picture)
     except OSError as error:
-        raise InputError(f"{target}: {error.strerror}; choose another place with --out") from None
-    if bands.measured is not None:
-        show_scores({name: score(bands, generator(seed, f"score {name}"))}, console)
-    console.print(f"wrote {target}", highlight=False, soft_wrap=True)
+        raise InputError(f"{table}: {error.strerror}; choose another place with --out") from None
+    if scores is not None and verdict is not None:
+        show_scores({name: scores}, console, {name: verdict})
+    for target in (table, numbers, picture):
+        console.print(f"wrote {target}", highlight=False, soft_wrap=True)
+    if verdict is not None and verdict.holds is False:
+        click.echo(f"DOES NOT HOLD: {name}; see {picture}", err=True)
+        return DOES_NOT_HOLD
     return 0
+
+
+def _record(problem: Problem, path: Path | None, wanted: str | None) -> Record:
+    """Read the record, or sample the signal as the training record was sampled."""
+    if path is not None:
+        return read_record(path, need_displacement=False)
+    assert wanted is not None
+    interval = problem.record.interval
+    _, voltage = signal(wanted).sample(1 / interval)
+    return Record(voltage, None, interval, origin=f"{wanted} signal")
+
+
+def _numbers(
+    bands: Bands, scores: Scores | None, verdict: Verdict | None, remarks: list[str]
+) -> dict[str, object]:
+    """Return what the JSON file holds; ``scores`` are null without a measurement."""
+    lead = bands.lead_in
+    judged = {"holds": None} if verdict is None else verdict.summary
+    return {
+        "name": bands.name,
+        "from_s": float(bands.time[0]),
+        "to_s": float(bands.time[-1] + bands.interval),
+        "samples": bands.time.size,
+        "remarks": remarks,
+        "lead_in": None if lead is None else asdict(lead),
+        "scores": None if scores is None else as_summary(scores),
+        **judged,
+    }

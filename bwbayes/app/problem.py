@@ -8,9 +8,8 @@ moved, continued and run again by itself.
 
 from __future__ import annotations
 
-import re
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,18 +18,16 @@ import numpy as np
 from bwbayes.app.config import (
     Config,
     ModelConfig,
-    ParameterConfig,
     RecordConfig,
     SignalConfig,
-    ValidationConfig,
 )
+from bwbayes.app.parameters import as_config, defaults_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
-from bwbayes.errors import InputError, InputWarning, suggestion
-from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
@@ -38,38 +35,23 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import Start, beyond_training
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
-
-# What people call a parameter, and its name here.
-MEANINGS = {
-    "n": "exponent",
-    "h0": "initial",
-    "k": "stiffness",
-    "m": "mass",
-    "b": "damping",
-    "a": "alpha",
-    "tau": "lag",
-    "time_constant": "lag",
-    "y0": "offset",
-    "gain": "d",
-    "d33": "d",
-    "noise": "sensor_sd",
-    "sigma": "discrepancy_sd",
-}
-
-# No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
-LARGEST = 1e60
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out data: a window (slice) of the training record, or another record and its start."""
+    """Held-out data: a window (slice) of the training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it.
+    """
 
     window: slice | None = None
     record: Record | None = None
     start: Start = field(default_factory=Start)
+    judged: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +64,8 @@ class Problem:
     plan: SamplingPlan
     validations: Mapping[str, Validation]
     remarks: tuple[str, ...] = ()
+    defaults: Mapping[str, Distribution] = field(default_factory=dict)
+    """What the default priors of this record would be, by name."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -122,7 +106,7 @@ def resolve(config: Config, folder: Path) -> Problem:
         others = {
             name: _other_record(config, name, folder)
             for name, validation in config.validation.items()
-            if validation.window is None
+            if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     remarks += [f"record: {finding}" for finding in inspect(record)]
@@ -132,7 +116,8 @@ def resolve(config: Config, folder: Path) -> Problem:
     actuator = Actuator(config.model.dynamics, hold, record.interval)
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
-    prior = JointPrior(_parameters(config, names, record, split.training))
+    defaults = defaults_of(config, record, split.training)
+    prior = JointPrior(parameters_of(config, names, defaults))
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -144,21 +129,29 @@ def resolve(config: Config, folder: Path) -> Problem:
         noise,
         prior,
         choose(config.sampling.engine),
+        config.record.from_rest,
     )
     windows = iter(split.held_out)
     validations = {
-        name: Validation(window=next(windows))
-        if v.window is not None
-        else Validation(record=others[name], start=Start(v.from_rest, v.own_offset, v.lead_in))
+        name: Validation(
+            record=others[name],
+            start=_start(config, name),
+            judged=None if v.window is None else (v.window[0], v.window[1]),
+        )
+        if v.another
+        else Validation(window=next(windows))
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
-        voltage = record.voltage[one.window] if one.record is None else one.record.voltage
-        if remark := beyond_training(posterior, voltage):
-            remarks.append(f"{name}: {remark}")
+        other = one.record or record
+        voltage = other.voltage[one.window or slice(None)]
+        leaving = beyond_training(posterior, voltage, other.interval)
+        remarks += [f"{name}: {remark}" for remark in leaving]
     explicit = _explicit(config, posterior, truth)
     plan = _plan(config, posterior)
-    return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
+    return Problem(
+        explicit, record, posterior, plan, validations, tuple(remarks), defaults.priors(names)
+    )
 
 
 def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, float]]:
@@ -194,12 +187,28 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
-    if source.own_offset and not 1 <= round(source.lead_in / record.interval) < record.samples:
-        raise InputError(
-            f"validation.{name}.lead_in: {source.lead_in:g} s is not a part of the record's "
-            f"{record.duration:g} s; choose another one"
-        )
+    try:
+        _start(config, name).window(record)
+    except InputError as error:
+        raise InputError(f"validation.{name}.lead_in: {error}") from None
+    if source.window is not None:
+        try:
+            record.window_slice(source.window[0], source.window[1])
+        except InputError as error:
+            raise InputError(f"validation.{name}.{error}") from None
     return record
+
+
+def _start(config: Config, name: str) -> Start:
+    """Return what a config knows of another record's start; its hold is its own, unless given."""
+    source, hold = config.validation[name], config.model.hold
+    return Start(
+        source.from_rest,
+        source.own_offset,
+        source.lead_in,
+        source.lead_in_from,
+        None if hold == "auto" else hold,
+    )
 
 
 def _stand(config: Config) -> VirtualTestStand:
@@ -212,7 +221,7 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 
 def _split(config: Config, record: Record) -> Split:
-    held_out = {n: v.window for n, v in config.validation.items() if v.window is not None}
+    held_out = {n: v.window for n, v in config.validation.items() if v.window and not v.another}
     if config.record.train is None:
         first, last = np.flatnonzero(record.has_reading)[[0, -1]]
         train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
@@ -231,101 +240,6 @@ def _split(config: Config, record: Record) -> Split:
                 "start, exclude and decimate in [record]"
             )
     return split
-
-
-def _parameters(
-    config: Config, names: tuple[str, ...], record: Record, training: tuple[slice, ...]
-) -> list[Parameter]:
-    _require_known("parameters", config.parameters, names)
-    _require_known("truth", config.truth, CATALOGUE)
-    rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
-    assert record.displacement is not None
-    voltage, displacement = record.voltage[rows], record.displacement[rows]
-    if np.ptp(voltage) == 0 or np.nanmax(displacement) == np.nanmin(displacement):
-        raise InputError("record.train: voltage or displacement is constant there; widen it")
-    ranges = Ranges.of(voltage, displacement, record.interval)
-    exponent = _fixed(config, "exponent", 1.0)
-    stiffness = _fixed(config, "stiffness", None)
-    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
-    return [_parameter(name, given[name], ranges, exponent, stiffness) for name in names]
-
-
-def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
-    for name in given:
-        if name not in known:
-            if name in CATALOGUE:
-                raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            raise InputError(
-                f"{table}.{name}: no such parameter here; {suggestion(name, known, MEANINGS)}"
-            )
-
-
-def _fixed(config: Config, name: str, default: float | None) -> float | None:
-    given = config.parameters.get(name)
-    return default if given is None or given.fixed is None else given.fixed
-
-
-def _parameter(
-    name: str,
-    given: ParameterConfig,
-    ranges: Ranges,
-    exponent: float | None,
-    stiffness: float | None,
-) -> Parameter:
-    """Put what the config says of a parameter before what the defaults say."""
-    meaning = CATALOGUE[name]
-    prior, fixed = None, given.fixed
-    if given.prior is not None:
-        prior = _distribution(name, given.prior)
-    elif fixed is None:
-        prior, fixed = _default(name, ranges, exponent or 1.0, stiffness)
-    _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
-    unit = meaning.unit
-    if name in ("beta", "gamma") and exponent != 1.0:
-        unit = "um^(1-n)/V"
-    if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
-        raise InputError(
-            f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
-        )
-    return Parameter(
-        name,
-        given.unit or unit,
-        given.label or meaning.label,
-        given.description or meaning.description,
-        prior,
-        fixed,
-        -np.inf if given.lower is None else given.lower,
-        np.inf if given.upper is None else given.upper,
-    )
-
-
-def _require_in_proportion(name: str, values: Collection[float]) -> None:
-    """Refuse numbers of which the model's products and quotients are too large or small to hold."""
-    for value in values:
-        if value and not 1 / LARGEST < abs(value) < LARGEST:
-            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
-
-
-def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
-    arguments = {key: value for key, value in prior.items() if key != "distribution"}
-    try:
-        # The distribution itself refuses arguments that are no numbers.
-        return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
-    except InputError as error:
-        raise InputError(f"parameters.{name}.prior: {error}") from None
-
-
-def _default(
-    name: str, ranges: Ranges, exponent: float, stiffness: float | None
-) -> tuple[Distribution | None, float | None]:
-    try:
-        found = default_prior(name, ranges, exponent, stiffness)
-    except KeyError:
-        raise InputError(
-            f"parameters.{name}: has no default prior; give prior or fixed (a record shows mass "
-            "and stiffness only through the damping)"
-        ) from None
-    return (found, None) if isinstance(found, Distribution) else (None, found)
 
 
 # Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
@@ -356,44 +270,30 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
     validation = {
-        name: v
-        if v.window is not None
-        else ValidationConfig(
-            file=f"records/{name}.h5",
-            from_rest=v.from_rest,
-            own_offset=v.own_offset,
-            lead_in=v.lead_in,
+        name: v.model_copy(
+            update={"file": f"records/{name}.h5", "signal": None, "voltage_is": None}
         )
+        if v.another
+        else v
         for name, v in config.validation.items()
     }
     return config.model_copy(
         update={
-            "record": RecordConfig(file="records/record.h5", train=config.record.train),
+            "record": RecordConfig(
+                file="records/record.h5",
+                train=config.record.train,
+                from_rest=config.record.from_rest,
+            ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
-                hold=posterior.actuator.hold,
+                hold=config.model.hold,
                 noise=config.model.noise,
             ),
-            "parameters": {p.name: _as_config(p) for p in prior.parameters},
+            "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
                 update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}
             ),
             "validation": validation,
             "truth": {n: v for n, v in truth.items() if n in prior.names},
         }
-    )
-
-
-def _as_config(parameter: Parameter) -> ParameterConfig:
-    prior: dict[str, str | float] | None = None
-    if parameter.prior is not None:
-        prior = {"distribution": parameter.prior.name, **parameter.prior.arguments}
-    return ParameterConfig(
-        prior=prior,
-        fixed=parameter.fixed,
-        lower=parameter.lower if np.isfinite(parameter.lower) else None,
-        upper=parameter.upper if np.isfinite(parameter.upper) else None,
-        unit=parameter.unit,
-        label=parameter.label,
-        description=parameter.description,
     )

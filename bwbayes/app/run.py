@@ -7,25 +7,30 @@ the next one needs, so it does not matter in how many pieces a run is done.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
+from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
 from bwbayes.app.workers import executor, one_thread
 from bwbayes.errors import InputError
-from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference import conflict, identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
@@ -36,6 +41,7 @@ from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores, score
+from bwbayes.results.verdict import Background, assess
 
 __all__ = [
     "assemble",
@@ -44,13 +50,10 @@ __all__ = [
     "load_run",
     "predictions",
     "redraw",
+    "scoring",
     "start",
     "versions",
 ]
-
-# A root mean square error, in parts of the range, above which something is wrong: a Bouc-Wen model
-# leaves over one or two percent of an actuator's displacement.
-POOR = 0.05
 
 PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
@@ -150,6 +153,7 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
     """
     problem = load_run(folder)
     chain = ChainFile.read(folder.chain)
+    _require_its_own(folder.chain, problem, chain.attributes())
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; go on with `bwbayes resume {folder.path}`")
     as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
@@ -173,12 +177,16 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
         for i, window in enumerate(training)
     }
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    bands = predict_windows(posterior, chosen, problem.record, windows)
-    for name, validation in problem.validations.items():
-        if validation.record is not None:
-            source = generator(seed, f"predict {name}")
+    # By content: the same record under another name gets the same bands.
+    source = generator(seed, f"predict {problem.record.sha256}")
+    bands = predict_windows(posterior, chosen, problem.record, windows, source)
+    for name, other in problem.validations.items():
+        if other.record is not None:
+            source = generator(seed, f"predict {other.record.sha256}")
             bands.append(
-                predict_record(posterior, chosen, validation.record, validation.start, source, name)
+                predict_record(
+                    posterior, chosen, other.record, other.start, source, name, other.judged
+                )
             )
     return tuple(bands)
 
@@ -189,10 +197,7 @@ def _chain(
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
     if folder.chain.exists():
-        chain = ChainFile.resume(folder.chain)
-        if chain.attributes()["data_sha256"] != problem.record.sha256:
-            chain.close()
-            raise InputError(f"{folder.chain}: belongs to another record; run again")
+        chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
             if wanted is None:
@@ -208,6 +213,7 @@ def _chain(
     attributes: dict[str, str | int] = {
         "config": dump(config),
         "data_sha256": problem.record.sha256,
+        "posterior": fingerprint(config),
         "versions": json.dumps(versions(posterior.engine)),
         "engine": posterior.engine,
         "platform": platform.platform(),
@@ -216,6 +222,13 @@ def _chain(
     }
     first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
     return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+
+
+def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
+    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
+    if noted.get("data_sha256") != problem.record.sha256:
+        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
+    require_same(noted.get("posterior"), problem.config, path)
 
 
 def _retarget(
@@ -236,17 +249,20 @@ def _retarget(
 def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions."""
     posterior = problem.posterior
-    left_open = identifiability.undetermined(posterior, chain.point)
+    sampled = draws(posterior, chain)
+    flat = sampled.reshape(-1, sampled.shape[-1])
     remarks = [
+        *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
-        *(f"the record does not determine {c}: the prior decides there" for c in left_open),
+        *conflict.conflicts(posterior.prior, flat, problem.defaults),
+        *identifiability.remarks(posterior, chain.point, flat),
     ]
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
         parameters=problem.parameters,
-        draws=draws(posterior, chain),
+        draws=sampled,
         log_density=chain.log_density("sampling"),
         moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),
@@ -256,14 +272,14 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     if not outcome.converged:
         return result
     bands = predictions(problem, result)
-    scores = _scores(problem, bands)
-    missed = max([scores[b.name].nrmse for b in bands if b.training and b.name in scores])
-    if missed > POOR:
-        remarks.append(
-            f"the mean misses the readings that were fitted by {missed:.1%} of their range (rms): "
-            "check the displacement's sign, outliers, and whether this is the right model"
-        )
-    return replace(result, bands=bands, scores=scores, remarks=tuple(remarks))
+    background = Background.of(posterior, result.flat_draws)
+    verdicts = {one.name: assess(one, background) for one in bands}
+    return replace(
+        result,
+        bands=bands,
+        scores=_scores(problem, bands),
+        verdicts={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+    )
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
@@ -292,12 +308,17 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
 
 
 def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
-    seed = problem.config.seed
     return {
-        one.name: score(one, generator(seed, f"score {one.name}"))
+        one.name: score(one, scoring(problem.config.seed, one))
         for one in bands
         if one.measured is not None
     }
+
+
+def scoring(seed: int, bands: Bands) -> np.random.Generator:
+    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    assert bands.measured is not None
+    return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")
 
 
 def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:

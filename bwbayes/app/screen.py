@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.folder import CalibrationFolder, RunFolder
-from bwbayes.inference.parameters import Parameter
+from bwbayes.app.problem import generator
+from bwbayes.inference import conflict
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
+from bwbayes.results.verdict import Verdict
 
-__all__ = ["show_calibration", "show_priors", "show_result", "show_scores"]
+__all__ = [
+    "show_calibration",
+    "show_priors",
+    "show_result",
+    "show_scores",
+    "show_verdicts",
+]
 
 
 def show_result(result: Result, folder: RunFolder, console: Console) -> None:
     """Show a finished run; without intervals, if it has not converged."""
+    show_verdicts(result.verdicts.values(), console)
     numbers = summary(result)["parameters"]
     if isinstance(numbers, Mapping):
         table = Table("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
@@ -35,11 +45,19 @@ def show_result(result: Result, folder: RunFolder, console: Console) -> None:
                 f"{row['rhat']:.3f}",
             )
         console.print(table)
-        show_scores(result.scores, console)
+        show_scores(result.scores, console, result.verdicts)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
     for remark in result.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
     console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_verdicts(verdicts: Iterable[Verdict], console: Console) -> None:
+    """Show first what does not hold, with its cause and what helps."""
+    for verdict in verdicts:
+        if verdict.holds is False:
+            line = f"[bold red]DOES NOT HOLD[/]: {escape(verdict.line)}"
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def _sampling(result: Result) -> str:
@@ -50,14 +68,26 @@ def _sampling(result: Result) -> str:
     return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
 
 
-def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
+def show_scores(
+    scores: Mapping[str, Scores], console: Console, verdicts: Mapping[str, Verdict] | None = None
+) -> None:
     """Show how predictions turned out."""
-    table = Table("prediction", "NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
+    table = Table(
+        "prediction",
+        *(["holds"] if verdicts else []),
+        "NRMSE",
+        "max error",
+        "CRPS",
+        "95 % width",
+        "sensor band covers",
+    )
     for name, one in scores.items():
         covered = one.coverage["sensor"] or {}
         error = one.coverage_error["sensor"] or {}
+        held = [_held(verdicts[name])] if verdicts else []
         table.add_row(
             name,
+            *held,
             f"{one.nrmse:.2%}",
             f"{one.max_error_um:.2f} um",
             f"{one.crps_um:.3f} um",
@@ -65,6 +95,10 @@ def show_scores(scores: Mapping[str, Scores], console: Console) -> None:
             ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
         )
     console.print(table)
+
+
+def _held(verdict: Verdict) -> str:
+    return {True: "yes", False: "[bold red]NO[/]", None: "unknown"}[verdict.holds]
 
 
 def show_calibration(calibration: Calibration, folder: CalibrationFolder, console: Console) -> None:
@@ -96,14 +130,24 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
 
 
 def show_priors(
-    parameters: Sequence[Parameter], console: Console, fitted: Mapping[str, float] | None = None
+    prior: JointPrior, console: Console, fitted: Mapping[str, float] | None = None
 ) -> None:
-    """Show every prior and fixed value as numbers, with the point fit if there is one."""
-    table = Table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
-    for parameter in parameters:
+    """Show every prior and fixed value as numbers, with the point fit if there is one.
+
+    Beside each stated prior stands what the physical constraints leave of it: median and 95 %
+    interval under the joint prior.
+    """
+    quantiles = conflict.effective(prior, generator(0, "effective priors"))
+    left = dict(zip(prior.free_names, quantiles.T, strict=True))
+    header = ["parameter", "prior", "in effect: median, 95 %"]
+    table = Table(*header, *(["point fit"] if fitted else []), "unit")
+    for parameter in prior.parameters:
         known = str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"
-        row = [parameter.name, known]
+        row = [parameter.name, known, "", escape(parameter.unit)]
+        if parameter.name in left:
+            low, middle, high = left[parameter.name]
+            row[2] = f"{middle:.3g}, {low:.2g} to {high:.2g}"
         if fitted:
-            row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
-        table.add_row(*row, escape(parameter.unit))
+            row.insert(3, f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
+        table.add_row(*row)
     console.print(table)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -144,8 +144,12 @@ class ChainFile(Chain):
         return chain
 
     @classmethod
-    def resume(cls, path: Path) -> ChainFile:
+    def resume(
+        cls, path: Path, check: Callable[[Mapping[str, str | int]], None] | None = None
+    ) -> ChainFile:
         """Read a chain and open it to go on, from the last block that counts.
+
+        ``check`` is given the attributes first, and may refuse them: the file then stays as it is.
 
         Raises
         ------
@@ -158,6 +162,8 @@ class ChainFile(Chain):
             As :meth:`read`.
         """
         old = cls.read(path)
+        if check is not None:
+            check(old.attributes())
         fresh = path.with_suffix(".fresh")
         made = cls.create(fresh, old, old.point, old.block, old.attributes())
         # The name changes under the open file: it is the same file all along.

@@ -22,7 +22,10 @@ from bwbayes.errors import InputError
 from bwbayes.inference.distributions import Distribution
 from bwbayes.model.boucwen import ceiling
 
-__all__ = ["JointPrior", "Parameter"]
+__all__ = ["COORDINATES", "JointPrior", "Parameter"]
+
+# Version of the map from coordinates to parameters. A chain stores coordinates, and notes it.
+COORDINATES = 1
 
 Values = dict[str, FloatArray]
 

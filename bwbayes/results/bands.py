@@ -14,13 +14,27 @@ from typing import Literal
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["KINDS", "LEVELS", "Bands", "Kind"]
+__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn"]
 
 Kind = Literal["parameter", "displacement", "sensor"]
 KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
 
 # Probabilities of the bands, percent.
 LEVELS = (50, 90, 95)
+
+
+@dataclass(frozen=True)
+class LeadIn:
+    """The stretch that told a record's start, and how well it fits.
+
+    It goes from ``start`` to ``stop`` in s and holds ``samples`` readings; ``p_value`` is that of
+    a test of its innovations, small where the model cannot have made them.
+    """
+
+    start: float
+    stop: float
+    samples: int
+    p_value: float
 
 
 @dataclass(frozen=True)
@@ -33,7 +47,8 @@ class Bands:
     reading under the sensor's distribution, ``crps`` its continuous ranked probability score in
     um; both None without a measurement. Samples before ``scored_from`` served to estimate the
     record's offset and are not judged. ``interval`` is the sampling interval
-    in s; ``training`` says that the samples were fitted to.
+    in s; ``training`` says that the samples were fitted to. ``lead_in`` says how well the lead-in
+    fits, if there was one.
     """
 
     name: str
@@ -49,6 +64,7 @@ class Bands:
     interval: float
     scored_from: int = 0
     training: bool = False
+    lead_in: LeadIn | None = None
 
     def columns(self) -> Iterator[tuple[str, FloatArray]]:
         """Yield the names and values of the columns of ``bands.csv``."""

@@ -18,6 +18,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
 from bwbayes.results.bands import Bands
 from bwbayes.results.scores import Scores, as_summary
+from bwbayes.results.verdict import Verdict
 
 __all__ = ["Result", "summary"]
 
@@ -44,6 +45,8 @@ class Result:
     bands, scores
         Of every window and record that was predicted; ``scores`` by the bands' name, for those
         with a measurement. Both empty unless converged.
+    verdicts
+        Whether the bands hold, by their name, for those with a measurement.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -60,6 +63,7 @@ class Result:
     moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     bands: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -73,6 +77,11 @@ class Result:
     def flat_draws(self) -> FloatArray:
         """All draws, (draws, free)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
+
+    @property
+    def failed(self) -> tuple[Verdict, ...]:
+        """The verdicts of bands that do not hold."""
+        return tuple(verdict for verdict in self.verdicts.values() if verdict.holds is False)
 
 
 def summary(result: Result) -> dict[str, object]:
@@ -99,7 +108,10 @@ def summary(result: Result) -> dict[str, object]:
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
-        known["validation"] = {name: as_summary(s) for name, s in result.scores.items()}
+        known["validation"] = {
+            name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
+            for name, s in result.scores.items()
+        }
     return known
 
 

@@ -91,7 +91,10 @@ def score(bands: Bands, generator: np.random.Generator) -> Scores:
             f"{bands.name}: no sample is left after the lead-in of "
             f"{bands.scored_from * bands.interval:g} s; shorten the lead-in or give a longer record"
         )
-    judged = slice(bands.scored_from, None)
+    judged = np.isfinite(bands.measured)
+    judged[: bands.scored_from] = False
+    if not judged.any():
+        raise InputError(f"{bands.name}: all readings are missing; judge another window")
     measured = bands.measured[judged]
     residual = measured - bands.mean[judged]
     extent = float(np.ptp(measured))
@@ -103,20 +106,22 @@ def score(bands: Bands, generator: np.random.Generator) -> Scores:
         if values is None:
             coverage[kind] = error[kind] = None
             continue
-        hits = _hits(bands, kind, values)
+        known = np.isfinite(values)
+        known[: bands.scored_from] = False
+        hits = {level: hit[known] for level, hit in _hits(bands, kind, values).items()}
         coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
-        block = block_length((values - bands.mean)[judged])
+        block = block_length((values - bands.mean)[known])
         error[kind] = _coverage_errors(hits, block, generator)
     seconds = {
-        level: _worst(hit, round(1 / bands.interval))
+        level: _worst(hit[bands.scored_from :], judged[bands.scored_from :], bands.interval)
         for level, hit in _hits(bands, "sensor", bands.measured).items()
     }
     return Scores(
         nrmse=float(np.sqrt(np.mean(residual**2))) / extent if extent > 0 else np.nan,
         max_error_um=float(np.abs(residual).max()),
         crps_um=float(bands.crps[judged].mean()),
-        width_um={level: _width(bands, level) for level in LEVELS},
-        interval_score_um={level: _interval_score(bands, level, measured) for level in LEVELS},
+        width_um={level: _width(bands, level, judged) for level in LEVELS},
+        interval_score_um={level: _interval_score(bands, level, judged) for level in LEVELS},
         coverage=coverage,
         coverage_error=error,
         worst_second=seconds,
@@ -228,29 +233,36 @@ def _coverage_errors(
 
 
 def _hits(bands: Bands, kind: Kind, values: FloatArray) -> dict[int, BoolArray]:
-    """Whether each judged value lies in the band, by level; its edges belong to the band."""
-    inside = {
+    """Whether each value lies in the band, by level; its edges belong to the band."""
+    return {
         level: (bands.lower[kind, level] <= values) & (values <= bands.upper[kind, level])
         for level in LEVELS
     }
-    return {level: hit[bands.scored_from :] for level, hit in inside.items()}
 
 
-def _width(bands: Bands, level: int) -> float:
+def _width(bands: Bands, level: int, judged: BoolArray) -> float:
     width = bands.upper["sensor", level] - bands.lower["sensor", level]
-    return float(width[bands.scored_from :].mean())
+    return float(width[judged].mean())
 
 
-def _interval_score(bands: Bands, level: int, measured: FloatArray) -> float:
+def _interval_score(bands: Bands, level: int, judged: BoolArray) -> float:
     """Mean of width + 2/a (distance to the band) of the judged readings, a = 1 - level."""
-    lower = bands.lower["sensor", level][bands.scored_from :]
-    upper = bands.upper["sensor", level][bands.scored_from :]
+    assert bands.measured is not None
+    measured = bands.measured[judged]
+    lower = bands.lower["sensor", level][judged]
+    upper = bands.upper["sensor", level][judged]
     outside = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
     return float((upper - lower + 2 / (1 - level / 100) * outside).mean())
 
 
-def _worst(hits: BoolArray, block: int) -> float:
-    """Lowest mean of ``block`` samples in a row, of all samples if there are fewer."""
-    block = max(1, min(block, hits.size))
-    total = np.concatenate([[0], np.cumsum(hits)])
-    return float((total[block:] - total[:-block]).min() / block)
+def _worst(hits: BoolArray, judged: BoolArray, interval: float) -> float:
+    """Lowest coverage of the readings in a second, in all of them if they last less.
+
+    A second that holds fewer than half as many readings as the fullest one says little, and is
+    left out.
+    """
+    block = max(1, min(round(1 / interval), hits.size))
+    covered, readings = (np.concatenate([[0], np.cumsum(some)]) for some in (hits & judged, judged))
+    counts = readings[block:] - readings[:-block]
+    telling = 2 * counts >= counts.max()
+    return float(((covered[block:] - covered[:-block])[telling] / counts[telling]).min())

@@ -185,12 +185,23 @@ def test_record_has_one_source(source: str) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "source", ["", 'file = "a.csv"\nwindow = [1.0, 2.0]', 'file = "a.csv"\nsignal = "step10"']
-)
+@pytest.mark.parametrize("source", ["", 'file = "a.csv"\nsignal = "step10"'])
 def test_validation_has_one_source(source: str) -> None:
     said = refused(f"{RECORD}[validation.a]\n{source}")
     assert "validation.a: give one of window, file and signal; correct the config" == said
+
+
+def test_a_window_of_another_record_is_what_is_judged() -> None:
+    text = f'{RECORD}[validation.a]\nfile = "a.csv"\nwindow = [1.0, 2.0]\nlead_in_from = 0.5'
+    found = parse(text, "").validation["a"]
+    assert found.another
+    assert [1.0, 2.0] == found.window
+    assert 0.5 == found.lead_in_from
+
+
+def test_a_window_of_the_training_record_has_no_lead_in() -> None:
+    said = refused(f"{RECORD}[validation.a]\nwindow = [1.0, 2.0]\nlead_in_from = 0.5")
+    assert "validation.a: lead_in_from is for another record; give file or signal" in said
 
 
 @pytest.mark.parametrize("name", ["record", "training", "training-2"])

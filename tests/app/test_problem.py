@@ -63,9 +63,11 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     voltage = np.concatenate([generator.uniform(-50, 50, 300), generator.uniform(-80, 80, 100)])
     write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
-    (remark,) = of(text + "[3.0, 4.0]", folder).remarks
+    # Jumps of up to 160 V are also faster than those of up to 100 V.
+    remark, faster = of(text + "[3.0, 4.0]", folder).remarks
     assert remark.startswith("rest: the voltage goes from -")
     assert "V were fitted: beyond that the bands are an extrapolation" in remark
+    assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
     assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
 
 
@@ -73,7 +75,7 @@ def by_name(problem: Problem) -> dict[str, Parameter]:
     return {parameter.name: parameter for parameter in problem.parameters}
 
 
-def test_default_priors_depend_on_ranges_and_interval_alone(tmp_path: Path) -> None:
+def test_default_priors_depend_on_ranges_and_times_of_the_drive_alone(tmp_path: Path) -> None:
     found = []
     for number, samples in ((1, 400), (2, 900)):
         write_record(record(samples, seed=number), tmp_path / "record.csv")
@@ -81,6 +83,26 @@ def test_default_priors_depend_on_ranges_and_interval_alone(tmp_path: Path) -> N
     assert found[0] == found[1]
     write_record(record(interval=0.02), tmp_path / "record.csv")
     assert found[0] != of(RECORD, tmp_path).parameters
+
+
+def test_free_exponent_has_its_own_unit_and_wider_scales_of_beta(folder: Path) -> None:
+    free = "[parameters.exponent]\nprior = { distribution = 'uniform', lower = 1.0, upper = 4.0 }"
+    known = by_name(of(RECORD, folder))
+    freed = by_name(of(RECORD + free, folder))
+    for name in ("beta", "gamma"):
+        assert (known[name].unit, freed[name].unit) == ("1/V", "um^(1-n)/V")
+    sigma = [one["beta"].prior.arguments["sigma"] for one in (known, freed) if one["beta"].prior]
+    assert sigma[1] > 1.1 * sigma[0]
+
+
+def test_fixed_gamma_takes_nothing_from_beta(folder: Path) -> None:
+    """|gamma| <= beta takes small beta away; where it does not, the stated median is higher."""
+    medians = [
+        by_name(of(RECORD + text, folder))["beta"].prior.frozen.median()  # type: ignore[union-attr]
+        for text in ("", "[parameters]\ngamma = { fixed = 0.0 }")
+    ]
+    assert medians[1] == pytest.approx(1 / 80, rel=0.01)
+    assert medians[0] < 0.5 * medians[1]
 
 
 def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
@@ -103,7 +125,7 @@ def test_resolved_config_says_every_choice_in_numbers(folder: Path) -> None:
         assert parameter.label
         assert parameter.description
     assert set(problem.config.parameters) == {p.name for p in problem.parameters}
-    assert problem.config.model.hold == "zero"
+    assert problem.posterior.actuator.hold == "zero"
     assert problem.config.sampling.walkers == problem.plan.walkers
 
 
@@ -188,7 +210,9 @@ def test_automatic_hold_follows_what_the_voltage_is(
     silent = [row for row in rows if not row.startswith("#")]
     (folder / "record.csv").write_text("\n".join(silent) + "\n")
     problem = of(RECORD + said, folder)
-    assert hold == problem.config.model.hold == problem.posterior.actuator.hold
+    assert hold == problem.posterior.actuator.hold
+    # Kept as it was asked for: another record has a hold of its own.
+    assert problem.config.model.hold == "auto"
 
 
 def test_automatic_hold_of_the_test_stand_is_zero_order(tmp_path: Path) -> None:

@@ -383,13 +383,21 @@ def test_chain_without_draws_predicts_nothing(
         module.finished(made)
 
 
-def test_fit_that_misses_its_own_readings_is_remarked_on(
+def test_fit_that_misses_its_own_readings_does_not_hold(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert not any("misses the readings" in text for text in redraw(copy).remarks)
-    monkeypatch.setattr("bwbayes.app.run.POOR", 1e-4)
-    (remark,) = [text for text in redraw(copy).remarks if "misses the readings" in text]
-    assert "% of their range (rms): check the displacement's sign" in remark
+    assert () == redraw(copy).failed
+    monkeypatch.setattr("bwbayes.results.verdict.POOR", 1e-4)
+    (verdict,) = redraw(copy).failed
+    assert "training" == verdict.name
+    assert "the mean misses the readings that were fitted by" in verdict.reasons[0]
+    row = small.numbers(copy.path)["validation"]["training"]
+    assert row["holds"] is False
+    assert list(verdict.reasons) == row["reasons"]
+    assert row["remedy"]
+    page = (copy.path / "report.html").read_text(encoding="utf-8")
+    assert 0 < page.index("DOES NOT HOLD") < page.index("Parameters")
+    assert 3 == _finish(copy.path, 1, quiet=True)
 
 
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:

@@ -12,6 +12,7 @@ import pytest
 from bwbayes.app import run as module
 from bwbayes.app.cli import _finish
 from bwbayes.app.config import load
+from bwbayes.app.fingerprint import fingerprint
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.predict import predict
 from bwbayes.app.run import carry_on
@@ -120,7 +121,8 @@ def run_with(run: Path, path: Path, draws: FloatArray) -> RunFolder:
             end = EnsembleState(made[-1, e], density[-1], state.random_state)
             blocks.append(Block(made[:, e], density, counts[e], np.zeros((3, 2), int), end))
         chain.append("sampling" if number else "tuning", blocks)
-    ChainFile.create(folder.chain, chain, old.point, BLOCK, old.attributes()).close()
+    noted = old.attributes() | {"posterior": fingerprint(load(folder.config))}
+    ChainFile.create(folder.chain, chain, old.point, BLOCK, noted).close()
     return folder
 
 

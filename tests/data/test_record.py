@@ -95,6 +95,17 @@ def test_window_holds_the_samples_from_start_to_before_stop(
     np.testing.assert_allclose(record.time[first:last], window.time, atol=1e-6 * interval)
 
 
+@pytest.mark.parametrize(
+    ("border", "sample"),
+    [(2.0, 2), (2.49, 2), (2.5, 2), (2.51, 3), (3.5, 3), (4.5, 4), (5.0, 5)],
+)
+def test_times_within_half_an_interval_count_as_on_a_border(border: float, sample: int) -> None:
+    """Whole numbers of quarter seconds are exact, so a half is one too."""
+    record = ramp(10, 0.25, 1.0)
+    assert slice(0, sample) == record.window_slice(1.0, 1.0 + border / 4)
+    assert slice(sample, 10) == record.window_slice(1.0 + border / 4, 3.5)
+
+
 def test_windows_that_share_a_border_partition_the_record() -> None:
     record = ramp(100, 0.01)
     cut = 0.3333

@@ -21,9 +21,10 @@ from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.series import draw_bands
 from bwbayes.app.figures.style import STYLE
+from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
 
-__all__ = ["draw_all", "save"]
+__all__ = ["draw_all", "draw_alone", "save", "save_one"]
 
 
 def draw_all(result: Result) -> dict[str, Figure]:
@@ -59,6 +60,18 @@ def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
             pictures[name] = _png(figure)
             (folder / f"{quote(name, safe=' ,;()+')}.png").write_bytes(pictures[name])
     return pictures
+
+
+def draw_alone(bands: Bands) -> Figure:
+    """Draw the bands of one prediction."""
+    with mpl.rc_context(STYLE):
+        return draw_bands(bands)
+
+
+def save_one(figure: Figure, path: Path) -> None:
+    """Write one figure as PNG."""
+    with mpl.rc_context(STYLE):
+        path.write_bytes(_png(figure))
 
 
 def _png(figure: Figure) -> bytes:

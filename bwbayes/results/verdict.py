@@ -1,0 +1,316 @@
+"""Whether bands hold on a record: the verdict that stands first on screen and report.
+
+Bands are held against the readings in three ways: how many readings they cover, how large the
+residuals are, and whether the residuals lean to one side. What luck alone may do to these three
+depends on how many independent readings a record is worth, and that is far fewer than it has: its
+discrepancy forgets slowly, and the parameters' error is one and the same all along. The bands
+themselves say how large each part is, so that the number follows from the model; a record that is
+worth too few to tell anything gets no verdict. A fit is judged on its own readings too. There the
+noise model grows until it covers whatever the model misses, so that a fit fails when it misses
+more than a part of the displacement's range.
+
+A verdict that says no names the likeliest cause (:mod:`bwbayes.results.causes`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special, stats
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.bands import LEVELS, Bands, Kind
+from bwbayes.results.causes import Cause, Residuals, cause, likeliest
+
+__all__ = ["Background", "Verdict", "assess"]
+
+# A root mean square error, in parts of the range, above which a fit misses its readings: a
+# Bouc-Wen model leaves over one or two percent of an actuator's displacement.
+POOR = 0.05
+
+# False alarms of each of the tests of coverage and size: some ten of them look at a record.
+ALARM = 2e-4
+
+# Standard errors that the mean of the residuals may be off.
+LEANING = 4.5
+
+# Coverage counts as off only where its odds are off by this factor: 95 % is not 92.6 %, but 94.
+ODDS = 1.5
+
+# Bands count as too wide where the residuals are smaller than they say by this factor or more.
+TOO_WIDE = 0.5
+
+# Residuals beyond this many sds count as this many, where their size is judged.
+FAR = 6.0
+
+# Readings in a row that are judged by themselves, so that a bad start is not lost in a long record.
+IN_A_ROW = 5
+
+# Worth fewer independent readings than this a record cannot show that bands hold.
+FEWEST = 5.0
+
+# The quantile of the discrepancy's time that the judgement goes by: rather too long than too short.
+LONG = 0.9
+
+# A lead-in whose test says less than this does not fit.
+LEAD_IN_ALARM = 0.002
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a verdict needs to know of the fit, besides the bands.
+
+    Parameters
+    ----------
+    memory
+        Correlation time of the discrepancy, s; to be on the safe side, a high quantile of its
+        posterior. Zero without a discrepancy.
+    unsure
+        Sd of the logarithm of the noise's sd over the draws: how well its size is known.
+    fitted
+        Lowest and highest voltage that was fitted, V.
+    """
+
+    memory: float = 0.0
+    unsure: float = 0.0
+    fitted: tuple[float, float] = (-np.inf, np.inf)
+
+    @classmethod
+    def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
+        """Return what a posterior and its draws (draws, free) say."""
+        names, actuator = posterior.prior.names, posterior.actuator.parameters
+        theta = posterior.prior.theta(draws)
+        memory = 0.0
+        if "discrepancy_time" in names:
+            times = theta[:, names.index("discrepancy_time")]
+            memory = float(np.quantile(times, LONG))
+        sds = posterior.noise.marginal_sd(theta[:, len(actuator) :])
+        sizes = np.log(np.sqrt(sum(sd**2 for sd in sds)))
+        voltage = np.concatenate([posterior.voltage[window] for window in posterior.training])
+        return cls(memory, float(np.std(sizes)), (float(voltage.min()), float(voltage.max())))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether bands hold on one record or window.
+
+    Attributes
+    ----------
+    name, training
+        Those of the bands.
+    holds
+        False if the bands fail one of the tests; None if the record is too short to tell.
+    reasons
+        What is off and by how much, one line each; of None, why nothing can be told.
+    cause
+        The likeliest cause with its remedy, if the bands do not hold.
+    """
+
+    name: str
+    training: bool
+    holds: bool | None
+    reasons: tuple[str, ...] = ()
+    cause: Cause | None = None
+
+    @property
+    def line(self) -> str:
+        """The verdict in one line."""
+        what = f"{self.name}, {'fitted' if self.training else 'not fitted'}"
+        if self.holds is not False:
+            known = "holds" if self.holds else "cannot be told"
+            return f"{what}: {known}{''.join(f'; {r}' for r in self.reasons)}"
+        cause = "" if self.cause is None else f"; {self.cause.line}"
+        return f"{what}: does not hold: {'; '.join(self.reasons)}{cause}"
+
+    @property
+    def summary(self) -> dict[str, object]:
+        """The verdict as ``validation.NAME`` in summary.json has it."""
+        return {
+            "holds": self.holds,
+            "reasons": list(self.reasons),
+            "cause": None if self.cause is None else self.cause.kind,
+            "remedy": None if self.cause is None else self.cause.remedy,
+        }
+
+
+@dataclass(frozen=True)
+class _Standard:
+    """Readings of the judged part against their bands, and what they are worth.
+
+    ``z`` (readings,) residuals over the sensor band's sd; ``for_mean`` and ``for_size``
+    independent readings that the record is worth to the mean of z and to that of z²; ``unsure``
+    is the background's.
+    """
+
+    z: FloatArray
+    for_mean: float
+    for_size: float
+    unsure: float
+
+
+def assess(bands: Bands, background: Background) -> Verdict | None:
+    """Judge bands by the readings after ``scored_from``; None if there are none.
+
+    A good record, one that the fitted model describes, fails with a probability below 1 %.
+    """
+    if bands.measured is None:
+        return None
+    judged = np.isfinite(bands.measured)
+    judged[: bands.scored_from] = False
+    if not judged.any():
+        return None
+    standard = _standardised(bands, judged, background)
+    residuals = Residuals.of(bands, judged, background.fitted)
+    reasons = [
+        *_lead_in(bands),
+        *_coverage(bands, judged, standard),
+        *_size(standard),
+        *_leaning(bands, judged, standard),
+        *_locally(bands, judged, standard),
+        *(_missed(bands, judged) if bands.training else []),
+        *residuals.isolated,
+    ]
+    wide = _too_wide(standard)
+    if reasons or wide:
+        why = likeliest(residuals) if reasons else cause("noise", residuals)
+        if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
+            why = cause("lead-in", residuals)
+        return Verdict(bands.name, bands.training, False, (*reasons, *wide), why)
+    if standard.for_size < FEWEST:
+        few = f"the record is worth {standard.for_size:.1f} independent readings: too few to tell"
+        return Verdict(bands.name, bands.training, None, (few,))
+    return Verdict(bands.name, bands.training, True)
+
+
+def _sd(bands: Bands, kind: Kind, judged: BoolArray) -> FloatArray:
+    """Sd of a band's quantity, um, from its 90 % edges."""
+    width = bands.upper[kind, 90][judged] - bands.lower[kind, 90][judged]
+    sd: FloatArray = width / (2 * stats.norm.ppf(0.95))
+    return sd
+
+
+def _standardised(bands: Bands, judged: BoolArray, background: Background) -> _Standard:
+    """Take the residuals over their sd, and work out how many independent ones they are worth.
+
+    With p, q and w the shares of parameters, discrepancy and sensor in the variance, z at two
+    samples t apart has the correlation p + q exp(-t/τ), and z² that squared.
+    """
+    assert bands.measured is not None
+    sensor = np.maximum(_sd(bands, "sensor", judged), np.finfo(float).tiny)
+    z = (bands.measured - bands.mean)[judged] / sensor
+    total = float(np.mean(sensor**2))
+    p = min(float(np.mean(_sd(bands, "parameter", judged) ** 2)) / total, 1.0)
+    q = min(float(np.mean(_sd(bands, "displacement", judged) ** 2)) / total, 1.0) - p
+    q = max(q, 0.0) if background.memory > 0 else 0.0
+    time = bands.time[judged]
+    length = float(time[-1] - time[0] + bands.interval)
+    once, twice = (_mean_correlation(length, background.memory / power, z.size) for power in (1, 2))
+    alone = 1 / z.size
+    mean = p + q * once + (1 - p - q) * alone
+    size = p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * alone
+    return _Standard(z, 1 / mean, 1 / (size + 2 * background.unsure**2), background.unsure)
+
+
+def _mean_correlation(length: float, memory: float, readings: int) -> float:
+    """Mean correlation of all pairs of a process that forgets by exp(-t/memory)."""
+    x = length / memory if memory > 0 else np.inf
+    if not np.isfinite(x):
+        return 1 / readings
+    mean = 1.0 - x / 3 if x < 1e-4 else 2 * (x - 1 + np.exp(-x)) / x**2
+    return max(float(mean), 1 / readings)
+
+
+def _coverage(bands: Bands, judged: BoolArray, standard: _Standard) -> list[str]:
+    """Say where fewer readings lie in the sensor band than chance allows."""
+    assert bands.measured is not None
+    reading, worth = bands.measured[judged], standard.for_size
+    for level in reversed(LEVELS):
+        low, high = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
+        covered = float(np.mean((low <= reading) & (reading <= high)))
+        nominal = level / 100
+        odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
+        hits = covered * worth
+        # The binomial distribution function, for a number of readings that is not whole.
+        chance = special.betainc(worth - hits, hits + 1, 1 - nominal) if covered < 1 else 1.0
+        if odds < 1 / ODDS and chance < ALARM:
+            return [f"the {level} % sensor band covers {_percent(covered)} of the readings"]
+    return []
+
+
+def _size(standard: _Standard) -> list[str]:
+    """Say whether the residuals are larger than the sensor band says."""
+    # A few spikes are told as such.
+    square, worth = float(np.mean(np.clip(standard.z, -FAR, FAR) ** 2)), standard.for_size
+    if square <= ODDS or stats.chi2.sf(square * worth, worth) >= ALARM:
+        return []
+    ratio = float(np.sqrt(np.mean(standard.z**2)))
+    return [f"the residuals are {ratio:.2g} times as large as the band says"]
+
+
+def _too_wide(standard: _Standard) -> list[str]:
+    """Say whether the residuals are far smaller than the sensor band says."""
+    square, worth = float(np.mean(standard.z**2)), standard.for_size
+    if square >= TOO_WIDE**2 or stats.chi2.cdf(square * worth, worth) >= ALARM:
+        return []
+    return [f"the band is {1 / max(np.sqrt(square), 1e-9):.2g} times as wide as the residuals are"]
+
+
+def _locally(bands: Bands, judged: BoolArray, standard: _Standard) -> list[str]:
+    """Say where readings in a row are farther off than any good record has them."""
+    if standard.z.size < IN_A_ROW:
+        return []
+    rows = np.convolve(standard.z, np.ones(IN_A_ROW) / IN_A_ROW, mode="valid")
+    at = int(np.argmax(np.abs(rows)))
+    # A noise whose size is hardly known may well be larger here.
+    if np.abs(rows[at]) <= FAR * np.exp(2 * standard.unsure):
+        return []
+    return [
+        f"at {bands.time[judged][at]:.4g} s the readings lie {abs(rows[at]):.2g} sds off the mean"
+    ]
+
+
+def _leaning(bands: Bands, judged: BoolArray, standard: _Standard) -> list[str]:
+    """Say whether the residuals lean to one side by more than the band allows."""
+    assert bands.measured is not None
+    mean = float(np.mean(standard.z))
+    # Less than this cannot be seen in the coverage.
+    if abs(mean) * np.sqrt(standard.for_mean) <= LEANING or abs(mean) < 0.5:
+        return []
+    residual = float(np.mean((bands.measured - bands.mean)[judged]))
+    sd = residual / mean if mean else 0.0
+    return [f"the readings lie {residual:+.3g} um off the mean, {abs(mean):.2g} sds of {sd:.2g} um"]
+
+
+def _missed(bands: Bands, judged: BoolArray) -> list[str]:
+    """Say whether a fit misses its own readings by more than a sensor's noise would."""
+    assert bands.measured is not None
+    reading = bands.measured[judged]
+    extent = float(np.ptp(reading))
+    residual = (bands.measured - bands.mean)[judged]
+    steps = np.diff(residual)
+    fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
+    rms = float(np.sqrt(np.mean(residual**2)))
+    # Of a sensor's noise, which no model follows, nothing is the model's fault.
+    slow = np.sqrt(max(rms**2 - fast**2, 0.0))
+    if extent == 0 or slow <= POOR * extent or slow <= fast:
+        return []
+    return [
+        f"the mean misses the readings that were fitted by {rms / extent:.1%} of their range (rms)"
+    ]
+
+
+def _lead_in(bands: Bands) -> list[str]:
+    """Say whether the lead-in does not fit."""
+    lead = bands.lead_in
+    if lead is None or not lead.p_value < LEAD_IN_ALARM:
+        return []
+    return [
+        f"the lead-in of {lead.start:.4g} to {lead.stop:.4g} s does not fit the model "
+        f"(p = {lead.p_value:.1g})"
+    ]
+
+
+def _percent(part: float) -> str:
+    return f"{100 * part:.3g} %"

@@ -1,0 +1,190 @@
+"""A chain knows the posterior it belongs to: an edited config is refused, in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pytest
+
+from bwbayes.app import run as module
+from bwbayes.app.config import Config, dump, load, parse
+from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
+from bwbayes.app.folder import RunFolder
+from bwbayes.app.predict import predict
+from bwbayes.app.problem import resolve
+from bwbayes.app.run import carry_on, redraw
+from bwbayes.errors import InputError
+from bwbayes.inference.chainfile import ChainFile
+from bwbayes.results.prediction import Start
+from tests.app import small
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> RunFolder:
+    """Return a copy of the finished run, to be changed."""
+    shutil.copytree(run, tmp_path / "copy")
+    return RunFolder.open(tmp_path / "copy")
+
+
+@pytest.fixture
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "draw_all", lambda _: {})
+
+
+def edit(folder: RunFolder, old: str, new: str) -> None:
+    text = folder.config.read_text()
+    assert old in text
+    folder.config.write_text(text.replace(old, new))
+
+
+def wider(folder: RunFolder) -> None:
+    """Make the prior of d wider, as a user would in an editor."""
+    config = load(folder.config)
+    d = config.parameters["d"]
+    assert d.prior is not None
+    sigma = float(d.prior["sigma"])
+    changed = d.model_copy(update={"prior": d.prior | {"sigma": 1.25 * sigma}})
+    parameters = config.parameters | {"d": changed}
+    folder.config.write_text(dump(config.model_copy(update={"parameters": parameters})))
+
+
+def report(folder: RunFolder) -> None:
+    redraw(folder)
+
+
+def resume(folder: RunFolder) -> None:
+    carry_on(folder, small.quiet(), workers=1)
+
+
+def predicted(folder: RunFolder) -> None:
+    predict(folder.path, None, "sine", Start(), None, small.quiet())
+
+
+@pytest.mark.parametrize("use", [report, resume, predicted])
+def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], None]) -> None:
+    """It once moved the means of a finished chain: 0.693 +- 0.008 became 0.675 +- 0.010."""
+    wider(copy)
+    with pytest.raises(InputError) as caught:
+        use(copy)
+    text = str(caught.value)
+    assert "chain.h5: parameters.d.prior was lognormal (" in text
+    assert text.endswith("; undo the edit or start a new run")
+
+
+@pytest.mark.parametrize("use", [report, resume])
+def test_edited_block_is_refused(copy: RunFolder, use: Callable[[RunFolder], None]) -> None:
+    """It once wrote rows of zeros into the chain, and said converged."""
+    edit(copy, "block = 25", "block = 30")
+    before = ChainFile.read(copy.chain).steps("sampling")
+    with pytest.raises(InputError, match=r"sampling.block was 25 .* is 30; undo the edit"):
+        use(copy)
+    assert before == ChainFile.read(copy.chain).steps("sampling")
+    assert copy.summary.exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("[[0.0, 5.0]]", "[[0.0, 4.0]]", "record.train"),
+        ('dynamics = "lag"', 'dynamics = "none"', "model.dynamics"),
+        ('hold = "zero"', 'hold = "first"', "model.hold"),
+        ("fixed = 0.0172", "fixed = 0.0173", "parameters.gamma.fixed"),
+        ("seed = 3", "seed = 4", "seed"),
+    ],
+)
+def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key: str) -> None:
+    text = (run / "config.toml").read_text()
+    if old not in text:  # the stand's hold
+        old, new = new, old
+    assert old in text
+    changed = parse(text.replace(old, new), "")
+    with pytest.raises(InputError, match=f"x: {key} was .* when the chain was sampled, is "):
+        require_same(fingerprint(load(run / "config.toml")), changed, Path("x"))
+
+
+def test_a_bound_that_was_not_set_is_named(run: Path) -> None:
+    config = load(run / "config.toml")
+    d = config.parameters["d"].model_copy(update={"lower": 0.5})
+    changed = config.model_copy(update={"parameters": config.parameters | {"d": d}})
+    with pytest.raises(InputError, match=r"parameters.d.lower was not set when .* is 0\.5; undo"):
+        require_same(fingerprint(config), changed, Path("x"))
+
+
+def test_all_that_differs_is_named(run: Path) -> None:
+    config = load(run / "config.toml")
+    changed = config.model_copy(
+        update={"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
+    )
+    with pytest.raises(InputError, match=r"seed was 3 .*, is 5 \(also model.noise\); undo"):
+        require_same(fingerprint(config), changed, Path("x"))
+
+
+def allowed(config: Config) -> Config:
+    sampling = config.sampling.model_copy(update={"ess": 9.0, "steps": 7, "pilot_steps": 9})
+    d = config.parameters["d"].model_copy(update={"label": "D", "description": "gain"})
+    changes = {
+        "name": "other",
+        "sampling": sampling.model_copy(update={"engine": "auto"}),
+        "validation": {},
+        "truth": {},
+        "parameters": config.parameters | {"d": d},
+    }
+    return config.model_copy(update=changes)
+
+
+def test_what_leaves_the_posterior_may_change(run: Path) -> None:
+    config = load(run / "config.toml")
+    assert config != allowed(config)
+    require_same(fingerprint(config), allowed(config), Path("x"))
+
+
+def test_a_resolved_config_is_its_own(run: Path) -> None:
+    config = load(run / "config.toml")
+    require_same(fingerprint(config), resolve(config, run).config, Path("x"))
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_a_validation_may_be_taken_out(copy: RunFolder) -> None:
+    config = load(copy.config)
+    kept = {"held-out": config.validation["held-out"]}
+    copy.config.write_text(dump(config.model_copy(update={"validation": kept})))
+    assert ["training", "held-out"] == [bands.name for bands in redraw(copy).bands]
+
+
+@pytest.mark.parametrize("use", [report, resume])
+def test_chain_without_a_fingerprint_is_refused(
+    copy: RunFolder, use: Callable[[RunFolder], None]
+) -> None:
+    with h5py.File(copy.chain, "r+") as file:
+        del file.attrs["posterior"]
+    with pytest.raises(InputError, match=r"does not say which priors .* start a new run"):
+        use(copy)
+
+
+def test_other_versions_are_said(run: Path) -> None:
+    noted = json.dumps({"numpy": "1.0", "scipy": "1.1", "gone": "3"})
+    now = {"numpy": "1.0", "scipy": "1.2", "new": "1"}
+    expected = "the chain was begun with other versions: scipy 1.1, now 1.2"
+    assert (expected,) == version_remarks(noted, now)
+    assert () == version_remarks(noted, {"numpy": "1.0"})
+    problem, chain, outcome = module.finished(RunFolder(run))
+    assert not any("other versions" in r for r in module.assemble(problem, chain, outcome).remarks)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_other_versions_do_not_stop_a_report(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = module.versions("numpy")
+    monkeypatch.setattr(module, "versions", lambda _: installed | {"numpy": "99"})
+    (remark,) = [text for text in redraw(copy).remarks if "other versions" in text]
+    assert remark.endswith(", now 99")
