@@ -150,7 +150,7 @@ def lines(*rows: str) -> bytes:
     ("content", "place", "problem"),
     [
         (lines(HEADER, *ROWS[:5], "0.05,abc,1", *ROWS[6:]), "7: voltage_V: ", "abc"),
-        (lines(HEADER, *ROWS[:5], "0.05,1,nan", *ROWS[6:]), "7: displacement_um: ", "nan"),
+        (lines(HEADER, *ROWS[:5], "0.05,nan,1", *ROWS[6:]), "7: voltage_V: ", "nan"),
         (lines(HEADER, *ROWS[:5], "0.05,1,inf", *ROWS[6:]), "7: displacement_um: ", "inf"),
         (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "1e999"),
         (lines(HEADER, *ROWS[:5], "0.05,,1", *ROWS[6:]), "7: voltage_V: ", "empty"),

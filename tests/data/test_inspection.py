@@ -78,13 +78,13 @@ def missed(kind: str, numbers: range) -> list[int]:
 
 
 def test_good_records_of_all_drives_raise_no_alarm() -> None:
-    """None of 40; at a rate of 1 % that happens twice in three times, at 10 % in one of 70."""
-    assert {} == false_alarms(range(40))
+    """None of 30; at a rate of 1 % that happens three times in four, at 10 % in one of 24."""
+    assert {} == false_alarms(range(30))
 
 
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_is_wrong_is_named(kind: str) -> None:
-    assert [] == missed(kind, range(7))
+    assert [] == missed(kind, range(4))
 
 
 @pytest.mark.slow
