@@ -64,11 +64,12 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
     # Jumps of up to 160 V are also faster than those of up to 100 V.
-    remark, faster = of(text + "[3.0, 4.0]", folder).remarks
+    coarse, remark, faster = of(text + "[3.0, 4.0]", folder).remarks
+    assert coarse.startswith("record: coarse sampling: ")
     assert remark.startswith("rest: the voltage goes from -")
     assert "V were fitted: beyond that the bands are an extrapolation" in remark
     assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
-    assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
+    assert (coarse,) == of(RECORD + "train = [[0, 4.0]]", folder).remarks
 
 
 def by_name(problem: Problem) -> dict[str, Parameter]:
