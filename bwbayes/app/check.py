@@ -21,7 +21,7 @@ from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.report import picture, symbol, template
 from bwbayes.app.screen import show_priors
 from bwbayes.data import Record
-from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.inspection import Finding
 from bwbayes.inference import conflict, identifiability, pointfit
 
 __all__ = ["check", "write_page"]
@@ -56,7 +56,7 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     """
     problem = resolve(config, folder)
     posterior = problem.posterior
-    findings = inspect(problem.record)
+    findings = problem.findings
     point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
     free, _ = posterior.prior.constrain(point.mode[None])
     fitted = dict(zip(posterior.names, free[0], strict=True))

@@ -33,7 +33,7 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 # A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
 DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 10.0, 0.1, 3.0
-START_SDS, START_PART = 15.0, 0.24
+START_SDS, START_PART = 20.0, 0.24
 TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
 LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
@@ -145,7 +145,7 @@ def _amplitude(record: Record) -> Iterator[Finding]:
     """Find a drive whose swings are all alike, but for the unfinished ones at its ends."""
     turns = turning_points(record.voltage, 0.02 * float(np.ptp(record.voltage)))
     swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
-    if swings.size >= 2 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
+    if swings.size >= 3 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
         text = f"every swing of the voltage is {np.median(swings):.4g} V"
         remedy = (
             "vary the amplitude, since one loop does not tell d, alpha and beta apart (a sine that "
