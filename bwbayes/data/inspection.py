@@ -183,7 +183,10 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
         yield _whole(record, "no relation", text, "check the columns, the wiring and the amplifier")
         return
     leads = _leads(record)
-    if loop.gain < 0:
+    # A single step leaves the fitted gain open; then the two do not agree.
+    voltage, displacement = record.voltage[record.has_reading], _readings(record)
+    together = float((voltage - voltage.mean()) @ (displacement - displacement.mean()))
+    if loop.gain < 0 and together < 0:
         text = f"the displacement falls by {-loop.gain:.3g} um where the voltage rises by 1 V"
         remedy = "turn the sign of the displacement's column in the file"
         yield _whole(record, "reversed sign", text, remedy)
