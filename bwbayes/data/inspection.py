@@ -32,7 +32,7 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 
 # A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
-DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 10.0, 0.1, 3.0
+DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 12.0, 0.1, 3.0
 START_SDS, START_PART = 20.0, 0.24
 TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
 LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
