@@ -34,7 +34,7 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
 DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 12.0, 0.1, 3.0
 START_SDS, START_PART = 20.0, 0.24
-TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
+TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.1
 LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it

@@ -95,7 +95,7 @@ def test_400_good_records_raise_few_alarms() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_is_wrong_is_named_in_50_records(kind: str) -> None:
-    assert len(missed(kind, range(1000, 1050))) <= 1
+    assert len(missed(kind, range(1000, 1050))) <= 2
 
 
 def test_of_the_measured_record_only_its_start_is_remarked_on() -> None:
