@@ -106,7 +106,7 @@ class _LeastSquares:
     def __init__(self, posterior: Posterior, centre: FloatArray, spread: FloatArray) -> None:
         self.posterior, self.centre, self.spread = posterior, centre, spread
         self.physical = np.array([n in posterior.actuator.parameters for n in posterior.names])
-        rows = np.concatenate([np.arange(w.start, w.stop) for w in posterior.training])
+        rows = posterior.readings.rows
         self.samples = rows.size
         self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
         self.target = posterior.displacement[self.rows]

@@ -109,14 +109,14 @@ class Posterior:
         )
 
     def simulate(self, theta: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Displacement (models, rows), um, at samples up to the last reading.
+        """Displacement (models, rows), um, at samples up to the last training sample.
 
         Where the start of the dynamics is unknown, it is the most probable one.
         """
         likelihood, size = self.likelihood, len(self.actuator.parameters)
         unrest = likelihood.start(theta).mean if likelihood.unknown else None
         started = likelihood.started(theta)[:, :size]
-        voltage = self.voltage[: self.readings.samples]
+        voltage = self.voltage[: self.training[-1].stop]
         return np.concatenate(
             [
                 self.actuator.advance(

@@ -1,0 +1,94 @@
+"""Isolated outliers are found, all of them and nothing else, and what is left is as without them.
+
+A good reading lies more than six sds from what the others predict once in 5e8, so a false alarm
+among all readings here has a probability below 1e-5. A spike of 20 um is some forty sds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.outliers import outliers, surprise
+from bwbayes.inference.posterior import Posterior
+from tests.inference.problems import INTERVAL, short_posterior
+
+FIXED = {"initial": 0.0}
+
+
+def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
+    displacement = posterior.displacement.copy()
+    displacement[rows] += size * (-1.0) ** np.arange(len(rows))
+    return replace(posterior, displacement=displacement)
+
+
+@pytest.mark.parametrize("noise", ["discrepancy", "white"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_spikes_are_found_and_nothing_else(noise: str, seed: int) -> None:
+    posterior = short_posterior("white" if noise == "white" else "discrepancy", 800, seed=seed)
+    posterior = replace(posterior, engine="numba")
+    rows = np.sort(np.random.default_rng(seed).choice(800, 10, replace=False))
+    generator = np.random.default_rng(3)
+    assert rows.tolist() == outliers(spoilt(posterior, rows.tolist()), generator).tolist()
+    assert [] == outliers(posterior, generator).tolist()
+
+
+def test_what_is_left_is_the_posterior_without_those_readings() -> None:
+    """The same posterior as that of the good record with these readings missing, exactly."""
+    good = short_posterior(samples=600)
+    rows = [40, 41, 300, 599]
+    spiky = spoilt(good, rows)
+    aside = outliers(spiky, np.random.default_rng(4))
+    assert rows == aside.tolist()
+    cleaned, missing = (p.displacement.copy() for p in (spiky, good))
+    cleaned[aside] = missing[rows] = np.nan
+    z = good.prior.unconstrain(good.prior.draw(np.random.default_rng(5), 5))
+    np.testing.assert_array_equal(
+        replace(spiky, displacement=cleaned).log_density(z),
+        replace(good, displacement=missing).log_density(z),
+    )
+
+
+def test_the_sensors_sd_grows_without_it() -> None:
+    """The twin: left in, ten spikes make the sensor several times noisier."""
+    good = short_posterior(samples=800)
+    spiky = spoilt(good, list(range(30, 800, 77)))
+    sds = []
+    for posterior in (good, spiky):
+        point = pointfit.fit(posterior, np.random.default_rng(6))
+        free = posterior.prior.constrain(point.mode[np.newaxis])[0][0]
+        sds.append(free[posterior.names.index("sensor_sd")])
+    assert sds[1] > 3 * sds[0]
+
+
+def test_surprise_is_that_of_a_dense_matrix() -> None:
+    """(V⁻¹ r)ᵢ / √(V⁻¹)ᵢᵢ is a reading's distance from what all the others predict."""
+    posterior = short_posterior(samples=120, training=(slice(5, 60), slice(80, 120)))
+    place = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(7), 1))[0]
+    value = dict(
+        zip(
+            posterior.prior.names,
+            posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])[0],
+            strict=True,
+        )
+    )
+    rows = posterior.readings.rows
+    apart = np.abs(np.subtract.outer(rows, rows)) * INTERVAL / value["discrepancy_time"]
+    dense = value["discrepancy_sd"] ** 2 * np.exp(-apart)
+    inverse = linalg.inv(dense + value["sensor_sd"] ** 2 * np.eye(rows.size))
+    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
+    residual = posterior.readings.values - posterior.simulate(theta, rows)[0]
+    expected = inverse @ residual / np.sqrt(np.diag(inverse))
+    np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-6)
+
+
+def test_a_record_full_of_outliers_is_refused() -> None:
+    posterior = short_posterior(samples=400)
+    noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)
+    with pytest.raises(InputError, match="too many for isolated outliers"):
+        outliers(noisy, np.random.default_rng(8))
