@@ -81,7 +81,7 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
         (RECORD + "[sampling]\ndraws = 100", "sampling.draws: unknown key; did you mean ess?"),
         (RECORD + "[record.signal]\nfreq = 1", "did you mean frequency?"),
         (RECORD + "ignore = [[0, 1]]", "record.ignore: unknown key; did you mean exclude?"),
-        (RECORD + "xyzzy = 1", "known are file, signal, voltage_is, start, stop, exclude, "),
+        (RECORD + "xyzzy = 1", "record.xyzzy: unknown key; known are file, signal, voltage_is, "),
         (RECORD + "seed = 3", "record.seed: unknown key; it belongs above the first table"),
         (RECORD + "walkers = 20", "record.walkers: unknown key; it belongs under [sampling]"),
         ("[record]\nsignal = [1]", "record.signal: write a signal's name or a table like"),
