@@ -29,6 +29,7 @@ __all__ = [
     "Config",
     "Distribution",
     "Experiment",
+    "Finding",
     "InputError",
     "InputWarning",
     "JointPrior",
@@ -47,6 +48,7 @@ __all__ = [
     "draws",
     "first_chain",
     "hysteresis",
+    "inspect",
     "judge",
     "load_config",
     "noise_model",
@@ -70,6 +72,7 @@ if TYPE_CHECKING:
     from bwbayes.app.config import parse as parse_config
     from bwbayes.app.problem import Problem, resolve
     from bwbayes.data.files import read_record, write_record
+    from bwbayes.data.inspection import Finding, inspect
     from bwbayes.data.record import Record
     from bwbayes.data.teststand import VirtualTestStand
     from bwbayes.data.waveforms import Waveform, signal
@@ -99,6 +102,7 @@ else:
         "Config": "app.config",
         "Distribution": "inference.distributions",
         "Experiment": "results.replicates",
+        "Finding": "data.inspection",
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
@@ -117,6 +121,7 @@ else:
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
         "hysteresis": "model.boucwen",
+        "inspect": "data.inspection",
         "judge": "results.calibration",
         "load_config": "app.config:load",
         "noise_model": "inference.noise",

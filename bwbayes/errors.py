@@ -7,7 +7,13 @@ line and ends with status 2. Anything else is a defect of bwbayes and keeps its 
 
 from __future__ import annotations
 
-__all__ = ["InputError", "InputWarning", "one_line"]
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
+
+__all__ = ["InputError", "InputWarning", "one_line", "suggestion"]
+
+# How alike two words must be, from 0 to 1, for one to be a misspelling of the other.
+ALIKE = 0.6
 
 # Of a longer text, as a stranger's file may cause, the beginning and the end are shown.
 LONGEST = 600
@@ -21,6 +27,18 @@ class InputError(ValueError):
         if len(line) > LONGEST:
             line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
         super().__init__(line)
+
+
+def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | None = None) -> str:
+    """Return what to say of a word that is not known: the nearest one that is, or all of them.
+
+    `meanings` says which known word other people's words stand for.
+    """
+    meant = (meanings or {}).get(word.lower().replace("-", "_"))
+    if meant in known:
+        return f"did you mean {meant}?"
+    near = get_close_matches(word, known, 1, ALIKE)
+    return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
 
 
 def one_line(text: str) -> str:

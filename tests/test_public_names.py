@@ -17,6 +17,7 @@ PUBLIC = {
     "bwbayes.app.config": {"Config", "load as load_config", "parse as parse_config"},
     "bwbayes.app.problem": {"Problem", "resolve"},
     "bwbayes.data.files": {"read_record", "write_record"},
+    "bwbayes.data.inspection": {"Finding", "inspect"},
     "bwbayes.data.record": {"Record"},
     "bwbayes.data.teststand": {"VirtualTestStand"},
     "bwbayes.data.waveforms": {"Waveform", "signal"},

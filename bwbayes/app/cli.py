@@ -124,18 +124,19 @@ def resume(
 @cli.command()
 @click.argument("config", type=FILE)
 @click.option("--record", type=FILE, help="Check this record instead of the config's.")
-def check(config: Path, record: Path | None) -> int:
-    """Check a CONFIG and its record, and fit a point, without sampling.
+@click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
+def check(config: Path, record: Path | None, out: Path | None) -> int:
+    """Check a CONFIG and its record, draw it, and fit a point, without sampling.
 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
-    from bwbayes.app.screen import show_check  # noqa: PLC0415
+    from bwbayes.app.check import check as look  # noqa: PLC0415
 
     wanted = load(config)
     if record is not None:
         source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
         wanted = wanted.model_copy(update={"record": source})
-    show_check(wanted, config.parent, Console())
+    look(wanted, config.parent, out or Path("results") / f"{config.stem}-check", Console())
     return 0
 
 

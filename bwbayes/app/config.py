@@ -7,7 +7,6 @@ one back, with every default made explicit.
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
 from pathlib import Path
@@ -24,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
@@ -46,6 +45,48 @@ LARGEST_SEED = 2**63 - 1
 # Python's TOML reader takes time and memory by the square of what it reads, or worse.
 LARGEST_FILE = 1_000_000  # bytes
 MOST_KEY_PARTS = 100
+
+# What people call a key of a config, and its name here.
+MEANINGS = {
+    "draws": "ess",
+    "samples": "ess",
+    "chains": "ensembles",
+    "iterations": "steps",
+    "budget": "steps",
+    "warmup": "pilot_steps",
+    "burn_in": "pilot_steps",
+    "path": "file",
+    "data": "file",
+    "filename": "file",
+    "fit": "train",
+    "training": "train",
+    "windows": "train",
+    "begin": "start",
+    "end": "stop",
+    "thin": "decimate",
+    "downsample": "decimate",
+    "skip": "exclude",
+    "mask": "exclude",
+    "ignore": "exclude",
+    "value": "fixed",
+    "constant": "fixed",
+    "min": "lower",
+    "minimum": "lower",
+    "max": "upper",
+    "maximum": "upper",
+    "units": "unit",
+    "symbol": "label",
+    "rate": "sample_rate",
+    "sampling_rate": "sample_rate",
+    "random_seed": "seed",
+    "rng": "seed",
+    "priors": "parameters",
+    "holdout": "validation",
+    "test": "validation",
+    "waveform": "signal",
+    "freq": "frequency",
+    "length": "duration",
+}
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
@@ -211,14 +252,15 @@ class Config(_Table):
         return found
 
 
-def load(path: Path) -> Config:
+def load(path: str | Path) -> Config:
     """Read a config from a TOML file.
 
     Raises
     ------
     InputError
-        The file cannot be read, is no TOML, or says something that no config can say.
+        The file cannot be read, is not TOML, or says something that no config can say.
     """
+    path = Path(path)
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise InputError(f"{path}: is not a regular file; give one")
@@ -238,7 +280,7 @@ def parse(text: str, where: str) -> Config:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         # Besides its own error, a ValueError for a whole number that is too long for Python.
-        raise InputError(f"{where}: is no TOML: {error}; mend the config") from None
+        raise InputError(f"{where}: is not TOML: {error}; correct the config") from None
     try:
         return Config.model_validate(table)
     except ValidationError as error:
@@ -266,11 +308,38 @@ def _one_line(where: str, error: ValidationError) -> str:
     place = [str(part) for part in first["loc"] if not _is_branch(str(part))]
     path = ".".join(place) or "config"
     if first["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(place[-1], _keys_at(place[:-1]), n=1, cutoff=0.0)
-        return f"{where}: {path}: unknown key; did you mean {near[0]}?"
+        hint = _home(place) or suggestion(place[-1], _keys_at(place[:-1]), MEANINGS)
+        return f"{where}: {path}: unknown key; {hint}"
     message = first["msg"].removeprefix("Value error, ")
+    if place[-1:] == ["prior"]:
+        message = 'write a table like { distribution = "normal", mean = 1.0, sd = 0.1 }'
+    elif place[-1:] == ["signal"]:
+        message = (
+            "write a signal's name or a table like { amplitude = 100.0, frequency = 1.0, ... }"
+        )
+    elif first["type"] == "dict_type":
+        message = f"is not a table; write [{path}.NAME] and its keys below"
+    elif first["type"] == "model_type":
+        message = f"is not a table; known keys are {', '.join(_keys_at(place))}"
+    elif first["type"] == "missing":
+        message = "is missing"
     got = "" if isinstance(first["input"], dict) else f", got {_shown(first['input'])}"
-    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; mend the config"
+    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
+
+
+def _home(place: list[str]) -> str:
+    """Say where a key belongs that is known, but in another table; nothing if it is not."""
+    key, table = place[-1], place[0] if len(place) > 1 else ""
+    if key in Config.model_fields:
+        return "it belongs above the first table, or is a table of its own"
+    homes: dict[str, type[BaseModel]] = {
+        "record": RecordConfig,
+        "model": ModelConfig,
+        "sampling": SamplingConfig,
+        "stand": StandConfig,
+    }
+    names = [name for name, one in homes.items() if key in one.model_fields and name != table]
+    return f"it belongs under [{names[0]}]" if names else ""
 
 
 def _shown(value: object) -> str:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection, Mapping
 
@@ -14,12 +13,29 @@ import numpy as np
 
 from bwbayes.app.config import Config, ParameterConfig
 from bwbayes.data import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import Parameter
 
 __all__ = ["as_config", "defaults_of", "parameters_of"]
+
+# What people call a parameter, and its name here.
+MEANINGS = {
+    "n": "exponent",
+    "h0": "initial",
+    "k": "stiffness",
+    "m": "mass",
+    "b": "damping",
+    "a": "alpha",
+    "tau": "lag",
+    "time_constant": "lag",
+    "y0": "offset",
+    "gain": "d",
+    "d33": "d",
+    "noise": "sensor_sd",
+    "sigma": "discrepancy_sd",
+}
 
 # No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
 LARGEST = 1e60
@@ -67,8 +83,9 @@ def _require_known(table: str, given: Collection[str], known: Collection[str]) -
         if name not in known:
             if name in CATALOGUE:
                 raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
+            raise InputError(
+                f"{table}.{name}: no such parameter here; {suggestion(name, known, MEANINGS)}"
+            )
 
 
 def _fixed(config: Config, name: str, default: float | None) -> float | None:

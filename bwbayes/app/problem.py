@@ -9,7 +9,7 @@ moved, continued and run again by itself.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from bwbayes.app.config import (
 from bwbayes.app.parameters import as_config, defaults_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
-from bwbayes.data.inspection import inspect
+from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
@@ -69,6 +69,7 @@ class Problem:
     validations: Mapping[str, Validation]
     remarks: tuple[str, ...] = ()
     defaults: Mapping[str, Distribution] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
     """What the default priors of this record would be, by name."""
 
     @property
@@ -113,7 +114,9 @@ def resolve(config: Config, folder: Path) -> Problem:
             if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
-    remarks += [f"record: {finding}" for finding in inspect(record)]
+    findings = _findings(record, (*split.training, *split.held_out))
+    remarks += [f"record: {finding}" for finding in findings]
+    remarks += [text for name, other in others.items() for text in _unlike(config, name, other)]
     hold = config.model.hold
     if hold == "auto":
         hold = "zero" if record.voltage_is == "command" else "first"
@@ -164,8 +167,40 @@ def resolve(config: Config, folder: Path) -> Problem:
     explicit = _explicit(config, posterior, truth, aside)
     plan = _plan(config, posterior)
     return Problem(
-        explicit, record, posterior, plan, validations, tuple(remarks), defaults.priors(names)
+        explicit,
+        record,
+        posterior,
+        plan,
+        validations,
+        tuple(remarks),
+        defaults.priors(names),
+        findings,
     )
+
+
+def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
+    """Return what is wrong with a record, but for places that no window looks at."""
+    # Borders that differ by less than half a sample are the same.
+    times = [
+        record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
+    ]
+    return tuple(
+        one
+        for one in inspect(record)
+        if any(one.start < stop and start < one.stop for start, stop in times)
+    )
+
+
+def _unlike(config: Config, name: str, record: Record) -> Iterator[str]:
+    """Yield what is wrong with the record of a file that is predicted."""
+    if config.validation[name].file is None:
+        return
+    for one in inspect(record):
+        if one.kind == "switch-on transient":
+            remedy = f"lead_in_from = {one.stop:.3g} under [validation.{name}]"
+            yield f"{name}: {one.kind}: {one.text}; {remedy}"
+        elif one.kind not in ("one amplitude", "few readings"):
+            yield f"{name}: {one}"
 
 
 def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, float]]:

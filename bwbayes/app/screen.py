@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bwbayes.app.config import Config
 from bwbayes.app.folder import CalibrationFolder, RunFolder
-from bwbayes.app.problem import generator, resolve
-from bwbayes.inference import conflict, identifiability, pointfit
+from bwbayes.app.problem import generator
+from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
@@ -22,7 +20,6 @@ from bwbayes.results.verdict import Verdict
 
 __all__ = [
     "show_calibration",
-    "show_check",
     "show_priors",
     "show_result",
     "show_scores",
@@ -134,35 +131,6 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
         highlight=False,
         soft_wrap=True,
     )
-
-
-def show_check(config: Config, folder: Path, console: Console) -> None:
-    """Show a record, the resolved priors, the point fit, and what the record cannot tell.
-
-    Raises
-    ------
-    InputError
-        The config or its record cannot be used.
-    """
-    problem = resolve(config, folder)
-    record, posterior = problem.record, problem.posterior
-    low, high = record.range_voltage
-    console.print(
-        f"record: {escape(record.origin)}, {record.samples} samples every {record.interval:g} s, "
-        f"{low:.4g} to {high:.4g} V ({record.voltage_is})",
-        highlight=False,
-        soft_wrap=True,
-    )
-    point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
-    free, _ = posterior.prior.constrain(point.mode[None])
-    show_priors(posterior.prior, console, dict(zip(posterior.names, free[0], strict=True)))
-    likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
-    conflicts = conflict.conflicts(posterior.prior, likely, problem.defaults)
-    untold = identifiability.remarks(posterior, point, likely)
-    for remark in (*problem.remarks, *conflicts):
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
-    for remark in untold:
-        console.print(f"warning: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def show_priors(

@@ -32,11 +32,11 @@ LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage mu
 
 # A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
-DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 8.0, 0.05, 2.0
-TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.15
-LONG_DECAY = 0.1  # of the record: a decay that takes longer is a drift
+DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 12.0, 0.1, 3.0
+START_SDS, START_PART = 20.0, 0.24
+TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.1
+LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
-RETURN_SDS, RETURN_PART = 2.0, 0.01  # of the displacement, where the voltage is clipped
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
 MOST_SPIKES = 0.02  # of the readings: more are no outliers
@@ -145,7 +145,7 @@ def _amplitude(record: Record) -> Iterator[Finding]:
     """Find a drive whose swings are all alike, but for the unfinished ones at its ends."""
     turns = turning_points(record.voltage, 0.02 * float(np.ptp(record.voltage)))
     swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
-    if swings.size >= 2 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
+    if swings.size >= 3 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
         text = f"every swing of the voltage is {np.median(swings):.4g} V"
         remedy = (
             "vary the amplitude, since one loop does not tell d, alpha and beta apart (a sine that "
@@ -183,7 +183,10 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
         yield _whole(record, "no relation", text, "check the columns, the wiring and the amplifier")
         return
     leads = _leads(record)
-    if loop.gain < 0:
+    # A single step leaves the fitted gain open; then the two do not agree.
+    voltage, displacement = record.voltage[record.has_reading], _readings(record)
+    together = float((voltage - voltage.mean()) @ (displacement - displacement.mean()))
+    if loop.gain < 0 and together < 0:
         text = f"the displacement falls by {-loop.gain:.3g} um where the voltage rises by 1 V"
         remedy = "turn the sign of the displacement's column in the file"
         yield _whole(record, "reversed sign", text, remedy)
@@ -282,8 +285,7 @@ def _clipped_drive(record: Record, left_out: BoolArray) -> Iterator[Finding]:
         if runs(at_end)[1].max() < SHORTEST_AT_END or (~at_end[rows]).sum() < LEAST_READINGS:
             continue
         loop = fit_loop(record, left_out | at_end)
-        least = max(RETURN_SDS * scatter(loop.residual), RETURN_PART * _extent(displacement))
-        some = clipped_drive(voltage[rows], sign * displacement, least)
+        some = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
         if some is not None:
             text = (
                 f"{some.samples} voltages stay at the {side} value, "
@@ -297,11 +299,16 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that comes from elsewhere at the start, whatever the voltage does."""
     size, time = loop.decay
     usual, extent = scatter(loop.residual), _extent(_readings(record))
-    velocity = float(np.quantile(np.abs(np.diff(record.voltage)), 0.99)) / record.interval
+    steps = np.abs(np.diff(record.voltage))
+    velocity = float(np.quantile(steps, 0.99)) / record.interval
     left = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
-    if time > LONG_DECAY * record.duration:
-        return  # a drift
-    if abs(size) < max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * left):
+    alone = max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * left)
+    # With another hysteretic state at the start, which steps of the voltage do not show.
+    moving = np.count_nonzero(steps) > steps.size / 2
+    in_all = max(START_SDS * usual, START_PART * extent)
+    if abs(loop.start) > in_all and moving and abs(size) > usual:
+        size = loop.start
+    elif abs(size) < alone or time > LONG_DECAY * record.duration:
         return
     begin = float(record.time[loop.rows[0]])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.

@@ -43,6 +43,9 @@ class LoopFit:
         Time constant with which the displacement follows.
     decay : Decay
         What dies out from the first reading on, whatever the voltage does; um and s.
+    start : float, um
+        How far off the displacement starts in all: the decay, and what another state of the plays
+        would change.
     trend : float, um
         How far the displacement goes from the first reading to the last at equal voltages.
     trend_told : float
@@ -56,6 +59,7 @@ class LoopFit:
     gain: float
     lag: float
     decay: Decay
+    start: float
     trend: float
     trend_told: float
     explained: float
@@ -101,6 +105,7 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
         float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
         lag,
         Decay(float(coefficients[-1]), float(times[which])),
+        float(whole[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :]) + coefficients[-2] / 2,
         float(coefficients[-2]),
         1 - imitated / float(trend_shape @ trend_shape),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),

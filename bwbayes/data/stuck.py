@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.data.patterns import runs, scatter
+from bwbayes.data.patterns import runs
 
 __all__ = ["SHORTEST_AT_END", "Stuck", "clipped", "clipped_drive", "held", "repeated"]
 
 SHORTEST_AT_END = 5  # samples in a row at the end of a range
+LEAST_FALL = 0.25  # of what follows a run, in its last quarter
+LEAST_OF_RANGE = 0.01
 FEWEST = 10  # samples that are stuck, in all
 LEAST_PART = 0.005  # of the samples
 LONG_ENOUGH = 20  # samples in a row, of which one run is enough
@@ -61,26 +63,33 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     return some
 
 
-def clipped_drive(values: FloatArray, other: FloatArray, least: float) -> Stuck | None:
-    """Return where a voltage stays at its largest while the displacement goes on and returns.
+def clipped_drive(values: FloatArray, other: FloatArray, usual: float) -> Stuck | None:
+    """Return where a voltage stays at its largest while the displacement turns and goes back.
 
-    The displacement may have noise, and may creep and lag behind a voltage that really rests. So
-    it must go up within a run and come down again by `least`, in its unit, most of the time.
+    Behind a voltage that really rests the displacement may lag and creep, but it does not fall
+    before the voltage does. Here it must, in the last quarters of the runs and on the whole, by a
+    part of what it falls by in the same time after them: more than it scatters by from run to run,
+    or than its unexplained part, of sd `usual`, would.
     """
     first, lengths = runs(values == values.max())
-    first, lengths = first[lengths >= SHORTEST_AT_END], lengths[lengths >= SHORTEST_AT_END]
-    returns = [_returns(other[f : f + n], least) for f, n in zip(first, lengths, strict=True)]
-    some = _enough(first, first + lengths - 1, np.array(returns, dtype=np.bool_))
-    return some if some is not None and 2 * some.samples >= lengths.sum() else None
-
-
-def _returns(values: FloatArray, least: float) -> bool:
-    """Tell whether the middle third lies above both others by `least`, and more than by noise."""
-    third = values.size // 3
-    parts = (values[:third], values[third : values.size - third], values[values.size - third :])
-    left, middle, right = (float(part.mean()) for part in parts)
-    noise = scatter(np.diff(values)) / np.sqrt(third)
-    return bool(min(middle - left, middle - right) > max(least, 3 * noise))
+    last = first + lengths - 1
+    quarter, some = lengths // 4, lengths // 8 + 1
+    whole = (lengths >= SHORTEST_AT_END) & (last + quarter < values.size)
+    if not whole.any():
+        return None
+    first, last, quarter, some = (each[whole] for each in (first, last, quarter, some))
+    sums = np.concatenate([[0.0], np.cumsum(other)])
+    before, end, after = (
+        (sums[at + 1] - sums[at + 1 - some]) / some for at in (last - quarter, last, last + quarter)
+    )
+    falls, count = before - end, last.size
+    sure = falls.sum() > 4 * usual * np.sqrt(count)
+    if count >= 6:
+        sure |= falls.mean() > 4 * falls.std(ddof=1) / np.sqrt(count)
+    least = max(LEAST_FALL * float((end - after).sum()), LEAST_OF_RANGE * float(np.ptp(other)))
+    if not sure or falls.sum() < least:
+        return None
+    return _enough(first, last, np.ones(count, dtype=np.bool_))
 
 
 def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:

@@ -7,7 +7,7 @@ import json
 import re
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,9 @@ import pytest
 from click.testing import CliRunner
 
 from bwbayes.app import cli
-from bwbayes.data import read_record
+from bwbayes.data import read_record, write_record
 from tests.app import small
+from tests.data.spoilt import looping
 
 COMMANDS = ("run", "resume", "check", "simulate", "predict", "report", "calibrate")
 
@@ -149,7 +150,7 @@ def lines(*rows: str) -> bytes:
     ("content", "place", "problem"),
     [
         (lines(HEADER, *ROWS[:5], "0.05,abc,1", *ROWS[6:]), "7: voltage_V: ", "abc"),
-        (lines(HEADER, *ROWS[:5], "0.05,1,nan", *ROWS[6:]), "7: displacement_um: ", "nan"),
+        (lines(HEADER, *ROWS[:5], "0.05,nan,1", *ROWS[6:]), "7: voltage_V: ", "nan"),
         (lines(HEADER, *ROWS[:5], "0.05,1,inf", *ROWS[6:]), "7: displacement_um: ", "inf"),
         (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "1e999"),
         (lines(HEADER, *ROWS[:5], "0.05,,1", *ROWS[6:]), "7: voltage_V: ", "empty"),
@@ -186,9 +187,9 @@ def test_malformed_record_is_one_line_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("", "record: field required"),
-        ("[record", "is no TOML"),
-        ("seed = 1\nseed = 2\n", "is no TOML"),
+        ("", "record: is missing"),
+        ("[record", "is not TOML"),
+        ("seed = 1\nseed = 2\n", "is not TOML"),
         ('[record]\nfil = "record.csv"', "record.fil: unknown key; did you mean file?"),
         (RECORD + "[sampling]\ness = nan", "sampling.ess: "),
         (RECORD + "[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
@@ -240,14 +241,41 @@ def test_damaged_chain_is_one_line(bwbayes: Type, tmp_path: Path) -> None:
 # What commands do
 
 
-def test_check_shows_priors_and_point_fit_and_writes_nothing(bwbayes: Type, tmp_path: Path) -> None:
+def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
+    bwbayes: Type, tmp_path: Path
+) -> None:
     (tmp_path / "small.toml").write_text(small.TEXT)
     said = bwbayes("check", "small.toml")
     assert (0, "") == (said.status, said.err)
     assert "300 samples every 0.02 s" in said.out
     for name in ("alpha", "discrepancy_time", "lognormal(median", "fixed at 0.0172"):
         assert name in said.out
-    assert [tmp_path / "small.toml"] == list(tmp_path.iterdir())
+    assert "nothing wrong shows in the record" in said.out
+    page = tmp_path / "results" / "small-check" / "check.html"
+    assert f"pictures: {page.relative_to(tmp_path)}" in said.out
+    assert {"small.toml", "results"} == {path.name for path in tmp_path.iterdir()}
+    before = page.read_text()
+    assert 0 == bwbayes("check", "small.toml").status
+    assert before == page.read_text()
+
+
+def test_check_says_what_is_wrong_and_what_to_do(bwbayes: Type, tmp_path: Path) -> None:
+    record = looping(0)
+    assert record.displacement is not None
+    spoilt = record.displacement.copy()
+    spoilt[700] += 60.0
+    write_record(replace(record, displacement=spoilt), tmp_path / "a.h5")
+    (tmp_path / "a.toml").write_text('[record]\nfile = "a.h5"\n')
+    said = bwbayes("check", "a.toml", "--out", "page")
+    assert 0 == said.status
+    assert "spikes: 1 isolated outliers" in said.out
+    assert "what to do: outliers = true under [model]" in said.out
+    page = (tmp_path / "page" / "check.html").read_text()
+    assert "<b>spikes</b>: 1 isolated outliers" in page
+    assert page.count("data:image/png;base64,") == 3
+    assert {"time.png", "loop.png", "drive.png"} == {
+        path.name for path in (tmp_path / "page" / "figures").iterdir()
+    }
 
 
 def test_check_takes_another_record(bwbayes: Type, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 Every case goes through ``bwbayes check`` in this process. What is used must give finite numbers,
 and make a run's folder that reads back the same, with nothing written beside it. The best of some
-prior draws stands in for the point fit, which takes longer than all the rest, but for a few cases.
+prior draws stands in for the point fit, which takes longer than all the rest, and no page is drawn,
+but for a few cases.
 
 The default run takes the first cases; ``-m slow`` takes all. A case is made again from its number:
 ``tests.app.mutations.case(SEED, number)``.
@@ -26,6 +27,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bwbayes.app import check as app_check
 from bwbayes.app import cli
 from bwbayes.app.config import load
 from bwbayes.app.folder import RunFolder
@@ -69,6 +71,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pointfit, "fit", best_draw)
+    monkeypatch.setattr(app_check, "write_page", lambda out, *_: out / "check.html")
 
 
 def best_draw(posterior: Posterior, generator: np.random.Generator) -> pointfit.PointFit:
@@ -197,6 +200,8 @@ def test_what_is_used_goes_through_the_whole_check(place: Path) -> None:
         fitted += said.status == 0
         assert "nan" not in said.out
         assert said.status in (0, 2)
+        assert (place / "results").exists() == (said.status == 0)
+        shutil.rmtree(place / "results", ignore_errors=True)
         (place / one.record).unlink()
 
 

@@ -16,6 +16,7 @@ from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
 from tests.app import small
+from tests.data.spoilt import SPOILT, looping
 
 
 def of(text: str, folder: Path) -> Problem:
@@ -361,6 +362,22 @@ def test_warnings_of_a_record_become_remarks(tmp_path: Path) -> None:
     remarks = resolve(small.config(("amplitude = 100.0", "amplitude = 101.0")), tmp_path).remarks
     assert len(remarks) == 1
     assert "100 V" in remarks[0]
+
+
+def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -> None:
+    transient = SPOILT["switch-on transient"](looping(0), np.random.default_rng(0))
+    write_record(transient, tmp_path / "record.h5")
+    text = '[record]\nfile = "record.h5"\n'
+    whole = of(text, tmp_path)
+    (finding,) = whole.findings
+    assert f"record: {finding}" in whole.remarks
+    later = of(f"{text}train = [[{finding.stop + 0.01}, 5.0]]\n", tmp_path)
+    assert () == later.findings
+    (remark,) = of(
+        f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
+    ).remarks
+    assert remark.startswith("a: switch-on transient: the displacement starts ")
+    assert f"; lead_in_from = {finding.stop:.3g} under [validation.a]" in remark
 
 
 @pytest.mark.parametrize("lead_in", ["4.0", "100.0", "0.001"])

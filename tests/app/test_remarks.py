@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from bwbayes.app.check import check
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.run import assemble, finished
-from bwbayes.app.screen import show_check, show_priors
+from bwbayes.app.screen import show_priors
 from bwbayes.inference.distributions import Distribution
 from tests.app import small
 
@@ -20,7 +21,7 @@ from tests.app import small
 def checked(folder: Path, *changes: tuple[str, str]) -> str:
     """Return what `check` prints for the small config."""
     console = Console(file=StringIO(), width=200)
-    show_check(small.config(*changes), folder, console)
+    check(small.config(*changes), folder, folder / "check", console)
     assert isinstance(console.file, StringIO)
     return console.file.getvalue()
 

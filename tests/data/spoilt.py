@@ -29,6 +29,7 @@ from bwbayes.errors import InputWarning
 __all__ = ["SPOILT", "good", "looping"]
 
 Generator = np.random.Generator
+Discrepancy = Literal["none", "process", "structural"]
 
 
 def good(number: int) -> Record:
@@ -39,10 +40,10 @@ def good(number: int) -> Record:
 
 
 def looping(number: int) -> Record:
-    """Return a good record whose drive makes loops, of varied amplitudes, at 30 V or more."""
+    """Return a good record whose drive makes loops, of varied amplitudes, of 60 V or more."""
     generator = np.random.default_rng(number)
     drives = [*LOOPING.values()]
-    return _run(drives[number % len(drives)], generator, (30.0, 60.0, 100.0))
+    return _run(drives[number % len(drives)], generator, (60.0, 100.0))
 
 
 def _run(
@@ -51,8 +52,8 @@ def _run(
     amplitudes: tuple[float, ...] = (10.0, 30.0, 60.0, 100.0),
 ) -> Record:
     rate = float(generator.choice([100.0, 250.0, 1000.0]))
-    kinds: tuple[Literal["none", "process", "structural"], ...] = ("none", "process", "structural")
-    stand = VirtualTestStand(kinds[int(generator.integers(3))], rate)
+    kinds: tuple[Discrepancy, ...] = ("none", "process", "structural")
+    stand = VirtualTestStand(kinds[generator.integers(3)], rate)
     wanted = drive(float(generator.choice(amplitudes)), rate, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)

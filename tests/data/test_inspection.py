@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
+from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.patterns import decay, spikes, trend, turning_points
+from tests.data.spoilt import SPOILT, good, looping
+
+MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
 
 
 def findings(kind: str, voltage: FloatArray, displacement: FloatArray) -> list[Finding]:
@@ -24,9 +32,10 @@ def test_a_displacement_cut_off_at_its_limit_is_clipping(
 ) -> None:
     clipped = np.clip(np.round(SINE / step) * step, *limits)
     (finding,) = findings("clipping", SINE, clipped)
-    inside = slice(round(finding.start / 1e-3), round(finding.stop / 1e-3))
-    assert 1 == np.unique(clipped[inside]).size
-    assert "exclude = [[" in finding.remedy
+    first, last = round(finding.start / 1e-3), round(finding.stop / 1e-3) - 1
+    assert abs(clipped[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
+    assert abs(clipped[[first - 1, last + 1]]).max() < 0.8
+    assert "use a wider range" == finding.remedy
 
 
 TRAPEZOID = np.clip(SINE, -0.7, 0.7)
@@ -46,3 +55,124 @@ def test_a_coarse_sensor_alone_is_not_taken_for_a_clipped_one(
     """Not at smooth peaks, whatever the phase, and not at rest on the highest plateau."""
     coarse = np.round(np.roll(voltage, lag) / step + shift) * step
     assert [] == findings("clipping", voltage, coarse)
+
+
+def false_alarms(numbers: range) -> dict[int, list[str]]:
+    """Return what is said about good records of these numbers."""
+    said = {number: [str(one) for one in inspect(good(number))] for number in numbers}
+    return {number: texts for number, texts in said.items() if texts}
+
+
+def missed(kind: str, numbers: range) -> list[int]:
+    """Return the records of these numbers in which what is wrong is not named."""
+    named = kind.partition(":")[0].partition(" of ")[0]
+    left = []
+    for number in numbers:
+        # On a drive that does not come back to its largest voltage, one rest cannot be told.
+        if kind == "clipping of the voltage" and number % 7 in (3, 5):
+            continue
+        record = SPOILT[kind](looping(number), np.random.default_rng(number))
+        if named not in [one.kind for one in inspect(record)]:
+            left.append(number)
+    return left
+
+
+def test_good_records_of_all_drives_raise_no_alarm() -> None:
+    """None of 30; at a rate of 1 % that happens three times in four, at 10 % in one of 24."""
+    assert {} == false_alarms(range(30))
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_what_is_wrong_is_named(kind: str) -> None:
+    assert [] == missed(kind, range(4))
+
+
+@pytest.mark.slow
+def test_400_good_records_raise_few_alarms() -> None:
+    assert len(false_alarms(range(1000, 1400))) <= 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SPOILT)
+def test_what_is_wrong_is_named_in_50_records(kind: str) -> None:
+    assert len(missed(kind, range(1000, 1050))) <= 2
+
+
+def test_of_the_measured_record_only_its_start_is_remarked_on() -> None:
+    if not MEASURED.exists():
+        pytest.skip("the measured record is not in the folder shared/data beside the repository")
+    record = read_record(MEASURED)
+    (finding,) = inspect(record)
+    assert "switch-on transient" == finding.kind
+    assert 0.05 < finding.stop < 1.0
+    assert f"start = {finding.stop:.3g} under [record]" == finding.remedy
+    later = record.upto(record.start + record.duration, first_reading=finding.stop)
+    assert () == inspect(later)
+
+
+def test_a_remedy_removes_its_finding() -> None:
+    transient = SPOILT["switch-on transient"](looping(0), np.random.default_rng(0))
+    (finding,) = inspect(transient)
+    end = transient.start + transient.duration
+    assert () == inspect(transient.upto(end, first_reading=finding.stop))
+
+
+def test_a_spike_is_where_it_is_said_to_be() -> None:
+    record = looping(0)
+    assert record.displacement is not None
+    values = record.displacement.copy()
+    values[[700, 900]] += 40.0
+    (finding,) = inspect(replace(record, displacement=values))
+    assert (record.time[700], record.time[900] + record.interval) == (finding.start, finding.stop)
+    assert f"2 isolated outliers of the displacement, at {record.time[700]:.6g}, " in finding.text
+    assert "outliers = true under [model]" == finding.remedy
+
+
+def test_missing_readings_are_no_fault() -> None:
+    record = looping(0)
+    assert () == inspect(record.exclude([(1.0, 1.5), (3.0, 3.2)]))
+    assert () == inspect(record.decimate(5))
+
+
+def test_a_planned_voltage_is_looked_at_too() -> None:
+    steady = 5e4 * np.sin(np.arange(3000) / 30)
+    kinds = [one.kind for one in inspect(Record(steady, None, 1e-3))]
+    assert ["wrong units", "one amplitude"] == kinds
+
+
+def test_a_finding_is_one_line() -> None:
+    for kind in SPOILT:
+        for one in inspect(SPOILT[kind](looping(0), np.random.default_rng(0))):
+            assert str(one).isprintable()
+            assert len(str(one)) < 300
+            assert one.start < one.stop
+
+
+def test_a_million_samples_take_seconds() -> None:
+    generator = np.random.default_rng(1)
+    time_s = np.arange(10**6) * 1e-4
+    voltage = 100 * np.sin(2 * np.pi * time_s) * np.exp(-time_s / 50)
+    displacement = 0.5 * voltage + 0.1 * generator.standard_normal(10**6)
+    begun = time.process_time()
+    assert () == inspect(Record(voltage, displacement, 1e-4))
+    assert time.process_time() - begun < 10
+
+
+def test_turning_points_leave_out_small_turns() -> None:
+    values = np.array([0.0, 1.0, 3.0, 2.9, 4.0, 1.0, 1.2, -2.0, 5.0, 5.0])
+    assert [0, 4, 7, 9] == turning_points(values, 0.5).tolist()
+
+
+def test_spikes_are_neither_edges_nor_turns() -> None:
+    noise = 0.01 * np.random.default_rng(1).standard_normal(400)
+    triangle = np.abs(np.arange(400) % 80 - 40) / 10
+    assert [] == spikes(triangle + noise, triangle).tolist()
+    assert [] == spikes(np.sign(triangle - 2) + noise).tolist()
+    assert [200] == spikes(triangle + noise + 2.0 * (np.arange(400) == 200), triangle).tolist()
+
+
+def test_a_decay_and_a_trend_are_measured() -> None:
+    at: FloatArray = np.linspace(0.0, 1.999, 2000)
+    size, constant = decay(at, 3 - 5 * np.exp(-at / 0.1), 1.0)
+    assert (size, constant) == pytest.approx((-5, 0.1), rel=0.05)
+    assert trend(at, 7 - 2 * at) == pytest.approx(-2 * at[-1])
