@@ -87,7 +87,8 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         The run.
     summary
         Its numbers, as :func:`bwbayes.results.result.summary` returns them; ``seed``, ``wall_s``,
-        ``versions`` and ``data_sha256`` are shown too if they are there.
+        ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
+        ``go_on``, the command that goes on.
     pictures
         PNG files by the name of their figure, in their order.
     """
@@ -103,6 +104,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
             for name, (proposed, kept) in result.moves.items()
         ],
         pareto_k=None if check.pareto_k is None else f"{check.pareto_k:.2f}",
+        go_on=summary.get("go_on") or "bwbayes resume FOLDER --steps N",
         remarks=result.remarks,
         free=list(_free(result, summary)),
         truth_known=any(p.name in result.truth for p in result.free),

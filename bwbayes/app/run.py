@@ -29,6 +29,7 @@ from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
 from bwbayes.app.workers import executor, one_thread
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import identifiability, pointfit
 from bwbayes.inference.chain import PHASES
@@ -312,6 +313,18 @@ def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
     }
 
 
+def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
+    """Return the log likelihood of each draw, nats, shaped as ``result.log_density``."""
+    prior = posterior.prior
+    _, log_prior = prior.constrain(prior.unconstrain(result.flat_draws))
+    return result.log_density - log_prior.reshape(result.log_density.shape)
+
+
+def going_on(path: Path, problem: Problem) -> str:
+    """Return the command that goes on with a run, with twice the budget that it had."""
+    return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
+
+
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
     """Return the generator that scores bands: it hangs on the readings, not on a name."""
     assert bands.measured is not None
@@ -322,13 +335,18 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
     """Write everything that a run leaves; the summary last, as the sign that all is there."""
     numbers = summary(result) | {
         "seed": problem.config.seed,
+        "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
     record = problem.record
-    assert record.displacement is not None
-    write_posterior(folder.path / "posterior.nc", result, record.voltage, record.displacement)
+    write_posterior(
+        folder.path / "posterior.nc",
+        result,
+        log_likelihood(problem.posterior, result),
+        record,
+    )
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)
