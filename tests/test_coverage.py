@@ -13,8 +13,7 @@ the whole record: most seeds then cover nearly all samples and some few only hal
 without any of those show hardly a spread. Over 40 seeds the sd of a coverage p was 0.35 of
 √(p (1 − p)); so there a spread below 0.3 of that is not believed.
 
-The default runs at 100 Hz to be affordable, with the correlation times that the stand's 1000 Hz
-make the default; ``-m slow`` runs 40 seeds at 1000 Hz.
+The default runs at 100 Hz to be affordable; ``-m slow`` runs 40 seeds at 1000 Hz.
 """
 
 from __future__ import annotations
@@ -42,10 +41,6 @@ CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"
 LIMIT = 5.0
 LEAST_SPREAD = 0.3
 
-CORRELATION = (
-    'discrepancy_time = { prior = { distribution = "lognormal", median = 0.25, sigma = 0.8 } }'
-)
-
 
 @dataclass(frozen=True)
 class Replicate:
@@ -61,7 +56,6 @@ def replicate(seed: int, discrepancy: str, rate: float) -> Replicate:
     text = CONFIG.read_text(encoding="utf-8").replace(
         'discrepancy = "process"', f'discrepancy = "{discrepancy}"\nsample_rate = {rate}'
     )
-    text = text.replace("[parameters]", f"[parameters]\n{CORRELATION}")
     config = parse(re.sub(r"ess = \d+", "ess = 500", text), "coverage")
     problem = resolve(config.model_copy(update={"seed": seed}), CONFIG.parent)
     posterior = problem.posterior

@@ -91,7 +91,7 @@ def run(
         wanted = wanted.model_copy(update={"name": config.stem})
     folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
     if not quiet:
-        show_priors(load_run(folder).parameters, Console())
+        show_priors(load_run(folder).posterior.prior, Console())
     return _finish(folder.path, workers, quiet)
 
 

@@ -85,14 +85,21 @@ class _Source(_Table):
 
 
 class RecordConfig(_Source):
-    """The training record: its source, the part to use, and the windows to fit (default: all)."""
+    """The training record: its source, the readings to use, and the windows to fit (default: all).
 
+    ``start``, ``exclude`` and ``decimate`` leave out readings, never the voltage: the simulation
+    runs from the file's first sample. ``stop`` cuts the record. ``from_rest`` says that it starts
+    with a demagnetised actuator at rest.
+    """
+
+    from_rest: bool = False
     start: float | None = None
     stop: float | None = None
+    exclude: Annotated[list[Window], Field(min_length=1)] | None = None
     decimate: Annotated[int, Field(ge=1)] = 1
     train: Annotated[list[Window], Field(min_length=1)] | None = None
 
-    @field_validator("train", mode="before")
+    @field_validator("train", "exclude", mode="before")
     @classmethod
     def _one_window(cls, given: object) -> object:
         """Take a single window for a list of one."""

@@ -22,8 +22,9 @@ from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
 from bwbayes.results.bands import Bands
+from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_summary
-from bwbayes.results.prediction import Start, beyond_training, predict_record, thinned
+from bwbayes.results.prediction import Start, predict_record, thinned
 from bwbayes.results.scores import Scores, as_summary, score
 from bwbayes.results.verdict import Background, Verdict, assess
 
@@ -70,7 +71,7 @@ def predict(
     posterior, seed = problem.posterior, problem.config.seed
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     chosen = thinned(flat, generator(seed, "draws"))
-    remarks = [beyond] if (beyond := beyond_training(posterior, other.voltage)) else []
+    remarks = list(beyond_training(posterior, other.voltage, other.interval))
     source = generator(seed, f"predict {other.sha256}")
     bands = predict_record(posterior, chosen, other, start, source, name, window)
     verdict = assess(bands, Background.of(posterior, flat))

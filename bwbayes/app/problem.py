@@ -8,10 +8,8 @@ moved, continued and run again by itself.
 
 from __future__ import annotations
 
-import difflib
-import re
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,16 +18,16 @@ import numpy as np
 from bwbayes.app.config import (
     Config,
     ModelConfig,
-    ParameterConfig,
     RecordConfig,
     SignalConfig,
 )
+from bwbayes.app.parameters import as_config, defaults_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
+from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
@@ -37,12 +35,10 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import Start, beyond_training
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.prediction import Start
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
-
-# No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
-LARGEST = 1e60
 
 
 @dataclass(frozen=True)
@@ -68,6 +64,8 @@ class Problem:
     plan: SamplingPlan
     validations: Mapping[str, Validation]
     remarks: tuple[str, ...] = ()
+    defaults: Mapping[str, Distribution] = field(default_factory=dict)
+    """What the default priors of this record would be, by name."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -111,13 +109,15 @@ def resolve(config: Config, folder: Path) -> Problem:
             if validation.another
         }
     remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    remarks += [f"record: {finding}" for finding in inspect(record)]
     hold = config.model.hold
     if hold == "auto":
         hold = "zero" if record.voltage_is == "command" else "first"
     actuator = Actuator(config.model.dynamics, hold, record.interval)
     noise = noise_model(config.model.noise, record.interval)
     names = (*actuator.parameters, *noise.parameters)
-    prior = JointPrior(_parameters(config, names, record, split.training))
+    defaults = defaults_of(config, record, split.training)
+    prior = JointPrior(parameters_of(config, names, defaults))
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -129,12 +129,13 @@ def resolve(config: Config, folder: Path) -> Problem:
         noise,
         prior,
         choose(config.sampling.engine),
+        config.record.from_rest,
     )
     windows = iter(split.held_out)
     validations = {
         name: Validation(
             record=others[name],
-            start=Start(v.from_rest, v.own_offset, v.lead_in, v.lead_in_from),
+            start=_start(config, name),
             judged=None if v.window is None else (v.window[0], v.window[1]),
         )
         if v.another
@@ -142,12 +143,15 @@ def resolve(config: Config, folder: Path) -> Problem:
         for name, v in config.validation.items()
     }
     for name, one in validations.items():
-        voltage = record.voltage[one.window] if one.record is None else one.record.voltage
-        if remark := beyond_training(posterior, voltage):
-            remarks.append(f"{name}: {remark}")
+        other = one.record or record
+        voltage = other.voltage[one.window or slice(None)]
+        leaving = beyond_training(posterior, voltage, other.interval)
+        remarks += [f"{name}: {remark}" for remark in leaving]
     explicit = _explicit(config, posterior, truth)
     plan = _plan(config, posterior)
-    return Problem(explicit, record, posterior, plan, validations, tuple(remarks))
+    return Problem(
+        explicit, record, posterior, plan, validations, tuple(remarks), defaults.priors(names)
+    )
 
 
 def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, float]]:
@@ -161,10 +165,11 @@ def _training_record(config: Config, folder: Path) -> tuple[Record, dict[str, fl
         waveform = sampled_waveform(source.signal)
         record = _named(stand.run(waveform, generator(config.seed, "record")), source.signal)
         truth = stand.parameters() | truth
+    if source.exclude is not None:
+        record = record.exclude([(window[0], window[1]) for window in source.exclude])
     if source.start is not None or source.stop is not None:
-        end = record.start + record.duration
-        start = record.start if source.start is None else source.start
-        record = record.window(start, end if source.stop is None else source.stop)
+        end = record.start + record.duration if source.stop is None else source.stop
+        record = record.upto(end, source.start)
     if source.decimate > 1:
         record = record.decimate(source.decimate)
     require_readable(record, "record")
@@ -182,24 +187,28 @@ def _other_record(config: Config, name: str, folder: Path) -> Record:
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
-    begin = record.start if source.lead_in_from is None else source.lead_in_from
-    after = begin - record.start + source.lead_in
-    if source.own_offset and not (
-        begin >= record.start - record.interval / 2
-        and round(source.lead_in / record.interval) >= 1
-        and round(after / record.interval) < record.samples
-    ):
-        key = "lead_in" if source.lead_in_from is None else "lead_in_from"
-        raise InputError(
-            f"validation.{name}.{key}: {source.lead_in:g} s is not a part of the record's "
-            f"{record.duration:g} s from {begin:g} s on; choose another one"
-        )
+    try:
+        _start(config, name).window(record)
+    except InputError as error:
+        raise InputError(f"validation.{name}.lead_in: {error}") from None
     if source.window is not None:
         try:
             record.window_slice(source.window[0], source.window[1])
         except InputError as error:
             raise InputError(f"validation.{name}.{error}") from None
     return record
+
+
+def _start(config: Config, name: str) -> Start:
+    """Return what a config knows of another record's start; its hold is its own, unless given."""
+    source, hold = config.validation[name], config.model.hold
+    return Start(
+        source.from_rest,
+        source.own_offset,
+        source.lead_in,
+        source.lead_in_from,
+        None if hold == "auto" else hold,
+    )
 
 
 def _stand(config: Config) -> VirtualTestStand:
@@ -212,104 +221,25 @@ def _named(record: Record, wanted: str | SignalConfig) -> Record:
 
 
 def _split(config: Config, record: Record) -> Split:
-    held_out = [v.window for v in config.validation.values() if v.window and not v.another]
-    train = config.record.train or [[record.start, record.start + record.duration]]
-    pairs = [(window[0], window[1]) for window in train]
-    return record.split(pairs, [(window[0], window[1]) for window in held_out])
-
-
-def _parameters(
-    config: Config, names: tuple[str, ...], record: Record, training: tuple[slice, ...]
-) -> list[Parameter]:
-    _require_known("parameters", config.parameters, names)
-    _require_known("truth", config.truth, CATALOGUE)
-    rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
-    assert record.displacement is not None
-    voltage, displacement = record.voltage[rows], record.displacement[rows]
-    if np.ptp(voltage) == 0 or np.ptp(displacement) == 0:
-        raise InputError("record.train: voltage or displacement is constant there; widen it")
-    ranges = Ranges.of(voltage, displacement, record.interval)
-    exponent = _fixed(config, "exponent", 1.0)
-    stiffness = _fixed(config, "stiffness", None)
-    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
-    return [_parameter(name, given[name], ranges, exponent, stiffness) for name in names]
-
-
-def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
-    for name in given:
-        if name not in known:
-            if name in CATALOGUE:
-                raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"{table}.{name}: no such parameter here; did you mean {near[0]}?")
-
-
-def _fixed(config: Config, name: str, default: float | None) -> float | None:
-    given = config.parameters.get(name)
-    return default if given is None or given.fixed is None else given.fixed
-
-
-def _parameter(
-    name: str,
-    given: ParameterConfig,
-    ranges: Ranges,
-    exponent: float | None,
-    stiffness: float | None,
-) -> Parameter:
-    """Put what the config says of a parameter before what the defaults say."""
-    meaning = CATALOGUE[name]
-    prior, fixed = None, given.fixed
-    if given.prior is not None:
-        prior = _distribution(name, given.prior)
-    elif fixed is None:
-        prior, fixed = _default(name, ranges, exponent or 1.0, stiffness)
-    _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
-    unit = meaning.unit
-    if name in ("beta", "gamma") and exponent != 1.0:
-        unit = "um^(1-n)/V"
-    if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
-        raise InputError(
-            f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
-        )
-    return Parameter(
-        name,
-        given.unit or unit,
-        given.label or meaning.label,
-        given.description or meaning.description,
-        prior,
-        fixed,
-        -np.inf if given.lower is None else given.lower,
-        np.inf if given.upper is None else given.upper,
-    )
-
-
-def _require_in_proportion(name: str, values: Collection[float]) -> None:
-    """Refuse numbers of which the model's products and quotients are too large or small to hold."""
-    for value in values:
-        if value and not 1 / LARGEST < abs(value) < LARGEST:
-            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
-
-
-def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
-    arguments = {key: value for key, value in prior.items() if key != "distribution"}
-    try:
-        # The distribution itself refuses arguments that are no numbers.
-        return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
-    except InputError as error:
-        raise InputError(f"parameters.{name}.prior: {error}") from None
-
-
-def _default(
-    name: str, ranges: Ranges, exponent: float, stiffness: float | None
-) -> tuple[Distribution | None, float | None]:
-    try:
-        found = default_prior(name, ranges, exponent, stiffness)
-    except KeyError:
-        raise InputError(
-            f"parameters.{name}: has no default prior; give prior or fixed (a record shows mass "
-            "and stiffness only through the damping)"
-        ) from None
-    return (found, None) if isinstance(found, Distribution) else (None, found)
+    held_out = {n: v.window for n, v in config.validation.items() if v.window and not v.another}
+    if config.record.train is None:
+        first, last = np.flatnonzero(record.has_reading)[[0, -1]]
+        train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
+    else:
+        train = [(window[0], window[1]) for window in config.record.train]
+    split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
+    parts = [("record.train", window) for window in split.training]
+    parts += [
+        (f"validation.{name}.window", w) for name, w in zip(held_out, split.held_out, strict=True)
+    ]
+    for place, part in parts:
+        if not record.has_reading[part].any():
+            begin, end = record.time[part][[0, -1]]
+            raise InputError(
+                f"{place}: no readings from {begin:g} to {end:g} s; choose another window, or see "
+                "start, exclude and decimate in [record]"
+            )
+    return split
 
 
 # Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
@@ -349,32 +279,21 @@ def _explicit(config: Config, posterior: Posterior, truth: Mapping[str, float]) 
     }
     return config.model_copy(
         update={
-            "record": RecordConfig(file="records/record.h5", train=config.record.train),
+            "record": RecordConfig(
+                file="records/record.h5",
+                train=config.record.train,
+                from_rest=config.record.from_rest,
+            ),
             "model": ModelConfig(
                 dynamics=config.model.dynamics,
-                hold=posterior.actuator.hold,
+                hold=config.model.hold,
                 noise=config.model.noise,
             ),
-            "parameters": {p.name: _as_config(p) for p in prior.parameters},
+            "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
                 update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}
             ),
             "validation": validation,
             "truth": {n: v for n, v in truth.items() if n in prior.names},
         }
-    )
-
-
-def _as_config(parameter: Parameter) -> ParameterConfig:
-    prior: dict[str, str | float] | None = None
-    if parameter.prior is not None:
-        prior = {"distribution": parameter.prior.name, **parameter.prior.arguments}
-    return ParameterConfig(
-        prior=prior,
-        fixed=parameter.fixed,
-        lower=parameter.lower if np.isfinite(parameter.lower) else None,
-        upper=parameter.upper if np.isfinite(parameter.upper) else None,
-        unit=parameter.unit,
-        label=parameter.label,
-        description=parameter.description,
     )

@@ -14,10 +14,12 @@ from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from bwbayes.app.figures.style import title, unit_text
-from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.conflict import effective
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
@@ -108,7 +110,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         remarks=result.remarks,
         free=list(_free(result, summary)),
         truth_known=any(p.name in result.truth for p in result.free),
-        assumed=[_assumed(p) for p in result.parameters],
+        assumed=list(_assumed(result.parameters)),
         validation=_validation(result) if result.outcome.converged and result.scores else None,
         pictures=[
             picture(png, name, *_caption(name))
@@ -205,16 +207,29 @@ def _words(parameter: Parameter) -> dict[str, Any]:
     }
 
 
-def _assumed(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter's prior in words, with the bounds that cut it, or its fixed value."""
+def _assumed(parameters: tuple[Parameter, ...]) -> Iterator[dict[str, Any]]:
+    """Yield each parameter's prior in words, stated and in effect, or its fixed value."""
+    prior = JointPrior(parameters)
+    quantiles = effective(prior, np.random.default_rng(0))
+    left = dict(zip(prior.free_names, quantiles.T, strict=True))
+    for parameter in parameters:
+        row = _words(parameter) | {"prior": _stated(parameter), "effect": ""}
+        if parameter.name in left:
+            low, middle, high = left[parameter.name]
+            row["effect"] = f"{middle:.3g} ({low:.2g} to {high:.2g})"
+        yield row
+
+
+def _stated(parameter: Parameter) -> str:
+    """Return a prior in words, with the bounds that cut it, or a fixed value."""
     if parameter.fixed is not None:
-        return _words(parameter) | {"prior": f"fixed at {parameter.fixed:.6g}"}
+        return f"fixed at {parameter.fixed:.6g}"
     text = str(parameter.prior)
     if math.isfinite(parameter.lower):
         text += f", at least {parameter.lower:.6g}"
     if math.isfinite(parameter.upper):
         text += f", at most {parameter.upper:.6g}"
-    return _words(parameter) | {"prior": text}
+    return text
 
 
 def _validation(result: Result) -> dict[str, Any]:

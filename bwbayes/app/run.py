@@ -31,7 +31,7 @@ from bwbayes.app.report import render
 from bwbayes.app.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import identifiability, pointfit
+from bwbayes.inference import conflict, identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
@@ -178,10 +178,11 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
         for i, window in enumerate(training)
     }
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    bands = predict_windows(posterior, chosen, problem.record, windows)
+    # By content: the same record under another name gets the same bands.
+    source = generator(seed, f"predict {problem.record.sha256}")
+    bands = predict_windows(posterior, chosen, problem.record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:
-            # By content: the same record under another name gets the same bands.
             source = generator(seed, f"predict {other.record.sha256}")
             bands.append(
                 predict_record(
@@ -249,18 +250,20 @@ def _retarget(
 def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions."""
     posterior = problem.posterior
-    left_open = identifiability.undetermined(posterior, chain.point)
+    sampled = draws(posterior, chain)
+    flat = sampled.reshape(-1, sampled.shape[-1])
     remarks = [
         *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
-        *(f"the record does not determine {c}: the prior decides there" for c in left_open),
+        *conflict.conflicts(posterior.prior, flat, problem.defaults),
+        *identifiability.remarks(posterior, chain.point, flat),
     ]
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
         parameters=problem.parameters,
-        draws=draws(posterior, chain),
+        draws=sampled,
         log_density=chain.log_density("sampling"),
         moves=chain.moves("sampling"),
         facts=_facts(problem, posterior, chain),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -12,8 +12,8 @@ from rich.table import Table
 from bwbayes.app.config import Config
 from bwbayes.app.folder import CalibrationFolder, RunFolder
 from bwbayes.app.problem import generator, resolve
-from bwbayes.inference import identifiability, pointfit
-from bwbayes.inference.parameters import Parameter
+from bwbayes.inference import conflict, identifiability, pointfit
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
 from bwbayes.results.result import Result, summary
@@ -151,27 +151,35 @@ def show_check(config: Config, folder: Path, console: Console) -> None:
     )
     point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
     free, _ = posterior.prior.constrain(point.mode[None])
-    show_priors(problem.parameters, console, dict(zip(posterior.names, free[0], strict=True)))
-    left_open = identifiability.undetermined(posterior, point)
-    for remark in problem.remarks:
+    show_priors(posterior.prior, console, dict(zip(posterior.names, free[0], strict=True)))
+    likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
+    conflicts = conflict.conflicts(posterior.prior, likely, problem.defaults)
+    untold = identifiability.remarks(posterior, point, likely)
+    for remark in (*problem.remarks, *conflicts):
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
-    for combination in left_open:
-        console.print(
-            f"warning: the record does not determine {combination}: the prior decides there",
-            highlight=False,
-            soft_wrap=True,
-        )
+    for remark in untold:
+        console.print(f"warning: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def show_priors(
-    parameters: Sequence[Parameter], console: Console, fitted: Mapping[str, float] | None = None
+    prior: JointPrior, console: Console, fitted: Mapping[str, float] | None = None
 ) -> None:
-    """Show every prior and fixed value as numbers, with the point fit if there is one."""
-    table = Table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
-    for parameter in parameters:
+    """Show every prior and fixed value as numbers, with the point fit if there is one.
+
+    Beside each stated prior stands what the physical constraints leave of it: median and 95 %
+    interval under the joint prior.
+    """
+    quantiles = conflict.effective(prior, generator(0, "effective priors"))
+    left = dict(zip(prior.free_names, quantiles.T, strict=True))
+    header = ["parameter", "prior", "in effect: median, 95 %"]
+    table = Table(*header, *(["point fit"] if fitted else []), "unit")
+    for parameter in prior.parameters:
         known = str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}"
-        row = [parameter.name, known]
+        row = [parameter.name, known, "", escape(parameter.unit)]
+        if parameter.name in left:
+            low, middle, high = left[parameter.name]
+            row[2] = f"{middle:.3g}, {low:.2g} to {high:.2g}"
         if fitted:
-            row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
-        table.add_row(*row, escape(parameter.unit))
+            row.insert(3, f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
+        table.add_row(*row)
     console.print(table)

@@ -2,9 +2,10 @@
 
 Every reader turns its file into a :class:`Table`: columns as they stand in the file, with the
 units in their names. :func:`build_record` converts the units and checks what all formats share:
-lengths, finite numbers, a uniform time grid, a voltage and a displacement that move. A problem is
-one line, ``file:line: column: problem; what to do``; files without lines name the sample, counted
-from 0.
+lengths, finite numbers, a uniform time grid, a voltage and a displacement that move. A displacement
+may be missing here and there (nan), and so may whole samples where the voltage is a command, which
+is held. A problem is one line, ``file:line: column: problem; what to do``; files without lines name
+the sample, counted from 0.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record, VoltageIs, require_voltage_is
 from bwbayes.errors import InputError, InputWarning
 
 __all__ = [
+    "AT_EVERY_SAMPLE",
     "MAXIMUM_SAMPLES",
     "MINIMUM_SAMPLES",
     "Column",
@@ -53,6 +55,7 @@ _SHORTEST = 1e-12  # s
 _LATEST = 1e12  # s
 _LARGEST = 1e9  # V or um: beyond it a unit is wrong, whatever the actuator
 _SMALLEST = 1e-9  # V or um: a range below it is none
+AT_EVERY_SAMPLE = "give one at every sample (only a displacement may be missing: nan)"
 
 
 @dataclass(frozen=True)
@@ -168,27 +171,35 @@ def build_record(
     Warns
     -----
     InputWarning
-        If the displacement looks clipped.
+        If samples are missing in which a command was held.
     """
     needed = ["time", "voltage"] + ["displacement"] * need_displacement
     _check_lengths(table, needed)
-    start, interval = _time_grid(table)
-    values = {name: _converted(table, name) for name in table.columns if name != "time"}
-    samples = values["voltage"].size
-    if samples < MINIMUM_SAMPLES:
-        raise table.error(f"too short, samples: {samples}; give at least {MINIMUM_SAMPLES}")
-    displacement = values.get("displacement")
-    _check_moving(table, "voltage", values["voltage"])
-    if displacement is not None:
-        _check_moving(table, "displacement", displacement)
-        _warn_if_clipped(table, values["voltage"], displacement)
     try:
         kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
     except InputError as error:
         raise table.error(str(error)) from error
+    start, interval, rows = _time_grid(table, held=kind == "command")
+    values = {name: _converted(table, name) for name in table.columns if name != "time"}
+    samples = values["voltage"].size
+    if samples < MINIMUM_SAMPLES:
+        raise table.error(f"too short, samples: {samples}; give at least {MINIMUM_SAMPLES}")
+    _check_moving(table, "voltage", values["voltage"])
+    if not need_displacement and np.isnan(values.get("displacement", 0.0)).all():
+        del values["displacement"]
+    if "displacement" in values:
+        _check_readings(table, values["displacement"])
+    if rows is not None:
+        values = {name: _filled(column, rows, name) for name, column in values.items()}
     origin = table.notes.get("origin") or table.path.name
     return Record(
-        values["voltage"], displacement, interval, start, kind, origin, values.get("truth")
+        values["voltage"],
+        values.get("displacement"),
+        interval,
+        start,
+        kind,
+        origin,
+        values.get("truth"),
     )
 
 
@@ -237,13 +248,15 @@ def _converted(table: Table, quantity: str) -> FloatArray:
         values = np.asarray(column.values, dtype=np.float64)
         values = _scaled(values, column.power)
         refused = ~(np.abs(values) <= (_LATEST if quantity == "time" else _LARGEST))
+    if quantity == "displacement":
+        refused &= ~np.isnan(values)
     if refused.any():
         sample = int(np.argmax(refused))
         raw = column.values[sample]
         if np.isfinite(raw):
             problem = f"{raw:g} is absurdly large; check the unit in the column's name"
         else:
-            problem = f"{raw} is not a finite number; mend or remove the sample"
+            problem = f"{raw} is not a finite number; {AT_EVERY_SAMPLE}"
         raise table.error(problem, quantity, sample)
     return values
 
@@ -253,8 +266,11 @@ def _scaled(values: FloatArray, power: int) -> FloatArray:
     return values * 10.0**power if power >= 0 else values / 10.0**-power
 
 
-def _time_grid(table: Table) -> tuple[float, float]:
-    """Return start and interval in s of the time column after checking that it is uniform."""
+def _time_grid(table: Table, held: bool) -> tuple[float, float, IntArray | None]:
+    """Return start and interval in s of the time column after checking that it is uniform.
+
+    With `held` samples may be missing; then the places (samples,) on the whole grid come third.
+    """
     column = table.columns["time"]
     time = _converted(table, "time")
     steps = np.diff(time)
@@ -266,15 +282,43 @@ def _time_grid(table: Table) -> tuple[float, float]:
         else:
             problem = f"time goes back from {before:.9g} s to {after:.9g} s; sort the samples"
         raise table.error(problem, "time", sample + 1)
-    interval = float((time[-1] - time[0]) / steps.size)
-    if np.median(steps) < _SHORTEST:
-        problem = f"steps of {np.median(steps):.3g} s are absurdly small; check the unit"
+    usual = float(np.median(steps))
+    if usual < _SHORTEST:
+        problem = f"steps of {usual:.3g} s are absurdly small; check the unit"
         raise table.error(problem, "time")
+    places = np.arange(time.size)
+    gaps = steps > 1.5 * usual
+    if held and gaps.any():
+        # The mean of the other steps, as the rounding of the times goes to nothing in it.
+        counts = np.maximum(np.rint(steps / steps[~gaps].mean()), 1.0)
+        if counts.sum() >= MAXIMUM_SAMPLES:
+            sample = int(np.argmax(steps))
+            problem = f"gap of {steps[sample]:.6g} s makes the record too long; cut it there"
+            raise table.error(problem, "time", sample + 1)
+        places = np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
+    interval = float((time[-1] - time[0]) / places[-1])
     tolerance = _time_tolerance(time, interval, column)
-    deviation = np.abs(time - (time[0] + interval * np.arange(time.size)))
+    deviation = np.abs(time - (time[0] + interval * places))
     if not (deviation <= tolerance).all():
-        raise _uneven(table, time, steps, deviation)
-    return float(time[0]), _declared_interval(table, interval, tolerance / steps.size)
+        raise _uneven(table, time, steps, deviation, held)
+    interval = _declared_interval(table, interval, tolerance / int(places[-1]))
+    if places[-1] < time.size:
+        return float(time[0]), interval, None
+    sample = int(np.argmax(gaps)) + 1
+    missing = int(places[-1]) + 1 - time.size
+    remark = f"{missing} samples are missing, from here on in {np.count_nonzero(gaps)} gaps"
+    error = table.error(f"{remark}; the commanded voltage is taken as held there", "time", sample)
+    warnings.warn(str(error), InputWarning, stacklevel=4)
+    return float(time[0]), interval, places
+
+
+def _filled(values: FloatArray, places: IntArray, quantity: str) -> FloatArray:
+    """Return a column on the whole grid: the voltage held in the gaps, all else missing there."""
+    whole = np.full(int(places[-1]) + 1, np.nan)
+    whole[places] = values
+    if quantity == "voltage":
+        whole = np.repeat(values, np.diff(places, append=places[-1] + 1))
+    return whole
 
 
 def _time_tolerance(time: FloatArray, interval: float, column: Column) -> float:
@@ -296,7 +340,9 @@ def _time_tolerance(time: FloatArray, interval: float, column: Column) -> float:
     return max(0.01 * interval, min(rounded, 0.4 * interval))
 
 
-def _uneven(table: Table, time: FloatArray, steps: FloatArray, deviation: FloatArray) -> InputError:
+def _uneven(
+    table: Table, time: FloatArray, steps: FloatArray, deviation: FloatArray, held: bool
+) -> InputError:
     """Return the error that says where the times leave the grid, and by how much."""
     usual = float(np.median(steps))
     off = np.abs(steps - usual) > _time_tolerance(time, usual, table.columns["time"])
@@ -307,9 +353,13 @@ def _uneven(table: Table, time: FloatArray, steps: FloatArray, deviation: FloatA
     sample = int(np.argmax(off)) + 1
     step, before = float(steps[sample - 1]), float(time[sample - 1])
     if step > 1.5 * usual:
+        if held:
+            problem = f"gap of {step:.6g} s is no whole number of intervals of {usual:.6g} s"
+            return table.error(f"{problem}; resample it or cut the record", "time", sample)
         missing = round(step / usual) - 1
         problem = f"gap of {step:.6g} s after {before:.9g} s, about {missing} missing"
-        return table.error(f"{problem}; fill it or cut the record there", "time", sample)
+        advice = 'give the voltage there (the displacement may be nan), say voltage_is = "command"'
+        return table.error(f"{problem}; {advice} if it was held, or cut the record", "time", sample)
     problem = f"irregular sampling: {step:.6g} s after the sample before, {usual:.6g} s elsewhere"
     return table.error(f"{problem}; resample it on a uniform grid", "time", sample)
 
@@ -339,43 +389,9 @@ def _check_moving(table: Table, quantity: str, values: FloatArray) -> None:
         raise table.error(problem, quantity)
 
 
-def _warn_if_clipped(table: Table, voltage: FloatArray, displacement: FloatArray) -> None:
-    """Warn if the displacement stays at its largest or smallest value while the voltage moves on.
-
-    A coarse sensor repeats its extreme value too, in two ways that are harmless. At rest the
-    voltage stands still: only runs count in which its quartiles lie apart, by 1 % of its range and
-    by what three steps of the sensor are worth. At a smooth peak the next level lasts as well: a
-    parabola stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
-    """
-    levels = np.unique(displacement)
-    if levels.size < 3:
-        return
-    resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
-    travel = max(0.01, 3 * resolution) * float(np.ptp(voltage))
-    for side, extreme, following in (("largest", -1, -2), ("smallest", 0, 1)):
-        at_extreme = displacement == levels[extreme]
-        first, lengths = _runs(at_extreme)
-        stuck = (lengths >= 5) & (_quartile_distances(voltage[at_extreme], lengths) > travel)
-        held = int(lengths[stuck].sum())
-        if held >= 10 and held > 3 * np.count_nonzero(displacement == levels[following]):
-            problem = f"clipped sensor? {held} samples stay at the {side} value"
-            advice = "leave these times out or use a wider range"
-            text = f"{problem} {levels[extreme]:g} um while the voltage moves; {advice}"
-            warning = table.error(text, "displacement", int(first[stuck][0]))
-            warnings.warn(str(warning), InputWarning, stacklevel=4)
-
-
-def _runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the first index and the length of every run of true values."""
-    edges = np.diff(mask.astype(np.int8), prepend=0, append=0)
-    first = np.flatnonzero(edges == 1)
-    return first, np.flatnonzero(edges == -1) - first
-
-
-def _quartile_distances(values: FloatArray, lengths: IntArray) -> FloatArray:
-    """Return third less first quartile of every run, where `values` holds run after run."""
-    run = np.repeat(np.arange(lengths.size), lengths)
-    ordered = values[np.lexsort((values, run))]
-    first = np.cumsum(lengths) - lengths
-    distances: FloatArray = ordered[first + 3 * lengths // 4] - ordered[first + lengths // 4]
-    return distances
+def _check_readings(table: Table, displacement: FloatArray) -> None:
+    read = displacement[~np.isnan(displacement)]
+    if read.size < MINIMUM_SAMPLES:
+        problem = f"too few readings: {read.size}; give at least {MINIMUM_SAMPLES}"
+        raise table.error(problem, "displacement")
+    _check_moving(table, "displacement", read)

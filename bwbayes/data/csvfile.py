@@ -1,23 +1,27 @@
 """Records as text: ``time_s,voltage_V,displacement_um``, one sample per line.
 
 Lines ``# key: value`` may stand above the header; ``voltage`` (command or output), ``origin`` and
-``interval_s`` are understood, others are comments. NumPy's C parser reads the numbers; only when
-it fails does a slow pass look for the line that is wrong, and says what is wrong with it.
+``interval_s`` are understood, others are comments. An empty cell or ``nan`` in the displacement is
+a missing reading; columns of other quantities are ignored, with a remark. NumPy's C parser reads
+the numbers; only when it fails does a slow pass look for the line that is wrong, and says what is
+wrong with it.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import warnings
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.checks import Column, Table, parse_name
+from bwbayes.data.checks import AT_EVERY_SAMPLE, Column, Table, parse_name
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning, one_line
 
 __all__ = ["read_csv", "write_csv"]
 
@@ -25,6 +29,14 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
 _EXAMPLE = "time_s,voltage_V,displacement_um"
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
+
+
+class _Header(NamedTuple):
+    """A column's name, its quantity ("" if it is none that counts), and its power of ten."""
+
+    name: str
+    quantity: str
+    power: int
 
 
 def read_csv(path: Path) -> Table:
@@ -44,19 +56,25 @@ def read_csv(path: Path) -> Table:
     if not body:
         raise InputError(f"{path}:{header_line}: no samples below the header; add them")
     lines = body.split("\n")
-    values = _numbers(lines, len(columns))
-    names = [name for name, _, _ in columns]
+    values = _numbers(lines, columns)
     if values is None:
-        raise _fault(f"{path}:", lines, names, header_line + 1, ended)
-    if not ended and _looks_cut(lines):
-        last = header_line + len(values)
-        raise InputError(f"{path}:{last}: {names[-1]}: the last line is cut off; remove it")
+        raise _fault(f"{path}:", lines, columns, header_line + 1, ended)
+    if not ended and columns[-1].quantity and _looks_cut(lines):
+        last = header_line + len(lines)
+        name = columns[-1].name
+        raise InputError(f"{path}:{last}: {name}: the last line is cut off; remove it")
+    extra = [column.name for column in columns if not column.quantity]
+    if extra:
+        some = ", ".join(extra[:10]) + (", ..." if len(extra) > 10 else "")
+        remark = f"{path}:{header_line}: ignored columns: {some}"
+        warnings.warn(one_line(remark), InputWarning, stacklevel=4)
+    known = [column for column in columns if column.quantity]
     return Table(
         path,
-        {quantity: Column(name, values[:, i], p) for i, (name, quantity, p) in enumerate(columns)},
+        {c.quantity: Column(c.name, values[:, i], c.power) for i, c in enumerate(known)},
         notes,
         first_line=header_line + 1,
-        names=tuple(names),
+        names=tuple(column.name for column in columns),
     )
 
 
@@ -71,8 +89,12 @@ def write_csv(record: Record, path: Path) -> None:
             file.write(f"# origin: {record.origin}\n")
         file.write(f"# interval_s: {record.interval!r}\n")
         file.write(",".join(columns) + "\n")
-        texts = [map(repr, column.tolist()) for column in columns.values()]
+        texts = [map(_text, column.tolist()) for column in columns.values()]
         file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def _text(value: float) -> str:
+    return "" if math.isnan(value) else repr(value)
 
 
 def _decoded(path: Path, data: bytes) -> str:
@@ -110,8 +132,8 @@ def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, st
     raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
 
 
-def _header_columns(path: Path, line: int, header: str) -> list[tuple[str, str, int]]:
-    """Return name, quantity and power of ten of every column."""
+def _header_columns(path: Path, line: int, header: str) -> list[_Header]:
+    """Return what stands in the header; columns of other quantities only beside all that count."""
     where = f"{path}:{line}:"
     for separator, words in _SEPARATORS.items():
         if separator in header:
@@ -121,38 +143,71 @@ def _header_columns(path: Path, line: int, header: str) -> list[tuple[str, str, 
     names = [cell.strip() for cell in header.split(",")]
     if all(_NUMBER.fullmatch(name) for name in names):
         raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
-    columns: list[tuple[str, str, int]] = []
+    columns: list[_Header] = []
+    unknown = ""
     for number, name in enumerate(names, start=1):
         shown = _quoted(name)[1:-1] or f"column {number}"
         try:
             quantity, power = parse_name(name)
         except ValueError as error:
-            raise InputError(f"{where} {shown}: {error}") from None
+            unknown = unknown or f"{where} {shown}: {error}"
+            quantity, power = "", 0
         if quantity == "truth":
             raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
-        if quantity in [known for _, known, _ in columns]:
+        if quantity and quantity in [column.quantity for column in columns]:
             raise InputError(f"{where} {name}: second {quantity} column; remove one")
-        columns.append((name, quantity, power))
+        columns.append(_Header(name if quantity else shown, quantity, power))
+    # An unknown name is most likely the missing one, misspelt.
+    missing = {"time", "voltage", "displacement"} - {column.quantity for column in columns}
+    if unknown and missing:
+        raise InputError(unknown)
     return columns
 
 
-def _numbers(lines: list[str], columns: int) -> FloatArray | None:
-    """Return the numbers, (samples, columns), or None if any is missing, wrong or not finite."""
-    try:
-        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
-    except ValueError:
+def _numbers(lines: list[str], columns: list[_Header]) -> FloatArray | None:
+    """Return the numbers of the known columns, (samples, known).
+
+    None if any is wrong, not finite, or missing where it may not be.
+    """
+    known = [number for number, column in enumerate(columns) if column.quantity]
+    if any(line.count(",") != len(columns) - 1 for line in lines):
         return None
-    if values.shape != (len(lines), columns) or not np.isfinite(values).all():
+    try:
+        values = _parsed(lines, known)
+    except ValueError:
+        places = [n for n in known if columns[n].quantity == "displacement"]
+        try:
+            values = _parsed([_with_nan(line, places) for line in lines], known)
+        except ValueError:
+            return None
+    may_miss = np.array([columns[number].quantity == "displacement" for number in known])
+    if (
+        values.shape[0] != len(lines)
+        or not (np.isfinite(values) | (np.isnan(values) & may_miss)).all()
+    ):
         return None
     return values
 
 
+def _parsed(lines: list[str], known: list[int]) -> FloatArray:
+    values: FloatArray = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, usecols=known)
+    return values
+
+
+def _with_nan(line: str, places: list[int]) -> str:
+    """Return the line with nan in the empty cells at these places."""
+    cells = line.split(",")
+    for place in places:
+        cells[place] = cells[place].strip() or "nan"
+    return ",".join(cells)
+
+
 def _fault(
-    where: str, lines: list[str], names: list[str], first_line: int, ended: bool
+    where: str, lines: list[str], columns: list[_Header], first_line: int, ended: bool
 ) -> InputError:
     """Return the error that names the first line that cannot be read."""
     for number, line in enumerate(lines, start=first_line):
-        fault = _fault_in_line(line, names)
+        fault = _fault_in_line(line, columns)
         if fault is None:
             continue
         column, problem = fault
@@ -163,19 +218,19 @@ def _fault(
     return InputError(f"{where} cannot be read as numbers; write it anew")
 
 
-def _fault_in_line(line: str, names: list[str]) -> tuple[str, str] | None:
+def _fault_in_line(line: str, columns: list[_Header]) -> tuple[str, str] | None:
     """Return column and ``problem; what to do`` of a line, or None if nothing is wrong."""
     if not line.strip():
         return "", "empty line; remove it"
     if line.lstrip().startswith("#"):
         return "", "comment among the samples; move it above the header"
     cells = [cell.strip() for cell in line.split(",")]
-    if len(cells) != len(names):
-        return _fault_in_fields(line, cells, names)
-    for name, cell in zip(names, cells, strict=True):
-        problem = _fault_in_cell(cell)
+    if len(cells) != len(columns):
+        return _fault_in_fields(line, cells, [column.name for column in columns])
+    for column, cell in zip(columns, cells, strict=True):
+        problem = _fault_in_cell(cell, column.quantity)
         if problem:
-            return name, problem
+            return column.name, problem
     return None
 
 
@@ -195,21 +250,27 @@ def _fault_in_fields(line: str, cells: list[str], names: list[str]) -> tuple[str
     return f"field {len(names) + 1}", f"extra field {_quoted(cells[-1])}, {counts}; remove it"
 
 
-def _fault_in_cell(cell: str) -> str | None:
+def _fault_in_cell(cell: str, quantity: str) -> str | None:
+    not_a_number = cell.lstrip("+-").lower() == "nan"
+    if not quantity or (quantity == "displacement" and (not cell or not_a_number)):
+        return None
     if not cell:
-        return "empty cell; give a number or remove the line"
+        return f"empty cell; {AT_EVERY_SAMPLE}"
     if _NUMBER.fullmatch(cell):
         if math.isfinite(float(cell)):
             return None
-        return f"{_quoted(cell)} is too large for a number; mend or remove the line"
-    if cell.lstrip("+-").lower() in ("nan", "inf", "infinity"):
-        return f"{_quoted(cell)} is not a finite number; mend or remove the line"
+        return f"{_quoted(cell)} is too large for a number; correct or remove the line"
+    if not_a_number or cell.lstrip("+-").lower() in ("inf", "infinity"):
+        return f"{_quoted(cell)} is not a finite number; {AT_EVERY_SAMPLE}"
     return f"{_quoted(cell)} is not a number; write it like 1.5 or 1.5e-3"
 
 
 def _looks_cut(lines: list[str]) -> bool:
     """Whether the last number has fewer decimals than all the numbers above it have alike."""
     cells = [line.rpartition(",")[2].strip() for line in lines[-50:]]
+    if not cells[-1]:
+        return True
+    cells = [cell for cell in cells if cell]
     if len(cells) < 6 or any("e" in cell.lower() for cell in cells):
         return False
     decimals = [len(cell.partition(".")[2]) for cell in cells]

@@ -56,7 +56,7 @@ def read_record(
     Warns
     -----
     InputWarning
-        If the displacement looks clipped.
+        If columns are ignored, or a commanded voltage is held where samples are missing.
     """
     path = Path(path)
     if voltage_is is not None:

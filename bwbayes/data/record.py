@@ -3,6 +3,8 @@
 A :class:`Record` is what every file is read into and what every later step starts from. Its units
 are volts, micrometres and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
 names the data exactly. Parts of a record are addressed by time: a window is the pair (start, stop).
+The voltage is known at every sample, since it drives the simulation; a displacement may be missing
+(nan), and what is missing is not judged.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, one_line
 
 __all__ = ["Record", "Split", "VoltageIs", "Window", "require_voltage_is"]
@@ -47,7 +49,7 @@ class Record:
     ----------
     voltage : array (samples,), V
     displacement : array (samples,), um, or None
-        None for a planned voltage without a measurement.
+        nan where the reading is missing; None for a planned voltage without a measurement.
     interval : float, s
         Sampling interval.
     start : float, s
@@ -64,8 +66,8 @@ class Record:
     Raises
     ------
     InputError
-        If an array is not a vector of finite numbers, lengths differ, the interval is not a
-        positive number, or `voltage_is` is unknown.
+        If an array is not a vector of finite numbers (of the displacement one is enough), lengths
+        differ, the interval is not a positive number, or `voltage_is` is unknown.
     """
 
     voltage: FloatArray
@@ -105,6 +107,18 @@ class Record:
     def duration(self) -> float:
         """Length of the record in s: samples times interval, the last one's included."""
         return self.samples * self.interval
+
+    @property
+    def has_reading(self) -> BoolArray:
+        """Whether the displacement was read, (samples,)."""
+        if self.displacement is None:
+            return np.zeros(self.samples, dtype=np.bool_)
+        return ~np.isnan(self.displacement)
+
+    @property
+    def readings(self) -> int:
+        """Number of samples at which the displacement was read."""
+        return int(np.count_nonzero(self.has_reading))
 
     @property
     def range_voltage(self) -> tuple[float, float]:
@@ -150,16 +164,35 @@ class Record:
         """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
         return self._part(self.window_slice(start, stop))
 
-    def decimate(self, factor: int) -> Record:
-        """Return the record of every `factor`-th sample, from the first one on.
+    def upto(self, stop: float, first_reading: float | None = None) -> Record:
+        """Return the record before `stop`, without the readings before `first_reading` (both s).
 
-        No filter is applied: a filter would round off the voltage's turning points, which the
-        hysteresis remembers. Leaving samples out moves them too, by less than one new interval, so
-        the decimated voltage drives a hysteresis only approximately as the whole one does.
+        The voltage is kept from the first sample on: what it did before the readings that count is
+        the history that the hysteresis remembers.
+        """
+        end = self.window_slice(self.start if first_reading is None else first_reading, stop)
+        part = self._part(slice(0, end.stop))
+        return part if first_reading is None else part._without(slice(0, end.start))
+
+    def exclude(self, windows: Sequence[Window]) -> Record:
+        """Return the record without the readings in `windows`, pairs (start, stop) in s."""
+        left = self
+        for window in windows:
+            left = left._without(self.window_slice(*window))
+        return left
+
+    def decimate(self, factor: int) -> Record:
+        """Return the record with every `factor`-th reading, from the first one on.
+
+        Only readings are left out. The voltage keeps all its samples, because its turning points
+        are what the hysteresis remembers, and a thinned voltage would move them.
         """
         if factor != int(factor) or factor < 1:
             raise InputError(f"decimate: {factor} is not a whole number of samples; give 1 or more")
-        return self._part(slice(0, self.samples, int(factor)))
+        kept = np.flatnonzero(self.has_reading)[:: int(factor)]
+        left_out = np.ones(self.samples, dtype=np.bool_)
+        left_out[kept] = False
+        return self._without(left_out)
 
     def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
         """Return training windows, in order of time, and held-out ones as slices of this record.
@@ -192,9 +225,16 @@ class Record:
             voltage=self.voltage[part],
             displacement=None if self.displacement is None else self.displacement[part],
             truth=None if self.truth is None else self.truth[part],
-            interval=self.interval * (part.step or 1),
             start=self.start + self.interval * part.start,
         )
+
+    def _without(self, left_out: slice | BoolArray) -> Record:
+        """Return the record with the readings at `left_out` missing."""
+        if self.displacement is None:
+            return self
+        displacement = self.displacement.copy()
+        displacement[left_out] = np.nan
+        return replace(self, displacement=displacement)
 
 
 def require_voltage_is(text: str) -> VoltageIs:
@@ -222,7 +262,11 @@ def _frozen_vector(name: str, values: ArrayLike, samples: int) -> FloatArray:
         raise InputError(f"{name}: shape {vector.shape} is not a vector; give (samples,)")
     if vector.size != samples:
         raise InputError(f"{name}: {vector.size} samples, voltage has {samples}; give the same")
-    finite = np.isfinite(vector)
+    missing = np.isnan(vector) if name == "displacement" else np.zeros(samples, dtype=np.bool_)
+    if missing.all():
+        raise InputError(f"{name}: holds no reading; give at least one")
+    vector[missing] = np.nan  # one nan for all, as there are many and a digest tells them apart
+    finite = np.isfinite(vector) | missing
     if not finite.all():
         sample = int(np.argmin(finite))
         raise InputError(f"{name}: {vector[sample]} at sample {sample}; give finite numbers")

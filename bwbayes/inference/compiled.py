@@ -8,67 +8,86 @@ rest of the work is compiled still.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import kernels
-from bwbayes.inference.noise import LOG_TWO_PI, Noise, SteadyState
+from bwbayes.inference import kernels, lanes
+from bwbayes.inference.noise import Noise, SteadyState
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.linear import Recursion
 
-__all__ = ["log_likelihood"]
+__all__ = ["moments"]
+
+# Elements (models x samples) of h that is worked out beforehand, at a time.
+LARGEST = 1 << 23
 
 
-def log_likelihood(
+def moments(
     theta: FloatArray,
     voltage: FloatArray,
     displacement: FloatArray,
-    training: Sequence[slice],
+    skipped: FloatArray,
     actuator: Actuator,
     noise: Noise,
-) -> FloatArray:
-    """Log likelihood (models,) at θ (models, parameters), inside the model's domain.
+    offset: int,
+    free: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return products and log determinants as :class:`~bwbayes.inference.likelihood.Moments` does.
 
-    ``voltage`` and ``displacement`` are (samples,), V and um, from the record's first sample on;
-    the columns of θ are the actuator's parameters followed by the noise's.
+    Parameters
+    ----------
+    theta
+        (models, parameters), those of the actuator and of the noise, inside the model's domain.
+    voltage, displacement
+        (samples,), V and um, from the record's first sample to its last reading.
+    skipped
+        (samples,) readings that are missing just before one; −1 where there is none.
+    actuator, noise
+        The model; the noise for the interval between readings.
+    offset, free
+        How many offsets and free responses of the dynamics are unknown.
     """
     column = dict(zip((*actuator.parameters, *noise.parameters), theta.T, strict=True))
     steady = noise.steady_state(theta[:, len(actuator.parameters) :])
+    models = _models(column, float(voltage[0]), actuator.recursion(column), steady)
     closed = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
-    recursion = actuator.recursion(column)
-    models = _models(column, float(voltage[0]), recursion.numerator, recursion.denominator, steady)
-    windows = np.array([(window.start, window.stop) for window in training], dtype=np.int64)
-    samples = int(windows[-1, 1])
-    result = np.empty(theta.shape[0])
-    for rows in (closed, ~closed):
-        if rows.any():
-            known = np.empty((int(rows.sum()), 0))
-            if rows is not closed:
-                names = ("alpha", "beta", "gamma", "exponent", "initial")
-                part = {name: column[name][rows] for name in names}
-                known = hysteresis(voltage[:samples], **part)
-            found = kernels.sums(voltage, displacement, windows, models[rows], known)
-            kept = SteadyState(*(values[rows] for values in steady))
-            result[rows] = sum(
-                _log_density(kept, one, window[1] - window[0])
-                for one, window in zip(found, windows.tolist(), strict=True)
-            )
-    return result
+    sums = np.empty((lanes.SUMS, len(theta)))
+    record = voltage, displacement, skipped
+    if closed.any():
+        unknown = np.empty((int(closed.sum()), 0))
+        sums[:, closed] = kernels.sums(*record, models[closed], unknown, offset, free)
+    others = np.flatnonzero(~closed)
+    size = max(LARGEST // voltage.size, 1)
+    for rows in (others[i : i + size] for i in range(0, others.size, size)):
+        names = ("alpha", "beta", "gamma", "exponent", "initial")
+        known = hysteresis(voltage, **{name: column[name][rows] for name in names})
+        sums[:, rows] = kernels.sums(*record, models[rows], known, offset, free)
+    size = 1 + offset + free
+    products = np.empty((len(theta), size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
+    readings = np.count_nonzero(skipped >= 0)
+    log_determinant = readings * np.log(steady.variance) + sums[lanes.LOG_RATIO]
+    return products, log_determinant
 
 
 def _models(
     column: Mapping[str, FloatArray],
     first_voltage: float,
-    numerator: FloatArray,
-    denominator: FloatArray,
+    recursion: Recursion,
     steady: SteadyState,
 ) -> FloatArray:
     """Return the kernel's parameters, (models, parameters)."""
-    nothing = np.zeros(numerator.shape[0])
-    b = [*numerator.T, nothing, nothing]
-    a = [*denominator.T, nothing, nothing]
+    nothing = np.zeros(steady.kept.size)
+    b = [*recursion.numerator.T, nothing, nothing]
+    a = [*recursion.denominator.T, nothing, nothing]
+    free = np.zeros((nothing.size, 2, 2))
+    unknowns, memory = recursion.free.shape[1:]
+    free[:, :unknowns, :memory] = recursion.free
     rest = column["d"] * first_voltage - column["initial"]
     rows = {
         "initial": column["initial"],
@@ -83,26 +102,17 @@ def _models(
         "b2": b[2],
         "a1": a[1],
         "a2": a[2],
+        "kept": steady.kept,
         "decay": np.exp(steady.log_decay),
         # φ − a, without its cancellation.
         "gain": steady.kept * steady.predicted / steady.variance,
-        "share": steady.surplus / (steady.surplus + steady.variance),
+        "predicted": steady.predicted,
+        "variance": steady.variance,
+        "surplus": steady.surplus,
+        "rate": steady.rate,
+        "free_11": free[:, 0, 0],
+        "free_12": free[:, 0, 1],
+        "free_21": free[:, 1, 0],
+        "free_22": free[:, 1, 1],
     }
-    return np.stack([rows[name] for name in kernels.PARAMETERS], axis=1)
-
-
-def _log_density(steady: SteadyState, sums: FloatArray, samples: int) -> FloatArray:
-    """Log density (models,) of a window from the kernel's sums (3, models).
-
-    As in :class:`~bwbayes.inference.noise.DiscrepancyNoise`, but with innovations η' that count
-    from a first estimate ξ₀ = δ r₀ / (δ + S) of the start instead of zero:
-
-        Σ(η − aᵗ ξ̂)²/S + ξ̂²/δ = Σ η'²/S + δ e² − δ (B' − e)² / (1 + δ A),   e = r₀ / (δ + S).
-    """
-    squares, pull, first = sums
-    gain = steady.start_gain(samples)
-    e = first / (steady.surplus + steady.variance)
-    start = e**2 - (pull / steady.variance - e) ** 2 / gain
-    logs = samples * (np.log(steady.variance) + LOG_TWO_PI) + np.log(gain)
-    density: FloatArray = -0.5 * (squares / steady.variance + steady.surplus * start + logs)
-    return density
+    return np.stack([rows[name] for name in lanes.PARAMETERS], axis=1)

@@ -1,15 +1,25 @@
-"""Default priors: broad, and from the record's ranges alone.
+"""Default priors: broad, and from the record's ranges and the drive's own times alone.
 
-With Y half the range of the displacement, U half the range of the voltage and Δ the sampling
-interval, every scale of the model is known to within a factor of a few: d is near Y/U, α a part of
-it, β near 1/U, a lag some samples, the sensor's noise some thousandth of the range, and what the
-model leaves over anything from nothing to a tenth of it, correlated over some hundreds of samples.
-These priors never come from a fit, so the data are not
-used twice; they are resolved once to explicit numbers, which a run prints and stores.
+With Y half the range of the displacement, U half the range of the voltage and T the typical time
+from one turning point of the drive to the next, every scale of the model is known to within a
+factor of a few: d is Y/U or twice that, α a part of it, β near 1/U, a lag some hundredth of T, the
+sensor's noise some thousandth of the range, and what the model leaves over anything from nothing to
+a tenth of it, correlated over about half a stretch from turn to turn. The sampling rate does not
+enter: a record and its every k-th sample have the same priors.
+
+The ranges are those of the training data, displacement included, so strictly the data are used
+twice: once for these scales, once for the fit. The priors are wide enough that this does not show
+(every one holds a factor of several), and they never come from a fit. They are resolved once to
+explicit numbers, which a run prints and stores.
+
+With half a range below about a third of 1/β a small drive shows no loop that closes; then these
+priors, not the record, say how large β is, and leave room for the value that a large drive shows.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,8 +27,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.drive import time_between_turns
 
-__all__ = ["CATALOGUE", "Meaning", "Ranges", "default_prior"]
+__all__ = ["CATALOGUE", "Defaults", "Meaning", "Ranges", "default_prior"]
 
 
 class Meaning(NamedTuple):
@@ -52,65 +63,160 @@ class Ranges:
     """All that a default prior may know of a record.
 
     ``voltage`` is U, half the range of the voltage, V; ``displacement`` is Y, um; ``middle`` the
-    middle of the displacement's range, um; ``interval`` is Δ, s.
+    middle of the displacement's range, um; ``time`` is T, the typical time between turning points
+    of the drive, s; ``bias`` the middle of the voltage's range, V.
     """
 
     voltage: float
     displacement: float
     middle: float
-    interval: float
+    time: float
+    bias: float = 0.0
 
     @classmethod
-    def of(cls, voltage: FloatArray, displacement: FloatArray, interval: float) -> Ranges:
-        """Take the ranges of a voltage (samples,) and a displacement (samples,)."""
-        low, high = float(np.min(displacement)), float(np.max(displacement))
-        return cls(float(np.ptp(voltage)) / 2, (high - low) / 2, (high + low) / 2, interval)
+    def of(
+        cls,
+        voltage: FloatArray,
+        displacement: FloatArray,
+        interval: float,
+        windows: Sequence[slice] = (slice(None),),
+    ) -> Ranges:
+        """Take the ranges within windows of a record.
+
+        ``voltage`` and ``displacement`` are the whole record's, (samples,), V and um; a missing
+        reading is NaN; ``interval`` is the sampling interval, s.
+        """
+        volts = np.concatenate([voltage[window] for window in windows])
+        readings = np.concatenate([displacement[window] for window in windows])
+        low, high = float(np.nanmin(readings)), float(np.nanmax(readings))
+        return cls(
+            voltage=float(np.ptp(volts)) / 2,
+            displacement=(high - low) / 2,
+            middle=(high + low) / 2,
+            time=time_between_turns(voltage, interval, windows),
+            bias=float(np.min(volts) + np.max(volts)) / 2,
+        )
 
 
 def default_prior(
-    name: str, ranges: Ranges, exponent: float = 1.0, stiffness: float | None = None
+    name: str,
+    ranges: Ranges,
+    exponent: float | Distribution = 1.0,
+    stiffness: float | None = None,
+    *,
+    gamma_free: bool = True,
 ) -> Distribution | float:
     """Return a parameter's default prior, or the value at which it is fixed by default.
 
-    The exponent is one unless a config frees it. ``exponent`` sets the unit of β and γ,
-    ``stiffness`` the damping that gives a lag of some samples; mass and stiffness have no default
-    (a record shows at most their ratio to the damping).
+    The exponent is one unless a config frees it. ``exponent``, its value or its prior, sets the
+    scale of β and γ; ``stiffness`` the damping that gives a lag of some hundredth of T; mass and
+    stiffness have no default (a record shows at most their ratio to the damping). ``gamma_free``:
+    whether γ has a prior, which cuts β's.
 
     Raises
     ------
     KeyError
         No default exists for that name.
     """
-    voltage, displacement, interval = ranges.voltage, ranges.displacement, ranges.interval
+    voltage, displacement, time = ranges.voltage, ranges.displacement, ranges.time
     gain = displacement / voltage
-    # β |h|^(n-1) is a rate per volt; h is some fifth of the displacement.
-    rate = (0.2 * displacement) ** (1 - exponent) / voltage
+    # What the voltage's distance from zero may add to offset and hysteresis.
+    reach = displacement + gain * abs(ranges.bias)
+    low, middle, high = (_log_rate(n, ranges) for n in _likely(exponent))
     priors: dict[str, Distribution | float] = {
-        "d": _lognormal(1.2 * gain, 0.4),
-        "alpha": _lognormal(0.4 * gain, 0.7),
-        "beta": _lognormal(1.5 * rate, 0.8),
-        "gamma": Distribution("normal", {"mean": 0.0, "sd": _round(1.5 * rate)}),
-        "exponent": 1.0,
-        "initial": Distribution("normal", {"mean": 0.0, "sd": _round(0.3 * displacement)}),
-        "lag": _lognormal(3 * interval, 1.0),
-        "offset": Distribution(
-            "normal", {"mean": _round(ranges.middle), "sd": _round(displacement)}
+        # A drive that is small for the loop shows d - α, which may be half of d.
+        "d": _lognormal(1.6 * gain, 0.6),
+        "alpha": _lognormal(0.7 * gain, 1.0),
+        "beta": _lognormal(
+            (BETA if gamma_free else 1.0) * _exp(middle), math.hypot(BETA_SIGMA, (high - low) / 4)
         ),
-        "sensor_sd": _lognormal(0.006 * displacement, 1.5),
+        "gamma": Distribution("normal", {"mean": 0.0, "sd": _round(GAMMA * _exp(max(low, high)))}),
+        "exponent": 1.0,
+        "initial": Distribution("normal", {"mean": 0.0, "sd": _round(0.3 * reach)}),
+        "lag": _lognormal(0.01 * time, 2.0),
+        "offset": Distribution(
+            "normal",
+            {"mean": _round(ranges.middle, displacement), "sd": _round(reach)},
+        ),
+        "sensor_sd": _lognormal(0.006 * displacement, 2.0),
         # Not even its order of magnitude is known. A prior that is level down to zero would claim
         # some discrepancy where there is none, and make a right model's bands too wide.
         "discrepancy_sd": _lognormal(1e-5 * displacement, 4.0),
-        "discrepancy_time": _lognormal(250 * interval, 0.8),
+        "discrepancy_time": _lognormal(0.5 * time, 0.8),
     }
     if stiffness is not None:
-        priors["damping"] = _lognormal(3 * interval * stiffness, 1.0)
+        priors["damping"] = _lognormal(0.01 * time * stiffness, 2.0)
     return priors[name]
 
 
+@dataclass(frozen=True)
+class Defaults:
+    """The default priors of one record and model; the arguments are :func:`default_prior`'s."""
+
+    ranges: Ranges
+    exponent: float | Distribution = 1.0
+    stiffness: float | None = None
+    gamma_free: bool = True
+
+    def of(self, name: str) -> Distribution | float:
+        """Return a parameter's default, as :func:`default_prior` does."""
+        return default_prior(
+            name, self.ranges, self.exponent, self.stiffness, gamma_free=self.gamma_free
+        )
+
+    def priors(self, names: Collection[str]) -> dict[str, Distribution]:
+        """Return the default priors of those of the parameters that have one."""
+        without = {"exponent", "mass", "stiffness"}
+        if self.stiffness is None:
+            without.add("damping")
+        known = {name: self.of(name) for name in names if name not in without}
+        return {name: prior for name, prior in known.items() if isinstance(prior, Distribution)}
+
+
+# Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
+# what is left for β has its median a little above 1/U, and room for a factor of thirty either way.
+BETA, BETA_SIGMA = 0.15, 2.3
+GAMMA = 4.0
+
+# Beyond this the hysteresis hardly changes: a prior that goes further still gets a scale for this.
+LARGEST_EXPONENT = 20.0
+
+
+def _log_rate(exponent: float, ranges: Ranges) -> float:
+    """Return the logarithm of the scale of β and γ, um^(1-n)/V.
+
+    β |h|^(n-1) is a rate per volt, about 1/U; h is some fifth of the displacement.
+    """
+    return (1 - exponent) * math.log(0.2 * ranges.displacement) - math.log(ranges.voltage)
+
+
+def _exp(logarithm: float) -> float:
+    """Return the exponential, or a number that is out of proportion instead of an overflow."""
+    return math.exp(min(logarithm, 700.0))
+
+
+def _likely(exponent: float | Distribution) -> tuple[float, float, float]:
+    """Return the exponent's 2.5 %, 50 % and 97.5 % quantiles above one."""
+    if not isinstance(exponent, Distribution):
+        return exponent, exponent, exponent
+    below = float(exponent.frozen.cdf(1.0))
+    if below >= 1:
+        return 1.0, 1.0, 1.0
+    likely = exponent.frozen.ppf(below + (1 - below) * np.array([0.025, 0.5, 0.975]))
+    low, middle, high = (float(n) for n in np.minimum(likely, LARGEST_EXPONENT))
+    return low, middle, high
+
+
 def _lognormal(median: float, sigma: float) -> Distribution:
-    return Distribution("lognormal", {"median": _round(median), "sigma": sigma})
+    return Distribution("lognormal", {"median": _round(median), "sigma": _round(sigma)})
 
 
-def _round(value: float) -> float:
-    """Keep three digits: a default prior is not more exact than that, and people read it."""
-    return float(f"{value:.3g}")
+def _round(value: float, scale: float | None = None) -> float:
+    """Keep three digits of the value, or of another ``scale`` that it need not be more exact than.
+
+    A default prior is not more exact than that, and people read it.
+    """
+    size = abs(value if scale is None else scale)
+    if not size > 0:
+        return value
+    return round(value, 2 - math.floor(math.log10(size)))

@@ -9,17 +9,22 @@ posterior itself, which trusts the noise model, may look surer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.diagnostics import pareto_k
+from bwbayes.inference.drive import turning_points
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.parameters import POSITIVE, Parameter
+from bwbayes.inference.parameters import POSITIVE, JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.boucwen import monotone_stretches
 
-__all__ = ["spectrum", "undetermined"]
+__all__ = ["Sway", "remarks", "spectrum", "sway", "undetermined"]
 
 # Parameters that together make the loop. The others only have to be found beside them.
 LOOP = ("d", "alpha", "beta", "gamma", "exponent")
@@ -33,6 +38,42 @@ SAME_START = 0.01
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
 
+# The prior decides where one twice as wide moves a mean by this part of its sd, or widens it so.
+MOVED, WIDENED = 0.3, 1.2
+
+# It decides, too, where the posterior is wider than this part of the prior's sd.
+WIDE = 0.7
+
+# Draws that priors are widened on, the Pareto k̂ (of weights at these draws) and the effective
+# draws at which that is still believed.
+DRAWS, BELIEVED_K, BELIEVED_DRAWS = 20_000, 0.7, 100
+
+# Swings of a drive differ where the smallest of them is smaller by more than this part.
+ALIKE = 0.2
+
+# A loop closes where β times half the voltage's range is about one; below this it hardly opens.
+SMALL = 0.3
+
+
+class Sway(NamedTuple):
+    """How far priors twice as wide move the posterior, or that this cannot be told.
+
+    ``moved`` is the largest shift of a mean, in sds; ``widened`` the largest ratio of sds; ``name``
+    the parameter that moves most; ``part`` the largest posterior sd, in prior sds. Unless ``told``,
+    the draws do not reach as far as the wider prior leads.
+    """
+
+    name: str
+    moved: float
+    widened: float
+    part: float
+    told: bool
+
+    @property
+    def decides(self) -> bool:
+        """Whether the prior decides."""
+        return self.moved >= MOVED or self.widened >= WIDENED or self.part > WIDE
+
 
 def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
     """Name the combinations of loop parameters that the record does not determine.
@@ -45,6 +86,114 @@ def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
         return []
     parts, directions = spectrum(posterior, point)
     return [_combination(d, names) for d in directions.T[parts > LEFT_OPEN]]
+
+
+def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[str]:
+    """Say, a line each, what the record does not tell, what decides then, and what to measure.
+
+    Parameters
+    ----------
+    posterior, point
+        The posterior and its point fit.
+    draws
+        (draws, free), of the posterior or of its Gaussian approximation
+        (:func:`bwbayes.inference.conflict.around`).
+    """
+    names = [posterior.names[i] for i in _columns(posterior, LOOP)]
+    if not names:
+        return []
+    parts, directions = spectrum(posterior, point)
+    found = []
+    for i in np.flatnonzero(parts > LEFT_OPEN):
+        combination = _combination(directions[:, i], names)
+        text = f"the record does not determine {combination}: {parts[i]:.0%} of the prior's sd left"
+        if i + 1 < parts.size:
+            following = _combination(directions[:, i + 1], names)
+            text += f", next {following} with {parts[i + 1]:.0%}"
+        members = [name for name in names if name in combination.split()]
+        decider = _decider(posterior.prior, draws, members)
+        found.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
+    return found
+
+
+def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
+    """Widen the priors of some parameters to twice their sd, and see how far the draws move.
+
+    By importance: a draw counts as much more as the wider prior thinks it more probable. Widened
+    are the stated priors, in their normal scores; the constraints stay.
+    """
+    thinned = draws[:: max(draws.shape[0] // DRAWS, 1)]
+    log_weights, parts = np.zeros(thinned.shape[0]), []
+    for parameter in prior.free:
+        if parameter.name in names:
+            assert parameter.prior is not None
+            low, high = (np.asarray(end) for end in parameter.support)
+            column = thinned[:, prior.free_names.index(parameter.name)]
+            scores = np.clip(parameter.prior.to_normal(column, low, high), -37, 37)
+            # log N(z; 0, 2²) − log N(z; 0, 1), up to a constant.
+            log_weights += 0.375 * scores**2
+            parts.append(float(np.std(scores)))
+    weights = np.exp(log_weights - np.max(log_weights))
+    weights /= np.sum(weights)
+    shape = pareto_k(log_weights)
+    # That k̂ belongs to the way back; see there.
+    told = shape < BELIEVED_K / (1 + BELIEVED_K) and 1 / np.sum(weights**2) > BELIEVED_DRAWS
+    columns = thinned[:, [prior.free_names.index(name) for name in names]]
+    mean, sd = np.mean(columns, axis=0), np.std(columns, axis=0) + 1e-300
+    wider = weights @ columns
+    widened = np.sqrt(weights @ (columns - wider) ** 2) / sd
+    moved = np.abs(wider - mean) / sd
+    return Sway(
+        name=names[int(np.argmax(moved))],
+        moved=float(moved.max()),
+        widened=float(widened.max()),
+        part=max(parts, default=0.0),
+        told=bool(told),
+    )
+
+
+def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
+    """Say whether the prior decides about some parameters."""
+    if "gamma" in names and "beta" in prior.free_names:
+        ratio = draws[:, prior.free_names.index("gamma")]
+        ratio = ratio / draws[:, prior.free_names.index("beta")]
+        # A ratio that may be anything between -1 and 1 has a sd of 0.58.
+        if np.max(np.abs(ratio)) <= 1 and np.std(ratio) > 0.45:
+            return "only |gamma| <= beta bounds gamma"
+    found = sway(prior, draws, names)
+    if found.part > WIDE:
+        return f"the prior decides there: the posterior has {found.part:.0%} of its sd"
+    if not found.told:
+        return "whether the prior decides there cannot be told from these draws"
+    if found.decides:
+        return (
+            f"the prior decides there: one twice as wide moves {found.name} by {found.moved:.1f} "
+            f"of its sd and makes an interval {found.widened:.1f} times as wide"
+        )
+    return (
+        f"the prior does not decide there (one twice as wide moves nothing by more than "
+        f"{found.moved:.1f} of its sd) but the noise model, which may be too sure"
+    )
+
+
+def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> str:
+    """Say what to measure instead."""
+    swings, half = [], 0.0
+    for window in posterior.training:
+        voltage = posterior.voltage[window]
+        half = max(half, float(np.ptp(voltage)) / 2)
+        swings += np.abs(np.diff(voltage[turning_points(voltage)])).tolist()
+    if "beta" in posterior.names:
+        beta = draws[:, posterior.names.index("beta")]
+        if "exponent" not in posterior.names and float(np.median(beta)) * half < SMALL:
+            return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+    if len(swings) < 2:
+        return "drive the actuator up and down several times, with decreasing amplitude"
+    if min(swings) > (1 - ALIKE) * max(swings):
+        return "vary the amplitude: let it decay to a tenth over ten periods"
+    if "gamma" in names:
+        return "turn at more voltages within the range, or come closer to zero amplitude"
+    return "add larger and smaller amplitudes"
 
 
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -100,14 +249,14 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     sds = posterior.noise.marginal_sd(theta[:, len(posterior.actuator.parameters) :])
-    floor = DISCREPANCY * float(np.ptp(posterior.displacement[rows]))
+    floor = DISCREPANCY * float(np.ptp(posterior.readings.values))
     weights, duration = _stretches(posterior.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sds[1][0], floor, duration / 2]])
     total = np.zeros((slopes.shape[0], slopes.shape[0]))
     for window in windows:
-        white = noise.whiten(values, slopes[:, window])
+        (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])
         total += (white * weights[window]) @ white.T
     return total
 

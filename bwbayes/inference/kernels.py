@@ -5,10 +5,14 @@ sample, for ``LANES`` models at once, so that a processor's vector instructions 
 a step and nothing larger than a cache is written. A few dozen samples at a time pass two stages:
 
     drive        hysteresis, and the drive w = d u − h it leaves
-    innovations  linear dynamics, the noise's steady-state filter, and the sums its density needs
+    innovations  linear dynamics, the noise's filter, and the sums its density needs
 
-The state of all models is one flat array of rows of ``LANES`` numbers, because a compiler can tell
-that rows of one array do not overlap. This module needs numba; it knows arrays and nothing else.
+The second stage has two forms. Most of a record passes :func:`_settled`: each sample has a reading,
+and the filter is in its steady state. Where readings are missing, or the filter is not settled, or
+still hears of the unknown start, the samples pass :func:`_exact`.
+
+The state of all models is one flat array, laid out in :mod:`bwbayes.inference.lanes`. This module
+needs numba; it knows arrays and nothing else.
 """
 
 from __future__ import annotations
@@ -18,35 +22,30 @@ import math
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 
-__all__ = ["LANES", "PARAMETERS", "sums"]
+# isort: off
+# fmt: off
+from bwbayes.inference.lanes import (
+    A1, A2, AGAINST, AHEAD, ALPHA, B0, B1, B2, BEFORE, D, DECAY, ESTIMATE, FREE, GAIN, H,
+    INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS,
+    PHI, PREDICTED, PRODUCTS, RATE, RATIO, REST, SQUARES, STATE, SUMS, SURPLUS, TRUST, UNSURE,
+    VALUE, VARIANCE, X1, X2, Z,
+)
+# fmt: on
+# isort: on
 
-# Models side by side: four vector registers of eight numbers, which hide each other's latency.
-LANES = 32
+__all__ = ["sums"]
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
-
-# Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
-PARAMETERS = (
-    "initial", "alpha", "against", "ahead", "d", "rest", "level",
-    "b0", "b1", "b2", "a1", "a2", "decay", "gain", "share",
-)  # fmt: skip
-(H, ALPHA, AGAINST, AHEAD, D, REST, LEVEL, B0, B1, B2, A1, A2, DECAY, GAIN, SHARE) = (
-    LANES * row for row in range(len(PARAMETERS))
-)
-X1, X2, ESTIMATE, POWER, INNOVATION, SQUARES, PULL, FIRST, BEFORE, Z, PHI = (
-    LANES * (len(PARAMETERS) + row) for row in range(11)
-)
-STATE = LANES * (len(PARAMETERS) + 11)
 
 # φ(z) = (1 − exp(−z)) / z by its series, to 3e-14 of itself up to this z; doubled beyond.
 SHORT = 0.1
 C1, C2, C3, C4, C5, C6, C7 = -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040, -1 / 40320
 
-# Powers of the filter's decay below this add nothing to the start's correction.
-FORGOTTEN = 1e-18
+# What is below this part of its size at the start adds nothing.
+FORGOTTEN = 1e-20
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -155,25 +154,24 @@ def _given(
     voltage: FloatArray,
     first: int,
     last: int,
-    hysteretic: FloatArray,
+    known: FloatArray,
     out: FloatArray,
 ) -> None:
     """Write w − w₀ for h (lanes, samples) that is known already."""
     for t in range(first, last):
         for i in range(LANES):
-            w = state[D + i] * voltage[t] - hysteretic[i, t]
-            out[(t - first) * LANES + i] = w - state[REST + i]
+            out[(t - first) * LANES + i] = state[D + i] * voltage[t] - known[i, t] - state[REST + i]
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _innovations(
+def _settled(
     state: FloatArray, displacement: FloatArray, first: int, last: int, drive: FloatArray
 ) -> None:
     """Let the dynamics follow the drive, and the noise's filter what the measurement has beyond.
 
-    One loop for both, which writes to the state alone: so the compiler can use vectors.
+    Every sample has a reading and the filter is in its steady state. One loop for both, which
+    writes to the state alone: so the compiler can use vectors.
     """
-    remembered = _remembered(state)
     for t in range(first, last):
         y = displacement[t]
         row = (t - first) * LANES
@@ -187,34 +185,122 @@ def _innovations(
             innovation = residual - estimate
             state[ESTIMATE + i] = state[DECAY + i] * estimate + state[GAIN + i] * residual
             state[SQUARES + i] += innovation * innovation
-            state[INNOVATION + i] = innovation
-        if remembered:
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _exact(
+    state: FloatArray,
+    displacement: FloatArray,
+    skipped: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
+    offset: int,
+    free: int,
+) -> None:
+    """Do the same for any samples, any state of the filter, and the responses of the start.
+
+    ``skipped`` is negative where there is no reading. ``offset`` and ``free`` count the responses
+    that are followed.
+    """
+    series = 1 + offset + free
+    for t in range(first, last):
+        row = (t - first) * LANES
+        for i in range(LANES):
+            w = drive[row + i]
+            x = state[B0 + i] * w + state[X1 + i]
+            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
+            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
+            state[VALUE + i] = displacement[t] - state[LEVEL + i] - x
+        for k in range(1 + offset, series):
+            at = k * LANES
             for i in range(LANES):
-                state[PULL + i] += state[POWER + i] * state[INNOVATION + i]
-                state[POWER + i] *= state[DECAY + i]
+                x = state[KEEP_1 + at + i]
+                state[KEEP_1 + at + i] = state[KEEP_2 + at + i] - state[A1 + i] * x
+                state[KEEP_2 + at + i] = -state[A2 + i] * x
+                state[VALUE + at + i] = x
+        if skipped[t] < 0.0:
+            continue
+        if skipped[t] > 0.0:
+            _skip(state, skipped[t], series)
+        for i in range(LANES):
+            ratio = state[UNSURE + i] / state[VARIANCE + i]
+            inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
+            state[RATIO + i] *= 1.0 + ratio
+            state[TRUST + i] = (state[PREDICTED + i] + state[UNSURE + i]) * inverse
+            state[UNSURE + i] *= state[DECAY + i] * state[DECAY + i] * state[VARIANCE + i] * inverse
+            state[INVERSE + i] = inverse
+        pair = PRODUCTS
+        for k in range(series):
+            at = k * LANES
+            for i in range(LANES):
+                estimate = state[ESTIMATE + at + i]
+                innovation = state[VALUE + at + i] - estimate
+                estimate += state[TRUST + i] * innovation
+                state[ESTIMATE + at + i] = state[KEPT + i] * estimate
+                state[INNOVATION + at + i] = innovation
+            for j in range(k + 1):
+                other = j * LANES
+                for i in range(LANES):
+                    product = state[INNOVATION + at + i] * state[INNOVATION + other + i]
+                    state[pair + i] += product * state[INVERSE + i]
+                pair += LANES
+    _take_logs(state)
 
 
 @njit(nogil=True, cache=True)
-def _remembered(state: FloatArray) -> bool:
-    """Tell whether any model's filter remembers its start."""
-    longest = 0.0
+def _skip(state: FloatArray, readings: float, series: int) -> None:
+    """Let the filter pass over missing readings; before one, the product of variances is logged."""
+    _take_logs(state)
     for i in range(LANES):
-        longest = max(longest, state[POWER + i])
-    return longest > FORGOTTEN
+        kept = math.exp(-readings * state[RATE + i])
+        fresh = -math.expm1(-2.0 * readings * state[RATE + i])
+        state[UNSURE + i] = kept * kept * state[UNSURE + i] + fresh * state[SURPLUS + i]
+        for k in range(series):
+            state[ESTIMATE + k * LANES + i] *= kept
 
 
 @njit(nogil=True, cache=True)
-def _begin(state: FloatArray) -> None:
-    """Start the noise's filter at a window's first sample, whose residual is the innovation."""
+def _take_logs(state: FloatArray) -> None:
+    """Move the product of variances to the sum of logs, before it gets too large."""
     for i in range(LANES):
-        # From the residual's own estimate of the discrepancy: what is left to correct is small.
-        r = state[INNOVATION + i]
-        state[FIRST + i] = r
-        estimate = state[SHARE + i] * r
-        state[ESTIMATE + i] = state[DECAY + i] * estimate + state[GAIN + i] * r
-        state[PULL + i] = r - estimate
-        state[SQUARES + i] = (r - estimate) ** 2
-        state[POWER + i] = state[DECAY + i]
+        state[LOG + i] += math.log(state[RATIO + i])
+        state[RATIO + i] = 1.0
+
+
+@njit(nogil=True, cache=True)
+def _is_settled(state: FloatArray) -> bool:
+    """Tell whether all models' filters are in their steady state."""
+    unsure, variance = state[UNSURE : UNSURE + LANES], state[VARIANCE : VARIANCE + LANES]
+    return bool(np.max(unsure / variance) <= FORGOTTEN)
+
+
+@njit(nogil=True, cache=True)
+def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
+    """Tell whether any model's filter still hears of the unknown start."""
+    if offset > 0:
+        return True
+    for i in range(LANES, (1 + free) * LANES):
+        left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
+        if left > FORGOTTEN:
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True)
+def _begin(state: FloatArray, offset: int, free: int) -> None:
+    """Put all that a model remembers to the record's first sample."""
+    for i in range(len(PARAMETERS) * LANES, STATE):
+        state[i] = 0.0
+    for i in range(LANES):
+        state[RATIO + i] = 1.0
+        state[UNSURE + i] = state[SURPLUS + i]
+        if offset > 0:
+            state[VALUE + LANES + i] = 1.0
+        for k in range(free):
+            at = (1 + offset + k) * LANES + i
+            state[KEEP_1 + at] = state[FREE + 2 * k * LANES + i]
+            state[KEEP_2 + at] = state[FREE + (2 * k + 1) * LANES + i]
 
 
 @njit(nogil=True, cache=True)
@@ -222,38 +308,45 @@ def _group(
     state: FloatArray,
     voltage: FloatArray,
     displacement: FloatArray,
-    windows: IntArray,
+    skipped: FloatArray,
     hysteretic: FloatArray,
+    offset: int,
+    free: int,
     result: FloatArray,
 ) -> None:
-    """Walk one group of models through the record; ``result`` (windows, 3, LANES)."""
+    """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
     steepest = 0.0
     for i in range(LANES):
         steepest = max(steepest, state[AHEAD + i], state[AGAINST + i])
-        state[X1 + i] = state[X2 + i] = state[POWER + i] = 0.0
+    _begin(state, offset, free)
     drive = _aligned(PIECE * LANES)
-    now = 0
-    for k in range(windows.shape[0]):
-        start, stop = windows[k, 0], windows[k, 1]
-        while now < stop:
-            # A window's first sample goes alone: the filter starts there.
-            last = min(now + PIECE, start if now < start else start + 1 if now == start else stop)
-            if hysteretic.shape[1] > 0:
-                _given(state, voltage, now, last, hysteretic, drive)
-            else:
-                _drive(state, voltage, now, last, steepest, drive)
-            if now == start:
-                # Without an estimate the innovation is the residual.
-                for i in range(LANES):
-                    state[ESTIMATE + i] = 0.0
-            _innovations(state, displacement, now, last, drive)
-            if now == start:
-                _begin(state)
-            now = last
-        for i in range(LANES):
-            result[k, 0, i] = state[SQUARES + i]
-            result[k, 1, i] = state[PULL + i]
-            result[k, 2, i] = state[FIRST + i]
+    now, settled, heard = 0, False, True
+    while now < voltage.size:
+        last = min(now + PIECE, voltage.size)
+        plain = settled and not heard and skipped[now] == 0.0
+        if plain:
+            # As far as every sample has a reading.
+            end = now
+            while end < last and skipped[end] == 0.0:
+                end += 1
+            last = end
+        if hysteretic.shape[1] > 0:
+            _given(state, voltage, now, last, hysteretic, drive)
+        else:
+            _drive(state, voltage, now, last, steepest, drive)
+        if plain:
+            _settled(state, displacement, now, last, drive)
+        else:
+            followed = free if heard else 0
+            _exact(state, displacement, skipped, now, last, drive, offset, followed)
+            settled = _is_settled(state)
+            heard = heard and _is_heard(state, offset, free)
+        now = last
+    for i in range(LANES):
+        state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]
+        for pair in range(PAIRS):
+            result[pair, i] = state[PRODUCTS + pair * LANES + i]
+        result[LOG_RATIO, i] = state[LOG + i]
 
 
 @njit(nogil=True, cache=True)
@@ -268,42 +361,40 @@ def _aligned(size: int) -> FloatArray:
 def sums(
     voltage: FloatArray,
     displacement: FloatArray,
-    windows: IntArray,
+    skipped: FloatArray,
     models: FloatArray,
     hysteretic: FloatArray,
+    offset: int,
+    free: int,
 ) -> FloatArray:
-    """Return what the noise's density needs of every window, (windows, 3, models).
+    """Return what the noise's density needs, (SUMS, models).
 
-    These are Σ η'², Σ aᵗ η' and the first residual, in um² and um; η' are the innovations of a
-    filter that starts at ``share`` of the first residual.
+    First Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of series:
+    the residual (um), the offset's response if ``offset`` is one, and ``free`` free responses. Then
+    Σ log S less that of the steady state.
 
     Parameters
     ----------
     voltage, displacement
         (samples,), V and um.
-    windows
-        (windows, 2), first and last sample (excluded) of each, ascending and apart.
+    skipped
+        (samples,) how many readings are missing just before one, −1 where there is none.
     models
         (models, parameters), the columns as in ``PARAMETERS``.
     hysteretic
         h, (models, samples), um, if it is known; (models, 0) to be worked out for n = 1.
     """
     count = models.shape[0]
-    result = np.empty((windows.shape[0], 3, count))
-    state = _aligned(STATE)
-    part = np.empty((windows.shape[0], 3, LANES))
-    known = np.empty((LANES, hysteretic.shape[1]))
+    result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
+    state, known = _aligned(STATE), np.empty((LANES, hysteretic.shape[1]))
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            for t in range(hysteretic.shape[1]):
-                known[i, t] = hysteretic[model, t]
-        _group(state, voltage, displacement, windows, known, part)
-        for k in range(windows.shape[0]):
-            for total in range(3):
-                for i in range(min(LANES, count - first)):
-                    result[k, total, first + i] = part[k, total, i]
+            known[i] = hysteretic[model]
+        _group(state, voltage, displacement, skipped, known, offset, free, part)
+        last = min(first + LANES, count)
+        result[:, first:last] = part[:, : last - first]
     return result

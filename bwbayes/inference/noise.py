@@ -1,4 +1,4 @@
-"""What the model leaves over: sensor noise, and honest discrepancy.
+"""The residual's noise: sensor noise, and honest discrepancy.
 
 The residual of a Bouc-Wen fit to a measured record is correlated over many samples: most of it is
 what the model does not know about the actuator. Calling it white makes the parameters look several
@@ -6,9 +6,8 @@ times better known than they are. So the residual is the sum of two parts,
 
     r(t) = x(t) + e(t),   x an Ornstein-Uhlenbeck process (sd σ, correlation time τ),   e white (s),
 
-and its exact log density costs one recursion over the samples: the innovations of the steady-state
-Kalman filter, which has constant coefficients, and one scalar correction for the start, where the
-filter is less sure than in the steady state.
+and a Kalman filter with one state turns it into independent innovations, whatever readings are
+missing. Its log density is theirs.
 """
 
 from __future__ import annotations
@@ -27,11 +26,16 @@ NoiseKind = Literal["white", "discrepancy"]
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
+# Stretches of evenly spaced readings from this length on go through the closed form, model by
+# model; shorter ones reading by reading, all models at once.
+LONG = 64
+
 
 class SteadyState(NamedTuple):
-    """The steady-state filter of a noise model; each (models,), names as in DiscrepancyNoise.
+    """The filter of a noise model in the long run; each (models,), names as in DiscrepancyNoise.
 
-    ``kept`` is φ, ``predicted`` p, ``variance`` S, ``surplus`` δ (um²) and ``log_decay`` log a.
+    ``kept`` is φ, ``predicted`` p, ``variance`` S, ``surplus`` δ = σ² − p, what the discrepancy's
+    own variance has beyond it (um²), ``log_decay`` log a, and ``rate`` is Δ/τ.
     """
 
     kept: FloatArray
@@ -39,11 +43,7 @@ class SteadyState(NamedTuple):
     variance: FloatArray
     surplus: FloatArray
     log_decay: FloatArray
-
-    def start_gain(self, samples: int) -> FloatArray:
-        """Return 1 + δ A (models,): how much the start's surplus counts over that many samples."""
-        powers = np.expm1(2 * samples * self.log_decay) / np.expm1(2 * self.log_decay)
-        return 1 + self.surplus / self.variance * powers
+    rate: FloatArray
 
 
 class Noise(Protocol):
@@ -52,6 +52,18 @@ class Noise(Protocol):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of θ's columns."""
+
+    def whiten(
+        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Turn series (models, series, readings) of each model into independent innovations.
+
+        ``theta`` is (models, parameters); ``skipped`` (readings,) counts the readings that are
+        missing just before each one, by default none, as in
+        :class:`~bwbayes.inference.readings.Readings`. Returns the innovations over their sds,
+        shaped as the series, and the log determinant (models,) of the covariance: with V = L Lᵀ
+        these are L⁻¹ series and log det V.
+        """
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
@@ -63,12 +75,20 @@ class Noise(Protocol):
         """Sd of the discrepancy and of the sensor, each (models,), um."""
 
     def at(self, interval: float) -> Noise:
-        """Return the same noise for samples ``interval`` seconds apart."""
+        """Return the same noise for readings ``interval`` seconds apart."""
 
 
 def noise_model(kind: NoiseKind, interval: float) -> Noise:
-    """Return the noise model of that name for samples ``interval`` seconds apart."""
+    """Return the noise model of that name for readings ``interval`` seconds apart."""
     return WhiteNoise() if kind == "white" else DiscrepancyNoise(interval)
+
+
+def _log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
+    """Log density (models,) of what was whitened (models, 1, readings)."""
+    readings = white.shape[2]
+    squares = np.sum(white[:, 0] ** 2, axis=1)
+    density: FloatArray = -0.5 * (squares + log_determinant + readings * LOG_TWO_PI)
+    return density
 
 
 @dataclass(frozen=True)
@@ -77,18 +97,25 @@ class WhiteNoise:
 
     parameters: tuple[str, ...] = ("sensor_sd",)
 
+    def whiten(
+        self,
+        theta: FloatArray,
+        series: FloatArray,
+        skipped: FloatArray | None = None,  # noqa: ARG002  # nothing is remembered over a gap
+    ) -> tuple[FloatArray, FloatArray]:
+        """Divide by the sensor's sd; shapes as in :class:`Noise`."""
+        sensor = theta[:, 0]
+        log_determinant: FloatArray = 2 * series.shape[2] * np.log(sensor)
+        return series / sensor[:, np.newaxis, np.newaxis], log_determinant
+
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Return Σ log N(r; 0, s²); shapes as in :class:`Noise`."""
-        sensor = theta[:, 0]
-        squares = np.sum((residual / sensor[:, np.newaxis]) ** 2, axis=1)
-        samples = residual.shape[1]
-        density: FloatArray = -0.5 * squares - samples * (np.log(sensor) + 0.5 * LOG_TWO_PI)
-        return density
+        return _log_density(*self.whiten(theta, residual[:, np.newaxis]))
 
     def steady_state(self, theta: FloatArray) -> SteadyState:
         """Nothing is remembered: innovations are the residuals."""
         none = np.zeros(theta.shape[0])
-        return SteadyState(none, none, theta[:, 0] ** 2, none, none - np.inf)
+        return SteadyState(none, none, theta[:, 0] ** 2, none, none - np.inf, none)
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """No discrepancy; sd of the sensor."""
@@ -101,78 +128,141 @@ class WhiteNoise:
 
 @dataclass(frozen=True)
 class DiscrepancyNoise:
-    """Ornstein-Uhlenbeck discrepancy plus white sensor noise, exact in O(samples).
+    """Ornstein-Uhlenbeck discrepancy plus white sensor noise, exact in O(readings).
 
-    With φ = exp(−Δ/τ), q = σ² (1 − φ²): the predicted variance of x in the steady state is the
-    positive root p of p² + p (1 − φ²)(s² − σ²) = q s², an innovation has variance S = p + s², and
-    errors of the prediction die out by a = φ s²/S a sample. The steady-state innovations are
+    With φ = exp(−Δ/τ), q = σ² (1 − φ²): the predicted variance of x in the long run is the positive
+    root p of p² + p (1 − φ²)(s² − σ²) = q s², an innovation has variance S = p + s², and errors of
+    the prediction die out by a = φ s²/S a reading. The variance at hand is p + D, with
 
-        η[t] = r[t] − x̂[t],   x̂[t+1] = a x̂[t] + (φ − a) r[t],   x̂[0] = 0.
+        D → a² D S / (S + D)           after a reading,
+        D → ρ² D + (1 − ρ²)(σ² − p)    over missing ones, ρ = φ to the power of their number,
 
-    At the start x has its stationary variance, larger than p by δ = σ² − p. Put this surplus into
-    an unknown mean ξ ~ N(0, δ) of x[0]: it shifts η[t] by −aᵗ ξ, and integrating ξ out gives
+    and D = σ² − p before the first. From one reading to the next the prediction follows
+    x̂ → φ (x̂ + (p + D)/(S + D) (r − x̂)). Along evenly spaced readings this has a closed form on top
+    of the innovations η[t] of the steady state, D = 0: with
 
-        log p(r) = Σ log N(η[t] − aᵗ ξ̂; 0, S) − ½ log(1 + δ A) − ½ ξ̂² / δ,
-        ξ̂ = δ B / (1 + δ A),   A = Σ a²ᵗ / S,   B = Σ aᵗ η[t] / S.
+        A[t] = Σ a²ʲ/S,   B[t] = Σ aʲ η[j]/S   (j < t),   ξ[t] = D₀ B[t] / (1 + D₀ A[t]),
 
-    Exact, and well behaved for σ → 0, s → 0 and any τ.
+    the innovations are η[t] − aᵗ ξ[t], of variance S + a²ᵗ D₀ / (1 + D₀ A[t]). Nothing here takes
+    differences of nearly equal numbers: it is well behaved for σ → 0, s → 0 and any τ.
 
     Parameters
     ----------
     interval
-        Sampling interval Δ, s.
+        Interval Δ between readings, s.
     """
 
     interval: float
     parameters: tuple[str, ...] = ("sensor_sd", "discrepancy_sd", "discrepancy_time")
 
+    def whiten(
+        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the exact innovations; shapes as in :class:`Noise`."""
+        steady = self.steady_state(theta)
+        filter_ = _Filter(steady, np.zeros(series.shape[:2]), steady.surplus.copy())
+        white = np.empty_like(series)
+        log_determinant = np.zeros(series.shape[0])
+        gaps = [] if skipped is None else np.flatnonzero(skipped).tolist()
+        for first, last in zip([0, *gaps], [*gaps, series.shape[2]], strict=True):
+            if first:
+                assert skipped is not None
+                filter_.skip(float(skipped[first]))
+            stretch = slice(first, last)
+            follow = filter_.run if last - first >= LONG else filter_.step
+            log_determinant += follow(series[..., stretch], white[..., stretch])
+        return white, log_determinant
+
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Return the exact log density; shapes as in :class:`Noise`."""
-        samples = residual.shape[1]
-        steady = self.steady_state(theta)
-        phi, variance, log_a = steady.kept, steady.variance, steady.log_decay
-        a = np.exp(log_a)
-        unsure, gain = steady.surplus / variance, steady.start_gain(samples)
-        squares = np.empty_like(a)
-        for row, values in enumerate(residual):
-            eta = lfilter((1.0, -phi[row]), (1.0, -a[row]), values)
-            # Powers of a below exp(-40) add nothing.
-            memory = int(min(samples, 1 - 40 / log_a[row]))
-            powers = np.power(a[row], np.arange(memory))
-            # Sums, not dot products: a linear algebra library may split those over threads.
-            pull = np.sum(powers * eta[:memory]) / gain[row]
-            eta[:memory] -= unsure[row] * pull * powers
-            squares[row] = np.sum(eta * eta) + unsure[row] * pull**2
-        squares /= variance
-        logs = samples * (np.log(variance) + LOG_TWO_PI) + np.log(gain)
-        density: FloatArray = -0.5 * (squares + logs)
-        return density
-
-    def whiten(self, theta: FloatArray, series: FloatArray) -> FloatArray:
-        """Return steady-state innovations of series (rows, samples) over their sd, at one θ."""
-        steady = self.steady_state(theta)
-        filters = (1.0, -steady.kept[0]), (1.0, -np.exp(steady.log_decay[0]))
-        white: FloatArray = lfilter(*filters, series, axis=1) / np.sqrt(steady.variance[0])
-        return white
+        return _log_density(*self.whiten(theta, residual[:, np.newaxis]))
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
 
     def at(self, interval: float) -> DiscrepancyNoise:
-        """Return the same noise for samples ``interval`` seconds apart."""
+        """Return the same noise for readings ``interval`` seconds apart."""
         return DiscrepancyNoise(interval)
 
     def steady_state(self, theta: FloatArray) -> SteadyState:
         """Return the filter without cancellation at either extreme."""
         sensor, process = theta[:, 0] ** 2, theta[:, 1] ** 2
-        log_phi = -self.interval / theta[:, 2]
-        fresh = -np.expm1(2 * log_phi)
+        rate = self.interval / theta[:, 2]
+        fresh = -np.expm1(-2 * rate)
         half = fresh * (process - sensor) / 2
         root = np.sqrt(half**2 + fresh * process * sensor)
         apart = np.where(half > 0, 1, root - half)
         predicted = np.where(half > 0, half + root, fresh * process * sensor / apart)
         with np.errstate(divide="ignore", over="ignore"):
-            log_a = np.minimum(log_phi - np.log1p(predicted / sensor), -1e-300)
-        phi, variance = np.exp(log_phi), predicted + sensor
-        return SteadyState(phi, predicted, variance, process - predicted, log_a)
+            log_a = np.minimum(-rate - np.log1p(predicted / sensor), -1e-300)
+        surplus = np.maximum(process - predicted, 0.0)
+        return SteadyState(np.exp(-rate), predicted, predicted + sensor, surplus, log_a, rate)
+
+
+@dataclass
+class _Filter:
+    """The Kalman filter of all models on its way through the readings.
+
+    ``mean`` (models, series) is x̂, the prediction of the next reading of each series, um;
+    ``unsure`` (models,) is D, um².
+    """
+
+    steady: SteadyState
+    mean: FloatArray
+    unsure: FloatArray
+
+    def skip(self, readings: float) -> None:
+        """Pass over that many missing readings."""
+        kept = np.exp(-readings * self.steady.rate)
+        self.mean *= kept[:, np.newaxis]
+        self.unsure = kept**2 * self.unsure - np.expm1(-2 * readings * self.steady.rate) * (
+            self.steady.surplus
+        )
+
+    def step(self, series: FloatArray, white: FloatArray) -> FloatArray:
+        """Whiten evenly spaced series reading by reading; return the log determinant (models,)."""
+        steady = self.steady
+        decay = np.exp(2 * steady.log_decay)
+        log_determinant = np.zeros(len(self.unsure))
+        for t in range(series.shape[2]):
+            variance = steady.variance + self.unsure
+            innovation = series[..., t] - self.mean
+            white[..., t] = innovation / np.sqrt(variance)[:, np.newaxis]
+            log_determinant += np.log(variance)
+            gain = (steady.predicted + self.unsure) / variance
+            self.mean = steady.kept[:, np.newaxis] * (self.mean + gain[:, np.newaxis] * innovation)
+            self.unsure = decay * self.unsure * (steady.variance / variance)
+        return log_determinant
+
+    def run(self, series: FloatArray, white: FloatArray) -> FloatArray:
+        """Do the same as :meth:`step` by the closed form."""
+        readings = series.shape[2]
+        log_determinant: FloatArray = readings * np.log(self.steady.variance)
+        for row, values in enumerate(series):
+            phi, variance = self.steady.kept[row], self.steady.variance[row]
+            log_a, unsure = self.steady.log_decay[row], self.unsure[row]
+            a = np.exp(log_a)
+            # Innovations over their sd in the long run.
+            scale = 1 / np.sqrt(variance)
+            before = -scale * self.mean[row][:, np.newaxis]
+            eta, after = lfilter((scale, -scale * phi), (1.0, -a), values, axis=-1, zi=before)
+            # Powers of a below exp(-40) add nothing.
+            memory = int(min(readings, 1 - 40 / log_a))
+            powers = np.power(a, np.arange(memory + 1))
+            squares = np.concatenate([[0.0], np.cumsum(powers[:-1] ** 2)])
+            pull = np.zeros((len(values), memory + 1))
+            np.cumsum(powers[:-1] * eta[:, :memory], axis=1, out=pull[:, 1:])
+            ratio = unsure / variance / (1 + unsure / variance * squares)
+            shift = powers * ratio * pull
+            ratio *= powers**2
+            white[row] = eta
+            white[row, :, :memory] -= shift[:, :-1]
+            white[row, :, :memory] /= np.sqrt(1 + ratio[:-1])
+            log_determinant[row] += np.sum(np.log1p(ratio[:-1]))
+            # What is past the memory is forgotten.
+            self.mean[row] = -after[:, 0] / scale
+            if memory == readings:
+                self.mean[row] += shift[:, -1] / scale
+            self.unsure[row] = ratio[-1] * variance if memory == readings else 0.0
+        return log_determinant

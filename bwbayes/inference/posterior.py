@@ -2,28 +2,27 @@
 
 A :class:`Posterior` gives the log density of a batch of models in the unconstrained coordinates
 in which everything downstream works: the point fit, the sampler, the diagnostics. The model is
-simulated from the record's first sample; only the training windows enter the likelihood.
+simulated from the record's first sample; only readings in the training windows enter the
+likelihood (:mod:`bwbayes.inference.likelihood`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 
 __all__ = ["Posterior"]
-
-# Models simulated together: enough to share the loop over turns, few enough for the memory.
-BATCH = 64
-ELEMENTS = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -35,20 +34,22 @@ class Posterior:
     voltage
         (samples,), V, from the record's first sample on.
     displacement
-        (samples,), um.
+        (samples,), um; nan where a reading is missing.
     training
-        Slices of the samples that enter the likelihood, in order of time and apart. The discrepancy
-        of one window is taken as independent of that of the next, so windows should lie several
-        correlation times apart.
+        Slices of the samples that enter the likelihood, in order of time and apart. One discrepancy
+        goes through all of them.
     actuator, noise, prior
         The model; the prior's parameters are those of the actuator followed by those of the noise.
     engine
         What computes the likelihood; see :mod:`bwbayes.inference.engine`.
+    from_rest
+        The record starts with a demagnetised actuator at rest, and ``initial`` is h at zero volts
+        before. Otherwise the state of the dynamics at the first sample is unknown.
 
     Raises
     ------
     InputError
-        The prior is another model's, or the windows are out of order.
+        The prior is another model's, the windows are out of order, or no reading is in them.
     """
 
     voltage: FloatArray
@@ -58,6 +59,7 @@ class Posterior:
     noise: Noise
     prior: JointPrior
     engine: Engine = "numpy"
+    from_rest: bool = False
 
     def __post_init__(self) -> None:
         expected = (*self.actuator.parameters, *self.noise.parameters)
@@ -86,34 +88,40 @@ class Posterior:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters), fixed parameters included."""
-        if self.engine == "numba":
-            # Here, because numba may not be installed, and takes half a second to load.
-            from bwbayes.inference import compiled  # noqa: PLC0415
+        return self.likelihood.log_density(theta)
 
-            return compiled.log_likelihood(
-                theta, self.voltage, self.displacement, self.training, self.actuator, self.noise
-            )
-        return np.concatenate([self._piece(theta[piece]) for piece in self._pieces(theta)])
+    @cached_property
+    def readings(self) -> Readings:
+        """The readings that enter the likelihood."""
+        return Readings.of(self.displacement, self.training)
 
-    def _pieces(self, theta: FloatArray) -> Iterator[slice]:
-        size = min(max(ELEMENTS // self.voltage.size, 1), BATCH)
-        return (slice(i, i + size) for i in range(0, theta.shape[0], size))
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """The likelihood of the record."""
+        return Likelihood(
+            self.voltage,
+            self.readings,
+            self.actuator,
+            self.noise,
+            self.engine,
+            self.from_rest,
+            float(np.ptp(self.voltage)) / 2,
+        )
 
     def simulate(self, theta: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Displacement (models, rows), um, at samples up to the last training sample."""
-        pieces = self._pieces(theta)
-        return np.concatenate([self._simulated(theta[piece])[:, rows] for piece in pieces])
+        """Displacement (models, rows), um, at samples up to the last reading.
 
-    def _simulated(self, theta: FloatArray) -> FloatArray:
-        """Displacement (models, samples) up to the last training sample."""
-        end = max(window.stop for window in self.training)
-        model = theta[:, : len(self.actuator.parameters)]
-        return self.actuator.displacement(model, self.voltage[:end])
-
-    def _piece(self, theta: FloatArray) -> FloatArray:
-        simulated = self._simulated(theta)
-        residual = self.displacement[: simulated.shape[1]] - simulated
-        noise = theta[:, len(self.actuator.parameters) :]
-        parts = [self.noise.log_density(noise, residual[:, window]) for window in self.training]
-        total: FloatArray = np.sum(parts, axis=0)
-        return total
+        Where the start of the dynamics is unknown, it is the most probable one.
+        """
+        likelihood, size = self.likelihood, len(self.actuator.parameters)
+        unrest = likelihood.start(theta).mean if likelihood.unknown else None
+        started = likelihood.started(theta)[:, :size]
+        voltage = self.voltage[: self.readings.samples]
+        return np.concatenate(
+            [
+                self.actuator.advance(
+                    started[part], voltage, unrest=None if unrest is None else unrest[part]
+                )[0][:, rows]
+                for part in batches(len(theta), voltage.size)
+            ]
+        )

@@ -19,7 +19,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.boucwen import hysteresis
-from bwbayes.model.linear import Hold, Recursion, first_order_lag, second_order
+from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
 
 __all__ = ["Actuator", "Dynamics", "State"]
 
@@ -92,6 +92,16 @@ class Actuator:
         """Names of θ's columns."""
         return (*HYSTERESIS_PARAMETERS, *self.dynamics_parameters, "offset")
 
+    @property
+    def unknowns(self) -> int:
+        """How many numbers say in which state the dynamics are at a record's first sample."""
+        states: dict[Dynamics, int] = {
+            "none": int(self.hold == "zero"),
+            "lag": 1,
+            "second-order": 2,
+        }
+        return states[self.dynamics]
+
     def displacement(self, theta: ArrayLike, voltage: ArrayLike) -> FloatArray:
         """Displacement of every model along one voltage.
 
@@ -119,12 +129,17 @@ class Actuator:
         return self.advance(theta, voltage)[0]
 
     def advance(
-        self, theta: ArrayLike, voltage: ArrayLike, state: State | None = None
+        self,
+        theta: ArrayLike,
+        voltage: ArrayLike,
+        state: State | None = None,
+        unrest: FloatArray | None = None,
     ) -> tuple[FloatArray, State]:
         """Displacement along the next piece of a record, and the state at its end.
 
         Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here:
-        h is θ's initial one and the dynamics are at rest at the first drive.
+        h is θ's initial one and the dynamics are at rest at the first drive, or ``unrest``
+        (models, unknowns) away from there, um, as in :class:`~bwbayes.model.linear.Recursion`.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):
@@ -142,6 +157,8 @@ class Actuator:
         drive -= h
         rest = drive[:, 0].copy() if state is None else state.rest
         memory = recursion.at_rest() if state is None else state.filter.copy()
+        if state is None and unrest is not None:
+            memory += np.einsum("mu,mut->mt", unrest, recursion.free)
         # The recursion sees the drive's distance from rest, so that it starts at zero exactly.
         drive -= rest[:, np.newaxis]
         result = recursion.run(drive, memory)
@@ -178,5 +195,16 @@ class Actuator:
             )
         if self.dynamics == "lag":
             return first_order_lag(column["lag"], self.interval, self.hold)
-        unity = np.ones((column["d"].size, 1))
-        return Recursion(unity, unity)
+        return no_dynamics(column["d"].size, self.hold)
+
+    def at_rest(self, theta: FloatArray, voltage: float) -> FloatArray:
+        """Return θ (models, parameters) whose initial h is the one at a first ``voltage`` (V).
+
+        The initial h of ``theta`` is taken for the one at zero volts, before the record: from there
+        the voltage went straight to the record's first.
+        """
+        column = dict(zip(self.parameters, theta.T, strict=False))
+        shape = {name: column[name] for name in ("alpha", "beta", "gamma", "exponent", "initial")}
+        started = theta.copy()
+        started[:, self.parameters.index("initial")] = hysteresis([0.0, voltage], **shape)[:, -1]
+        return started

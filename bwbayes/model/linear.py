@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["Hold", "Recursion", "first_order_lag", "second_order"]
+__all__ = ["Hold", "Recursion", "first_order_lag", "no_dynamics", "second_order"]
 
 Hold = Literal["first", "zero"]
 
@@ -35,11 +35,29 @@ class Recursion:
     """x[t] = Σ numerator[i] w[t−i] − Σ denominator[i] x[t−i], for a batch of models.
 
     ``numerator`` and ``denominator`` are (models, taps), ``denominator[:, 0]`` is one, and the
-    static gain is one.
+    static gain is one. ``free`` (models, unknowns, taps − 1) holds the filter's states that answer
+    to a unit of each thing unknown of the dynamics at the first sample: how far the displacement
+    is from rest, and how fast it moves, in units of the natural frequency. Without a drive they
+    give the free responses.
     """
 
     numerator: FloatArray
     denominator: FloatArray
+    free: FloatArray
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers say in which state the dynamics are."""
+        return int(self.free.shape[1])
+
+    @property
+    def remembered(self) -> FloatArray:
+        """Largest part (models,) of a free response that is left after a sample, below one."""
+        taps = np.zeros((self.denominator.shape[0], 3))
+        taps[:, : self.denominator.shape[1]] = self.denominator
+        root = np.sqrt(taps[:, 1] ** 2 - 4 * taps[:, 2] + 0j)
+        largest: FloatArray = np.max(np.abs([taps[:, 1] + root, taps[:, 1] - root]), axis=0) / 2
+        return largest
 
     def at_rest(self) -> FloatArray:
         """Return the state (models, taps - 1) of a filter at rest at zero."""
@@ -54,6 +72,26 @@ class Recursion:
                 self.numerator[row], self.denominator[row], values, zi=state[row]
             )
         return drive
+
+    def free_responses(self, samples: int) -> FloatArray:
+        """Displacement (models, unknowns, samples) after a unit of each, without a drive."""
+        models, unknowns, _ = self.free.shape
+        responses = np.zeros((models, unknowns, samples))
+        for unknown in range(unknowns):
+            self.run(responses[:, unknown], self.free[:, unknown].copy())
+        return responses
+
+
+def no_dynamics(models: int, hold: Hold) -> Recursion:
+    """Return the recursion of x = w for a batch of ``models``: all that is left is the hold.
+
+    A drive that is held changes just after the sample, so the displacement follows one sample
+    later: the limit of a lag that goes to zero.
+    """
+    if hold == "zero":
+        return first_order_lag(np.zeros(models), 1.0, hold)
+    unity = np.ones((models, 1))
+    return Recursion(unity, unity, np.empty((models, 0, 0)))
 
 
 def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
@@ -74,7 +112,8 @@ def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
     decay = np.exp(z)
     now = -_z_phi_2(z) if hold == "first" else np.zeros_like(z)
     numerator = np.stack([now, -np.expm1(z) - now], axis=1)
-    return Recursion(numerator, np.stack([np.ones_like(decay), -decay], axis=1))
+    one = np.ones_like(decay)
+    return Recursion(numerator, np.stack([one, -decay], axis=1), one[:, np.newaxis, np.newaxis])
 
 
 def second_order(
@@ -117,7 +156,12 @@ def second_order(
     ]
     # Both are sums over a conjugate pair or over real numbers: the imaginary part is rounding.
     denominator = [np.ones_like(slow), -(e_slow + np.exp(fast)), np.exp(slow + fast)]
-    return Recursion(np.stack(numerator, axis=1).real, np.stack(denominator, axis=1).real)
+    backward = np.stack(denominator, axis=1).real
+    # The first two samples of the free responses: of a unit of displacement, and of speed.
+    first = np.stack([np.ones_like(natural), np.zeros_like(natural)], axis=1)
+    second = np.stack([e_slow - slow * both, natural * interval * both], axis=1).real
+    free = np.stack([first, second + backward[:, 1:2] * first], axis=2)
+    return Recursion(np.stack(numerator, axis=1).real, backward, free)
 
 
 def _divided_differences(

@@ -7,6 +7,7 @@ file. This module alone knows arviz's labelled posterior.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -84,7 +85,10 @@ def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, reco
 
 
 def write_bands(path: Path, bands: Sequence[Bands]) -> None:
-    """Write bands as CSV; of several sets, a first column ``set`` names each."""
+    """Write bands as CSV; of several sets, a first column ``set`` names each.
+
+    Every column has seven digits of its range, however far from zero it lies.
+    """
     temporary = path.with_suffix(".partial")
     with temporary.open("w", encoding="utf-8") as file:
         for number, one in enumerate(bands):
@@ -92,9 +96,20 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
             if number == 0:
                 file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
             prefix = f"{one.name}," if len(bands) > 1 else ""
-            row = prefix + ",".join("%.9g" if n == "time_s" else "%.7g" for n in names) + "\n"
+            row = prefix + ",".join(_format(n, c) for n, c in zip(names, columns, strict=True))
+            row += "\n"
             file.writelines(row % values for values in zip(*columns, strict=True))
     temporary.replace(path)
+
+
+def _format(name: str, column: FloatArray) -> str:
+    """Return the format of a column (samples,), which may hold NaN."""
+    values = column[np.isfinite(column)]
+    span = float(np.ptp(values)) if values.size else 0.0
+    far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
+    # A float has no more than 17 digits.
+    extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
+    return f"%.{min((9 if name == 'time_s' else 7) + extra, 17)}g"
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:

@@ -6,9 +6,8 @@ deviation. The record is walked through in pieces, so memory does not grow with 
 discrepancy enters by its marginal distribution, on training windows too, where the smoothed one
 would promise more than a new record can keep.
 
-Windows of the training record share its simulation and its offset. Another record brings two
-unknowns of its own: the hysteretic state it starts from, and the sensor's offset. Both are drawn
-anew for every draw, and a lead-in at the record's start, which is not judged later, narrows them.
+Windows of the training record share its simulation and its offset. Another record has a start of
+its own, see :mod:`bwbayes.results.start`.
 """
 
 from __future__ import annotations
@@ -19,19 +18,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.record import Record
+from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.results import mixture
 from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.start import Start, Started, fitted, started
 
-__all__ = ["DRAWS", "Start", "beyond_training", "predict_record", "predict_windows", "thinned"]
+__all__ = ["DRAWS", "Start", "predict_record", "predict_windows", "thinned"]
 
 # Posterior draws in the mixture.
 DRAWS = 1000
@@ -40,53 +37,21 @@ DRAWS = 1000
 # apart would take each other's place in the cache.
 PIECE = 4000
 
-# Part of the fitted voltages' range that others may lie beyond it: a sensor's noise.
-SLACK = 0.02
-
 # Threads that summarise pieces, while this one simulates the next.
 THREADS = 2
-
-# Earlier drives that a record's initial state may come from, and their most turning points.
-EARLIER_DRIVES = 16
-EARLIER_TURNS = 6
-
-
-@dataclass(frozen=True)
-class Start:
-    """What is known of the start of another record.
-
-    Parameters
-    ----------
-    from_rest
-        The actuator starts demagnetised (h = 0). Otherwise h is a state that some earlier drive
-        within the voltage range could have left.
-    own_offset
-        The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
-        the training record, as it is for a planned voltage without a measurement.
-    lead_in
-        Length of the lead-in, s.
-    lead_in_from
-        Time at which the lead-in begins, s; by default the record's first sample.
-    """
-
-    from_rest: bool = False
-    own_offset: bool = True
-    lead_in: float = 1.0
-    lead_in_from: float | None = None
 
 
 @dataclass(frozen=True)
 class _Draws:
-    """Model parameters (draws, model parameters) and the sds (draws,) of what they leave over."""
+    """The start of every draw's simulation, and the sds (draws,) of what is added to it, um."""
 
-    model: FloatArray
+    start: Started
     discrepancy: FloatArray
     sensor: FloatArray
-    offset: FloatArray
 
     def sds(self, kind: Kind) -> FloatArray:
         """Sd of a band's quantity, given a draw, um."""
-        variance = self.offset**2
+        variance = self.start.offset_sd**2
         if kind != "parameter":
             variance = variance + self.discrepancy**2
         if kind == "sensor":
@@ -101,27 +66,12 @@ def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAW
     return draws[generator.choice(draws.shape[0], count, replace=False)]
 
 
-def beyond_training(posterior: Posterior, voltage: FloatArray) -> str | None:
-    """Say, in one line, where a voltage (samples,) leaves the range in which the model was fitted.
-
-    There the bands know the parameters' uncertainty, and nothing of what the actuator does else.
-    """
-    fitted = np.concatenate([posterior.voltage[window] for window in posterior.training])
-    low, high = float(np.min(fitted)), float(np.max(fitted))
-    slack = SLACK * (high - low)
-    if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
-        return None
-    return (
-        f"the voltage goes from {np.min(voltage):.4g} to {np.max(voltage):.4g} V, and only "
-        f"{low:.4g} to {high:.4g} V were fitted: beyond that the bands are an extrapolation"
-    )
-
-
 def predict_windows(
     posterior: Posterior,
     draws: FloatArray,
     record: Record,
     windows: Mapping[str, slice],
+    generator: np.random.Generator,
 ) -> list[Bands]:
     """Predict windows of the training record: one simulation, one offset.
 
@@ -135,13 +85,15 @@ def predict_windows(
         The training record, whole.
     windows
         Slices of its samples, by name.
+    generator
+        Draws the state of the dynamics at the record's start, where that is unknown.
     """
-    mixed = _draws(posterior, draws)
+    theta = posterior.prior.theta(draws)
+    mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     bands = []
     for name, window in windows.items():
         training = any(w.start < window.stop and window.start < w.stop for w in posterior.training)
-        found = _bands(name, posterior.actuator, mixed, record, window)
-        bands.append(replace(found, training=training))
+        bands.append(replace(_bands(name, mixed, record, window), training=training))
     return bands
 
 
@@ -152,7 +104,7 @@ def predict_record(
     start: Start,
     generator: np.random.Generator,
     name: str = "prediction",
-    window: tuple[float, float] | None = None,
+    window: Window | None = None,
 ) -> Bands:
     """Predict another record, or a planned voltage without a measurement.
 
@@ -165,128 +117,35 @@ def predict_record(
     start
         What is known of its start.
     generator
-        Draws the initial states.
+        Draws the starts.
     name
-        The bands' name.
+        Name of the bands.
     window
-        Start and stop in s of the part that is predicted and judged; by default the whole record.
+        Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
+        its first sample in any case.
 
     Raises
     ------
     InputError
-        A lead-in that leaves nothing of the record.
+        A lead-in or window that does not fit into the record.
     """
-    posterior = replace(
-        posterior,
-        actuator=replace(posterior.actuator, interval=record.interval),
-        noise=posterior.noise.at(record.interval),
-    )
-    mixed = _draws(posterior, draws)
-    if not start.from_rest:
-        states = _reachable(posterior, mixed.model, record.voltage, generator)
-    else:
-        states = np.zeros((1, draws.shape[0]))
-    lead_in = 0
-    if record.displacement is not None and start.own_offset:
-        lead_in = round(start.lead_in / record.interval)
-        if not 1 <= lead_in < record.samples:
-            raise InputError(
-                f"{record.origin}: a lead-in of {start.lead_in:g} s leaves nothing of "
-                f"{record.duration:g} s; choose a shorter one"
-            )
-        mixed = _informed(posterior, mixed, states, draws, record, lead_in, generator)
-    else:
-        chosen = generator.integers(states.shape[0], size=draws.shape[0])
-        mixed = _starting_at(posterior, mixed, states[chosen, np.arange(draws.shape[0])])
     part = slice(0, record.samples) if window is None else record.window_slice(*window)
-    found = _bands(name, posterior.actuator, mixed, record, part)
-    return replace(found, scored_from=max(lead_in - part.start, 0))
-
-
-def _draws(posterior: Posterior, draws: FloatArray) -> _Draws:
     theta = posterior.prior.theta(draws)
-    size = len(posterior.actuator.parameters)
-    discrepancy, sensor = posterior.noise.marginal_sd(theta[:, size:])
-    return _Draws(theta[:, :size], discrepancy, sensor, np.zeros(draws.shape[0]))
+    begun = started(posterior, theta, record, start, generator)
+    if part.stop <= begun.judged_from:
+        raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
+    bands = _bands(name, _draws(posterior, theta, begun), record, part)
+    return replace(bands, scored_from=max(begun.judged_from - part.start, 0), lead_in=begun.lead_in)
 
 
-def _column(posterior: Posterior, name: str) -> int:
-    return posterior.actuator.parameters.index(name)
+def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
+    noise = theta[:, len(posterior.actuator.parameters) :]
+    return _Draws(start, *posterior.noise.marginal_sd(noise))
 
 
-def _starting_at(posterior: Posterior, mixed: _Draws, states: FloatArray) -> _Draws:
-    model = mixed.model.copy()
-    model[:, _column(posterior, "initial")] = states
-    return replace(mixed, model=model)
-
-
-def _reachable(
-    posterior: Posterior, model: FloatArray, voltage: FloatArray, generator: np.random.Generator
-) -> FloatArray:
-    """Draw initial states (drives, draws): where earlier drives, from rest, leave each draw.
-
-    A drive turns at random voltages within the range of this record and the training record, and
-    ends at this record's first voltage.
-    """
-    low = min(float(np.min(voltage)), float(np.min(posterior.voltage)))
-    high = max(float(np.max(voltage)), float(np.max(posterior.voltage)))
-    column = dict(zip(posterior.actuator.parameters, model.T, strict=True))
-    shape = {name: column[name] for name in ("alpha", "beta", "gamma", "exponent")}
-    states = np.empty((EARLIER_DRIVES, model.shape[0]))
-    for drive in range(EARLIER_DRIVES):
-        turns = generator.uniform(low, high, generator.integers(1, EARLIER_TURNS + 1))
-        path = np.concatenate([[0.0], turns, voltage[:1]])
-        states[drive] = hysteresis(path, **shape)[:, -1]
-    return states
-
-
-def _informed(
-    posterior: Posterior,
-    mixed: _Draws,
-    states: FloatArray,
-    draws: FloatArray,
-    record: Record,
-    lead_in: int,
-    generator: np.random.Generator,
-) -> _Draws:
-    """Let the lead-in choose every draw's initial state and tell its offset.
-
-    Given a draw and a state, the lead-in's log density is quadratic in the offset, whose prior is
-    normal around the lead-in's mean with the sd of the training record's range: so the offset's
-    posterior is normal, and the state is drawn by its marginal density. The other parameters keep
-    the posterior that the training record gave them.
-    """
-    assert record.displacement is not None
-    reading = record.displacement[:lead_in]
-    wide = float(np.ptp(posterior.displacement))
-    noise = posterior.prior.theta(draws)[:, len(posterior.actuator.parameters) :]
-    log_marginal, mean, variance = [], [], []
-    for state in states:
-        model = _starting_at(posterior, mixed, state).model
-        model[:, _column(posterior, "offset")] = np.mean(reading)
-        residual = reading - posterior.actuator.displacement(model, record.voltage[:lead_in])
-        # Three points fix the quadratic.
-        step = wide / 100
-        below, here, above = (
-            posterior.noise.log_density(noise, residual + shift) for shift in (step, 0.0, -step)
-        )
-        slope = (above - below) / (2 * step)
-        precision = (2 * here - above - below) / step**2 + 1 / wide**2
-        mean.append(np.mean(reading) + slope / precision)
-        variance.append(1 / precision)
-        log_marginal.append(here + 0.5 * slope**2 / precision - 0.5 * np.log(precision))
-    columns = np.arange(draws.shape[0])
-    weight = np.exp(log_marginal - logsumexp(log_marginal, axis=0))
-    uniform = generator.uniform(size=draws.shape[0])
-    chosen = np.minimum(np.sum(np.cumsum(weight, axis=0) < uniform, axis=0), len(states) - 1)
-    informed = _starting_at(posterior, mixed, states[chosen, columns])
-    informed.model[:, _column(posterior, "offset")] = np.array(mean)[chosen, columns]
-    return replace(informed, offset=np.sqrt(np.array(variance)[chosen, columns]))
-
-
-def _bands(name: str, actuator: Actuator, mixed: _Draws, record: Record, window: slice) -> Bands:
+def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
     """Walk through a record and summarise the mixture over a window."""
-    pieces = _simulated(actuator, mixed.model, record.voltage, window)
+    pieces = _simulated(mixed.start, record.voltage, window)
     parts: list[dict[str, FloatArray]] = []
     pending: deque[Future[dict[str, FloatArray]]] = deque()
     with ThreadPoolExecutor(THREADS) as executor:
@@ -313,13 +172,13 @@ def _bands(name: str, actuator: Actuator, mixed: _Draws, record: Record, window:
 
 
 def _simulated(
-    actuator: Actuator, model: FloatArray, voltage: FloatArray, window: slice
+    start: Started, voltage: FloatArray, window: slice
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
     state = None
     for first in range(0, window.stop, PIECE):
         piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, state = actuator.advance(model, piece, state)
+        simulated, state = start.actuator.advance(start.model, piece, state, start.unrest)
         skipped = max(window.start - first, 0)
         if skipped < piece.size:
             yield first + skipped, simulated[:, skipped:]
@@ -341,6 +200,10 @@ def _summarised(
             summarised[f"{kind} {level} upper"] = edges[len(LEVELS) + i]
     if record.displacement is not None:
         reading = record.displacement[first : first + simulated.shape[1]]
-        summarised["pit"], distance = mixture.judged(simulated, mixed.sds("sensor"), reading)
-        summarised["crps"] = distance - spread["sensor"]
+        seen = np.isfinite(reading)
+        judged = np.full((2, reading.size), np.nan)
+        if seen.any():
+            judged[:, seen] = mixture.judged(simulated[:, seen], mixed.sds("sensor"), reading[seen])
+        summarised["pit"] = judged[0]
+        summarised["crps"] = judged[1] - spread["sensor"]
     return summarised

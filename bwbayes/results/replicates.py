@@ -250,7 +250,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     if len(free) < RANKED:
         return Replicate(number, *ended, names, truth, nothing, {})
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
-    bands = predict_windows(posterior, flat, record, experiment.held_out)
+    bands = predict_windows(posterior, flat, record, experiment.held_out, predicting)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
     covered = _covered(experiment, bands, record, model)
     return Replicate(number, *ended, names, truth, drawn, covered)
@@ -263,16 +263,16 @@ def _simulated(
     source = experiment.truth
     theta = source.prior.theta(source.prior.draw(generator, 1))
     column = dict(zip(source.prior.names, theta.T, strict=True))
-    model = source.actuator.displacement(
-        theta[:, : len(source.actuator.parameters)], source.voltage
-    )[0]
-    # Training windows have discrepancies of their own: so the likelihood has it.
-    ends = {end for window in source.training for end in (window.start, window.stop)}
-    pieces = np.diff(sorted(ends | {0, source.voltage.size}))
+    sd = source.likelihood.start_sd(theta)
+    model = source.actuator.advance(
+        source.likelihood.started(theta)[:, : len(source.actuator.parameters)],
+        source.voltage,
+        unrest=sd * generator.standard_normal(sd.shape),
+    )[0][0]
     interval = source.actuator.interval
-    discrepancy = [_discrepancy(column, int(piece), interval, generator) for piece in pieces]
-    truth = model + np.concatenate(discrepancy)
+    truth = model + _discrepancy(column, model.size, interval, generator)
     reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
+    reading[np.isnan(experiment.posterior.displacement)] = np.nan
     return column, Record(source.voltage, reading, interval, truth=truth), model
 
 

@@ -63,9 +63,11 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     voltage = np.concatenate([generator.uniform(-50, 50, 300), generator.uniform(-80, 80, 100)])
     write_record(Record(voltage, 0.5 * voltage + 7, 0.01), folder / "record.csv")
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
-    (remark,) = of(text + "[3.0, 4.0]", folder).remarks
+    # Jumps of up to 160 V are also faster than those of up to 100 V.
+    remark, faster = of(text + "[3.0, 4.0]", folder).remarks
     assert remark.startswith("rest: the voltage goes from -")
     assert "V were fitted: beyond that the bands are an extrapolation" in remark
+    assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
     assert () == of(RECORD + "train = [[0, 4.0]]", folder).remarks
 
 
@@ -73,7 +75,7 @@ def by_name(problem: Problem) -> dict[str, Parameter]:
     return {parameter.name: parameter for parameter in problem.parameters}
 
 
-def test_default_priors_depend_on_ranges_and_interval_alone(tmp_path: Path) -> None:
+def test_default_priors_depend_on_ranges_and_times_of_the_drive_alone(tmp_path: Path) -> None:
     found = []
     for number, samples in ((1, 400), (2, 900)):
         write_record(record(samples, seed=number), tmp_path / "record.csv")
@@ -81,6 +83,26 @@ def test_default_priors_depend_on_ranges_and_interval_alone(tmp_path: Path) -> N
     assert found[0] == found[1]
     write_record(record(interval=0.02), tmp_path / "record.csv")
     assert found[0] != of(RECORD, tmp_path).parameters
+
+
+def test_free_exponent_has_its_own_unit_and_wider_scales_of_beta(folder: Path) -> None:
+    free = "[parameters.exponent]\nprior = { distribution = 'uniform', lower = 1.0, upper = 4.0 }"
+    known = by_name(of(RECORD, folder))
+    freed = by_name(of(RECORD + free, folder))
+    for name in ("beta", "gamma"):
+        assert (known[name].unit, freed[name].unit) == ("1/V", "um^(1-n)/V")
+    sigma = [one["beta"].prior.arguments["sigma"] for one in (known, freed) if one["beta"].prior]
+    assert sigma[1] > 1.1 * sigma[0]
+
+
+def test_fixed_gamma_takes_nothing_from_beta(folder: Path) -> None:
+    """|gamma| <= beta takes small beta away; where it does not, the stated median is higher."""
+    medians = [
+        by_name(of(RECORD + text, folder))["beta"].prior.frozen.median()  # type: ignore[union-attr]
+        for text in ("", "[parameters]\ngamma = { fixed = 0.0 }")
+    ]
+    assert medians[1] == pytest.approx(1 / 80, rel=0.01)
+    assert medians[0] < 0.5 * medians[1]
 
 
 def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
@@ -103,7 +125,7 @@ def test_resolved_config_says_every_choice_in_numbers(folder: Path) -> None:
         assert parameter.label
         assert parameter.description
     assert set(problem.config.parameters) == {p.name for p in problem.parameters}
-    assert problem.config.model.hold == "zero"
+    assert problem.posterior.actuator.hold == "zero"
     assert problem.config.sampling.walkers == problem.plan.walkers
 
 
@@ -130,13 +152,44 @@ def test_resolved_config_resolves_to_the_same_numbers(
     np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
 
 
-def test_part_of_a_record_is_resolved_once(folder: Path) -> None:
-    text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\ntrain = [[1.0, 2.0]]\n"
+@pytest.mark.parametrize("train", ["train = [[1.0, 2.0]]\n", ""])
+def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
+    folder: Path, train: str
+) -> None:
+    text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\nexclude = [1.5, 1.7]\n" + train
     first = of(text, folder)
-    assert (100, 0.02, 1.0) == (first.record.samples, first.record.interval, first.record.start)
+    assert (300, 0.01, 0.0) == (first.record.samples, first.record.interval, first.record.start)
+    np.testing.assert_array_equal(record().voltage[:300], first.posterior.voltage)
+    assert [*range(100, 150, 2), *range(170, 300, 2)] == np.flatnonzero(
+        first.record.has_reading
+    ).tolist()
+    assert (slice(100, 200 if train else 299),) == first.posterior.training
     again = load_run(RunFolder.create(folder / "run", first, overwrite=False))
-    assert (again.record.samples, again.record.sha256) == (100, first.record.sha256)
+    assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
+    assert again.posterior.training == first.posterior.training
     assert again.parameters == first.parameters
+    assert again.config == first.config
+
+
+def test_default_priors_come_from_the_readings_there_are(folder: Path) -> None:
+    whole, some = (of(RECORD + text, folder) for text in ("", "exclude = [[1.0, 3.5]]"))
+    assert by_name(whole)["offset"] == by_name(some)["offset"]
+    made = record()
+    assert made.displacement is not None
+    wild = np.where(np.arange(400) == 200, 1e4, made.displacement)
+    write_record(replace(made, displacement=wild), folder / "record.csv")
+    assert by_name(some) == by_name(of(RECORD + "exclude = [[1.0, 3.5]]", folder))
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("train = [[0.5, 0.9], [1.2, 2.0]]", "record.train: no readings from 0.5 to 0.89 s"),
+        ("[validation.a]\nwindow = [0.0, 0.5]", "validation.a.window: no readings from 0 to"),
+    ],
+)
+def test_windows_without_readings_are_refused(folder: Path, text: str, place: str) -> None:
+    assert place in refused(RECORD + "start = 1.0\n" + text, folder)
 
 
 def test_run_folder_can_be_moved(tmp_path: Path) -> None:
@@ -157,7 +210,9 @@ def test_automatic_hold_follows_what_the_voltage_is(
     silent = [row for row in rows if not row.startswith("#")]
     (folder / "record.csv").write_text("\n".join(silent) + "\n")
     problem = of(RECORD + said, folder)
-    assert hold == problem.config.model.hold == problem.posterior.actuator.hold
+    assert hold == problem.posterior.actuator.hold
+    # Kept as it was asked for: another record has a hold of its own.
+    assert problem.config.model.hold == "auto"
 
 
 def test_automatic_hold_of_the_test_stand_is_zero_order(tmp_path: Path) -> None:
@@ -233,7 +288,7 @@ def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said
         ("train = [[0.0, 2.0], [1.0, 3.0]]", "overlaps the training window 0 to 2 s"),
         ("train = [[0.0, 9.0]]", "reaches outside the record"),
         ("start = 3.0\nstop = 2.0", "holds no sample"),
-        ("decimate = 1000", "record: too short, samples: 1;"),
+        ("decimate = 1000", "record: displacement_um: too few readings: 1;"),
         ("stop = 0.09", "record: too short, samples: 9; give at least 10"),
     ],
 )

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 
 from bwbayes.app.report import digits, render, symbol
+from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.result import Result, summary
 from tests.app import example
@@ -77,8 +78,20 @@ def test_priors_and_fixed_values_are_listed() -> None:
     bounded = dataclasses.replace(example.PARAMETERS[0], lower=0.1, upper=2.0)
     table = rows(page(example.run(parameters=(bounded, *example.PARAMETERS[1:]))), "priors")
     assert "normal(mean = 0.7, sd = 0.1), at least 0.1, at most 2" == table["coefficient"][1]
-    assert "fixed at 1" == table["smoothness"][1]
+    assert ["fixed at 1", ""] == table["smoothness"][1:3]
     assert len(example.PARAMETERS) == len(table)
+
+
+def test_priors_are_listed_as_the_constraints_leave_them() -> None:
+    """The bound d takes the upper part of a prior of alpha that reaches beyond it."""
+    close = dataclasses.replace(
+        example.PARAMETERS[1], prior=Distribution("normal", {"mean": 0.7, "sd": 0.1})
+    )
+    parameters = (example.PARAMETERS[0], close, *example.PARAMETERS[2:])
+    table = rows(page(example.run(parameters=parameters)), "priors")
+    median, upper = (float(part) for part in re.findall(r"[\d.]+", table["part"][2])[::2])
+    assert 0.62 < median < 0.67
+    assert upper < 0.83
 
 
 def test_scores_are_shown_for_each_of_the_bands() -> None:

@@ -29,6 +29,7 @@ from bwbayes.app.screen import show_priors
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.chainfile import ChainFile
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.result import Result, summary
 from tests.app import example
 from tests.app.odd_files import good_arrays
@@ -315,7 +316,7 @@ def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
     """Brackets are no markup there, and do not stop the command."""
     parameters = [dataclasses.replace(p, unit=text) for p in example.PARAMETERS]
     console = Console(file=io.StringIO(), width=500)
-    show_priors(parameters, console)
+    show_priors(JointPrior(parameters), console)
     assert isinstance(console.file, io.StringIO)
     assert text.partition("\0")[0] in console.file.getvalue()
 

@@ -22,11 +22,11 @@ MAIN = "import sys; from bwbayes.app.cli import main; sys.argv[0] = 'bwbayes'; m
 # One model through all that is compiled, with a record as a run has it: not to be written to.
 COMPILED = """
 import numpy as np
-from bwbayes.inference import kernels
+from bwbayes.inference import kernels, lanes
 record = np.ones(9)
 record.flags.writeable = False
-one = np.ones((1, len(kernels.PARAMETERS)))
-kernels.sums(record, record, np.array([[0, 9]]), one, np.empty((1, 0)))
+one = np.ones((1, len(lanes.PARAMETERS)))
+kernels.sums(record, record, 0 * record, one, np.empty((1, 0)), 0, 1)
 """
 
 STARTS: Mapping[str, list[str]] = {

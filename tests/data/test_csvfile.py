@@ -135,10 +135,6 @@ def test_a_planned_voltage_is_accepted_only_when_asked_for(tmp_path: Path) -> No
         ("0x10", "'0x10' is not a number"),
         ("1_000", "'1_000' is not a number"),
         ("1;5", "'1;5' is not a number"),
-        ("", "empty cell"),
-        ("  ", "empty cell"),
-        ("nan", "'nan' is not a finite number"),
-        ("-NaN", "'-NaN' is not a finite number"),
         ("inf", "'inf' is not a finite number"),
         ("-Infinity", "'-Infinity' is not a finite number"),
         ("1e999", "'1e999' is too large"),
@@ -152,6 +148,102 @@ def test_a_bad_cell_is_named_by_line_and_column(
 ) -> None:
     where = f"record.csv:{line}: {HEADER.split(',')[column]}: "
     assert fault(tmp_path, cell(line, column, text)).startswith(where + problem)
+
+
+@pytest.mark.parametrize("column", [0, 1])
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "empty cell; give one at every sample (only a displacement may be missing"),
+        ("  ", "empty cell; give one at every sample"),
+        ("nan", "'nan' is not a finite number; give one at every sample"),
+        ("-NaN", "'-NaN' is not a finite number; give one at every sample"),
+    ],
+)
+def test_a_time_and_a_voltage_are_needed_at_every_sample(
+    tmp_path: Path, column: int, text: str, problem: str
+) -> None:
+    where = f"record.csv:17: {HEADER.split(',')[column]}: "
+    assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
+
+
+@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN"])
+@pytest.mark.parametrize("line", [2, 17, 31])
+def test_an_empty_cell_in_the_displacement_is_a_missing_reading(
+    tmp_path: Path, line: int, text: str
+) -> None:
+    whole, record = read(tmp_path, GOOD), read(tmp_path, cell(line, 2, text))
+    assert record.displacement is not None
+    assert [line - 2] == np.flatnonzero(np.isnan(record.displacement)).tolist()
+    np.testing.assert_array_equal(whole.voltage, record.voltage)
+    assert record.readings == whole.readings - 1
+
+
+def without_readings(rows: int) -> str:
+    return "\n".join(
+        [HEADER, *ROWS[: 30 - rows], *(f"{i * 0.005:.3f},1," for i in range(30 - rows, 30))]
+    )
+
+
+def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> None:
+    text = fault(tmp_path, without_readings(21) + "\n")
+    assert text.startswith("record.csv: displacement_um: too few readings: 9; give at least 10")
+    assert "too few readings: 0" in fault(
+        tmp_path, "\n".join([HEADER, *(r.rpartition(",")[0] + "," for r in ROWS)]) + "\n"
+    )
+    assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
+
+
+def test_columns_of_other_quantities_are_ignored_with_a_remark(tmp_path: Path) -> None:
+    lines = ["note," + HEADER + ",temp_C,", *(f"a.b,{row},21.5," for row in ROWS)]
+    path = tmp_path / "record.csv"
+    path.write_text("\n".join(lines))
+    with pytest.warns(InputWarning, match=r"record.csv:1: ignored columns: note, temp_C, column 6"):
+        record = read_record(path)
+    assert record.sha256 == read(tmp_path, GOOD).sha256
+
+
+@pytest.mark.parametrize("row", ["0.040,1,2,3,4", "0.040,1,2", "0.040,x,2,3"])
+def test_a_faulty_line_is_named_beside_columns_that_are_ignored(tmp_path: Path, row: str) -> None:
+    lines = [HEADER + ",temp_C", *(f"{row},x" for row in ROWS)]
+    lines[9] = row
+    assert fault(tmp_path, "\n".join(lines) + "\n").startswith("record.csv:10: ")
+
+
+def with_gaps() -> str:
+    return "# voltage: command\n" + edited(lambda x: [*x[:9], *x[12:20], *x[21:]])
+
+
+def test_a_command_is_held_where_samples_are_missing(tmp_path: Path) -> None:
+    whole = read(tmp_path, GOOD)
+    (tmp_path / "record.csv").write_text(with_gaps())
+    with pytest.warns(InputWarning, match=r"csv:11: time_s: 4 samples are missing, .* in 2 gaps"):
+        record = read_record(tmp_path / "record.csv")
+    missing = [8, 9, 10, 19]
+    assert missing == np.flatnonzero(~record.has_reading).tolist()
+    assert (record.samples, record.interval) == (whole.samples, whole.interval)
+    expected = whole.voltage.copy()
+    expected[missing] = whole.voltage[[7, 7, 7, 18]]
+    np.testing.assert_array_equal(expected, record.voltage)
+
+
+def test_a_gap_in_an_output_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text(with_gaps())
+    with pytest.raises(InputError, match="about 3 missing; give the voltage there") as caught:
+        read_record(tmp_path / "record.csv", voltage_is="output")
+    assert 'voltage_is = "command"' in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("late", "problem"),
+    [(0.0025, "no whole number of"), (0.0013, "no whole number of"), (1e9, "makes the record too")],
+)
+def test_a_gap_that_is_no_whole_number_of_intervals_is_refused(
+    tmp_path: Path, late: float, problem: str
+) -> None:
+    rows = [f"{i * 0.005 + (0.01 + late) * (i > 9):.4f},{i},{i}" for i in range(40)]
+    text = fault(tmp_path, "# voltage: command\n" + "\n".join([HEADER, *rows]) + "\n")
+    assert problem in text
 
 
 FAULTS: list[tuple[str, str | bytes, str]] = [
@@ -373,9 +465,10 @@ def outcome(path: Path) -> str:
             record = read_record(path)
         except InputError as error:
             return str(error)
-    for values in (record.time, record.voltage, record.displacement):
-        assert values is not None
+    assert record.displacement is not None
+    for values in (record.time, record.voltage, record.displacement[record.has_reading]):
         assert np.isfinite(values).all()
+    assert record.readings >= 10
     return ""
 
 

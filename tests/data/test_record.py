@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, read_record, write_record
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.data import Record, read_record
+from bwbayes.errors import InputError
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
 
@@ -97,6 +95,17 @@ def test_window_holds_the_samples_from_start_to_before_stop(
     np.testing.assert_allclose(record.time[first:last], window.time, atol=1e-6 * interval)
 
 
+@pytest.mark.parametrize(
+    ("border", "sample"),
+    [(2.0, 2), (2.49, 2), (2.5, 2), (2.51, 3), (3.5, 3), (4.5, 4), (5.0, 5)],
+)
+def test_times_within_half_an_interval_count_as_on_a_border(border: float, sample: int) -> None:
+    """Whole numbers of quarter seconds are exact, so a half is one too."""
+    record = ramp(10, 0.25, 1.0)
+    assert slice(0, sample) == record.window_slice(1.0, 1.0 + border / 4)
+    assert slice(sample, 10) == record.window_slice(1.0 + border / 4, 3.5)
+
+
 def test_windows_that_share_a_border_partition_the_record() -> None:
     record = ramp(100, 0.01)
     cut = 0.3333
@@ -112,11 +121,50 @@ def test_windows_outside_the_record_or_empty_name_its_span(window: tuple[float, 
         ramp(100, 0.01).window(*window)
 
 
-def test_decimate_keeps_every_factor_th_sample_from_the_first() -> None:
+def test_decimate_thins_readings_and_never_the_drive() -> None:
     record = ramp(10, 0.01, 1.0)
     thinned = record.decimate(3)
-    assert [0.0, 3.0, 6.0, 9.0] == thinned.voltage.tolist()
-    np.testing.assert_allclose(record.time[::3], thinned.time, rtol=1e-14)
+    np.testing.assert_array_equal(record.voltage, thinned.voltage)
+    assert (record.interval, record.start) == (thinned.interval, thinned.start)
+    assert thinned.displacement is not None
+    assert [0, 3, 6, 9] == np.flatnonzero(thinned.has_reading).tolist()
+    assert [0.0, 6.0, 12.0, 18.0] == thinned.displacement[thinned.has_reading].tolist()
+
+
+def test_decimating_twice_is_decimating_by_the_product() -> None:
+    record = ramp(100)
+    assert record.decimate(6).sha256 == record.decimate(2).decimate(3).sha256
+    late = record.upto(1.0, first_reading=0.05).decimate(10)
+    assert [*range(5, 100, 10)] == np.flatnonzero(late.has_reading).tolist()
+
+
+def test_excluded_readings_are_missing_and_the_voltage_is_not() -> None:
+    record = ramp(100, 0.01).exclude([(0.0, 0.1), (0.5, 0.52)])
+    assert [*range(10), 50, 51] == np.flatnonzero(~record.has_reading).tolist()
+    np.testing.assert_array_equal(ramp().voltage, record.voltage)
+    with pytest.raises(InputError, match="reaches outside the record"):
+        record.exclude([(0.5, 1.5)])
+
+
+def test_late_first_reading_keeps_the_history_of_the_voltage() -> None:
+    record = ramp(100, 0.01, 5.0).upto(5.8, first_reading=5.2)
+    assert (80, 5.0, 60) == (record.samples, record.start, record.readings)
+    assert 20 == np.flatnonzero(record.has_reading)[0]
+    assert ramp(100, 0.01, 5.0).window(5.0, 5.8).sha256 == ramp(100, 0.01, 5.0).upto(5.8).sha256
+
+
+def test_a_record_needs_one_reading_and_all_missing_ones_are_alike() -> None:
+    voltage = np.arange(3.0)
+    with pytest.raises(InputError, match="displacement: holds no reading"):
+        Record(voltage, np.full(3, np.nan), 1.0)
+    other_nan = np.array([0x7FF8000000000001], dtype=np.uint64).view(np.float64)[0]
+    one, other = (Record(voltage, np.array([1.0, x, 2.0]), 1.0) for x in (np.nan, -other_nan))
+    assert one.sha256 == other.sha256
+    assert [True, False, True] == one.has_reading.tolist()
+    with pytest.raises(InputError, match="displacement: inf at sample 1"):
+        Record(voltage, np.array([np.nan, np.inf, 2.0]), 1.0)
+    with pytest.raises(InputError, match="voltage: nan at sample 1"):
+        Record(np.array([1.0, np.nan, 2.0]), voltage, 1.0)
 
 
 @pytest.mark.parametrize("factor", [0, -1, 1.5])
@@ -149,44 +197,6 @@ def test_split_refuses_windows_that_overlap_training(
 ) -> None:
     with pytest.raises(InputError, match=f"overlaps the {kind}"):
         ramp(100, 0.01).split(training, held_out)
-
-
-def reread(path: Path, voltage: FloatArray, displacement: FloatArray) -> Record:
-    write_record(Record(voltage, displacement, 0.001), path / "record.h5")
-    return read_record(path / "record.h5")
-
-
-SINE = np.sin(np.linspace(0.0, 12 * np.pi, 3000))
-
-
-@pytest.mark.parametrize("limits", [(-0.8, 2.0), (-2.0, 0.8)])
-@pytest.mark.parametrize("step", [1e-6, 0.01])
-def test_a_displacement_cut_off_at_its_limit_is_a_warning(
-    tmp_path: Path, limits: tuple[float, float], step: float
-) -> None:
-    clipped = np.clip(np.round(SINE / step) * step, *limits)
-    with pytest.warns(InputWarning, match=r"record\.h5:sample \d+: displacement_um: clipped"):
-        reread(tmp_path, SINE, clipped)
-
-
-TRAPEZOID = np.clip(SINE, -0.7, 0.7)
-SQUARE = np.sign(SINE + 1e-9)
-
-
-@pytest.mark.parametrize("step", [0.3, 0.1, 0.03, 0.01, 0.001])
-@pytest.mark.parametrize("shift", [0.0, 0.25, 0.5, 0.99])
-@pytest.mark.parametrize(
-    ("voltage", "lag"),
-    [(SINE, 0), (SINE, 40), (SINE, 125), (TRAPEZOID, 0), (TRAPEZOID, 20), (SQUARE, 1)],
-    ids=["sine", "lagging sine", "sine a quarter late", "plateaus", "late plateaus", "late steps"],
-)
-def test_a_coarse_sensor_alone_is_not_taken_for_a_clipped_one(
-    tmp_path: Path, step: float, shift: float, voltage: FloatArray, lag: int
-) -> None:
-    """Not at smooth peaks, whatever the phase, and not at rest on the highest plateau."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        reread(tmp_path, voltage, np.round(np.roll(voltage, lag) / step + shift) * step)
 
 
 def test_the_measured_record_is_read_without_a_warning() -> None:

@@ -83,6 +83,15 @@ def test_a_voltage_alone_survives(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("missing", [slice(3), slice(3, 8), slice(17, 20), slice(0, 20, 2)])
+def test_missing_readings_survive(tmp_path: Path, suffix: str, missing: slice) -> None:
+    displacement = np.cos(np.arange(20.0))
+    displacement[missing] = np.nan
+    record = Record(np.arange(20.0), displacement, 0.1, origin="gaps", truth=np.arange(20.0))
+    assert_same(record, through(record, tmp_path, suffix))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_part_of_a_long_record_survives_with_its_times(tmp_path: Path, suffix: str) -> None:
     """Times far from zero carry the rounding of the whole record, and must be uniform still."""
     voltage = np.sin(0.37 * np.arange(200_000))

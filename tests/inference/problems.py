@@ -125,14 +125,15 @@ def posterior_of(
     *,
     training: tuple[slice, ...] | None = None,
     priors: Mapping[str, Distribution] | None = None,
+    from_rest: bool = True,
 ) -> Posterior:
-    """Return the posterior with default priors."""
+    """Return the posterior with default priors, of a record that starts from rest."""
     model = noise_model(noise, actuator.interval)
     names = (*actuator.parameters, *model.parameters)
     ranges = Ranges.of(voltage, displacement, actuator.interval)
     prior = joint_prior(names, ranges, {"initial": 0.0} if fixed is None else fixed, priors)
     windows = training or (slice(0, voltage.size),)
-    return Posterior(voltage, displacement, windows, actuator, model, prior)
+    return Posterior(voltage, displacement, windows, actuator, model, prior, from_rest=from_rest)
 
 
 def short_posterior(

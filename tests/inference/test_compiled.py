@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import engine, kernels
+from bwbayes.inference import engine
 from bwbayes.inference.engine import choose
+from bwbayes.inference.lanes import LANES
 from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Dynamics
@@ -61,7 +62,7 @@ def test_engines_agree_on_either_hold(hold: Hold) -> None:
     assert_engines_agree(posterior, prior_draws(posterior, 40))
 
 
-@pytest.mark.parametrize("count", [1, kernels.LANES - 1, kernels.LANES, kernels.LANES + 1, 100])
+@pytest.mark.parametrize("count", [1, LANES - 1, LANES, LANES + 1, 100])
 def test_any_number_of_models_fits_the_lanes(count: int) -> None:
     posterior = short_posterior(dynamics="lag")
     assert_engines_agree(posterior, prior_draws(posterior, count))
@@ -71,6 +72,19 @@ def test_windows_start_anywhere() -> None:
     windows = (slice(3, 4), slice(10, 150), slice(150, 151), slice(190, 333))
     posterior = short_posterior(dynamics="lag", training=windows)
     assert_engines_agree(posterior, prior_draws(posterior, 40))
+
+
+@pytest.mark.parametrize("discrepancy_sd", [0.05, 0.2])
+def test_engines_agree_on_a_start_that_is_long_remembered(discrepancy_sd: float) -> None:
+    """A small discrepancy of long memory in a large noise: the filter settles in 200 samples or so.
+
+    What is off by a large constant, as for a bad model, keeps pulling at the start all that time.
+    """
+    posterior = short_posterior(samples=6000, dynamics="lag", fixed={})
+    theta = changed(
+        posterior, sensor_sd=1.0, discrepancy_sd=discrepancy_sd, discrepancy_time=20.0, offset=30.0
+    )
+    assert_engines_agree(posterior, theta)
 
 
 def test_a_general_exponent_is_left_to_numpy() -> None:

@@ -231,6 +231,45 @@ def test_a_walker_that_was_stuck_earlier_no_longer_blocks() -> None:
     assert [] == shortcomings(good_draws(), accepted)
 
 
+def test_a_walker_that_moved_once_and_stands_still_since_is_stuck() -> None:
+    """Its last two blocks are some 25 autocorrelation times of three steps; ten had moves."""
+    accepted = moving()
+    accepted[-2:, 1, 7] = 0
+    assert ["1 walkers are stuck"] == shortcomings(good_draws(), accepted)
+
+
+def test_walkers_that_keep_to_their_modes_in_one_parameter_are_told() -> None:
+    """The R-hat of walkers is the worst parameter's, whichever that is."""
+    assert check(good_draws(), moving(), BLOCK).walker_rhat < 1.02
+    for parameter in range(FREE):
+        draws = good_draws()
+        draws[:, :, ::2, parameter] += 4
+        found = check(draws, moving(), BLOCK)
+        assert found.walker_rhat > 1.5
+        assert any("of walkers" in text for text in found.shortcomings(1000))
+
+
+def test_effective_draws_of_the_tails_are_those_of_the_outer_twentieths() -> None:
+    """Draws that stay in a tail for long are few there, and hardly fewer in the body.
+
+    Arviz's estimate on the same draws differs by how it finds the quantile.
+    """
+    generator = np.random.default_rng(17)
+    draws = generator.standard_normal((2000, 4, 8, 1))
+    for start_of_stay in range(0, 2000, 20):
+        away = generator.random((4, 8, 1)) < 0.04
+        draws[start_of_stay : start_of_stay + 20, away] += 6
+    chains = as_chains(draws)
+    axes: dict[str, int] = {"chain_axis": 0, "draw_axis": 1}
+
+    def arvizs(part: float) -> float:
+        return float(array_stats.ess(chains, method="tail", prob=(part, 1 - part), **axes)[0])
+
+    _, tail = effective_draws(draws)
+    assert arvizs(0.05) == pytest.approx(tail[0], rel=0.05)
+    assert arvizs(0.25) > 2 * tail[0]
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", [(0, 0, 0, 0), (-1, 3, 5, 1), (slice(None), 2, 3, 0)])
 def test_what_is_not_finite_anywhere_never_counts_as_converged(

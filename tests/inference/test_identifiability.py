@@ -16,10 +16,11 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Sine, Waveform, identification_signal, verification_signal
+from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.identifiability import spectrum, undetermined
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
-from tests.inference.problems import posterior_of_record, short_posterior, truth
+from tests.inference.problems import TRUE_NOISE, posterior_of_record, short_posterior, truth
 
 FIXED = {"mass": 0.00134, "stiffness": 4.1e5, "initial": 0.0}
 
@@ -85,6 +86,28 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
 def test_decaying_amplitudes_leave_nothing_open(discrepancy: Discrepancy, seed: int) -> None:
     posterior = measured(identification_signal(), discrepancy, seed)
     assert [] == undetermined(posterior, at_truth(posterior))
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.03])
+def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float) -> None:
+    """With d alone, whose slope is the voltage, and a discrepancy of a percent of the range.
+
+    No stretch comes twice, so each counts; the discrepancy's time is half of a stretch.
+    """
+    known = {"alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0, "offset": 0.0}
+    prior = {"d": Distribution("lognormal", {"median": 0.7, "sigma": sigma})}
+    posterior = short_posterior("white", 400, fixed=known, priors=prior)
+    voltage = posterior.voltage
+    turns = 1 + np.count_nonzero(np.diff(np.sign(np.diff(voltage))))
+    lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
+    floor = 0.01 * np.ptp(posterior.displacement)
+    covariance = floor**2 * np.exp(-lags / (200 / turns)) + TRUE_NOISE["sensor_sd"] ** 2 * np.eye(
+        400
+    )
+    slope = 0.7 * sigma * voltage
+    expected = (1 + slope @ np.linalg.solve(covariance, slope)) ** -0.5
+    assert 0.1 < expected < 0.95
+    np.testing.assert_allclose(expected, left(posterior), rtol=0.03)
 
 
 def test_decaying_amplitudes_leave_less_open_than_a_sine_the_more_of_them_the_less() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import block_diag
+from scipy.signal import lfilter
 from scipy.stats import kstest, multivariate_normal, norm
 
 from bwbayes.arrays import FloatArray
@@ -104,7 +104,7 @@ def test_white_noise_is_exact_at_extreme_values(sensor: float) -> None:
 
 @pytest.mark.parametrize("kind", ["white", "discrepancy"])
 def test_windows_of_a_record_are_one_multivariate_normal(kind: NoiseKind) -> None:
-    """Its covariance has a block for each window: what lies between is independent and unseen."""
+    """One discrepancy goes through all windows; what lies between is only not seen."""
     windows = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 150))
     posterior = short_posterior(kind, 150, "lag", {}, training=windows)
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(11), 20))
@@ -115,19 +115,17 @@ def test_windows_of_a_record_are_one_multivariate_normal(kind: NoiseKind) -> Non
         named = dict(zip(posterior.prior.names, theta[row].tolist(), strict=True))
         scale = [named["sensor_sd"], named.get("discrepancy_sd", 0.0)]
         scaled = np.array([*scale, named.get("discrepancy_time", 1.0) / INTERVAL])
-        blocks = [covariance(scaled, window.stop - window.start) for window in windows]
-        dense = multivariate_normal(np.zeros(rows.size), block_diag(*blocks))
+        seen = covariance(scaled, rows[-1] + 1)[np.ix_(rows, rows)]
+        dense = multivariate_normal(np.zeros(rows.size), seen)
         assert_same(float(dense.logpdf(values)), got[row], rows.size)
 
 
 def steady(theta: FloatArray, residual: FloatArray) -> float:
     """Log density by the steady-state innovations alone, as if the filter had always run."""
-    sensor, process, time = theta
-    decay = 1 - np.exp(-2 / time)
-    half = decay * (process**2 - sensor**2) / 2
-    spread = half + np.sqrt(half**2 + decay * (process * sensor) ** 2) + sensor**2
-    white = DiscrepancyNoise(1.0).whiten(theta[np.newaxis], residual[np.newaxis])[0]
-    return float(np.sum(norm.logpdf(white) - np.log(spread) / 2))
+    state = DiscrepancyNoise(1.0).steady_state(theta[np.newaxis])
+    filters = (1.0, -state.kept[0]), (1.0, -np.exp(state.log_decay[0]))
+    sd = np.sqrt(state.variance[0])
+    return float(np.sum(norm.logpdf(lfilter(*filters, residual) / sd) - np.log(sd)))
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 10, 100])
@@ -223,18 +221,18 @@ def test_whitened_noise_is_white_with_unit_variance(theta: tuple[float, float, f
     samples = 20_000
     series = simulated(np.array(theta), samples, np.random.default_rng(9))
     noise = DiscrepancyNoise(1.0)
-    white = noise.whiten(np.array([theta]), np.stack([series, 2 * series]))
+    (white,), _ = noise.whiten(np.array([theta]), np.stack([series, 2 * series])[np.newaxis])
     np.testing.assert_allclose(2 * white[0], white[1])
-    settled = white[0, 2000:]
-    assert kstest(settled, "norm").pvalue > 1e-4
+    assert kstest(white[0], "norm").pvalue > 1e-4
     for lag in range(1, 6):
-        assert abs(np.mean(settled[lag:] * settled[:-lag])) < 4 / np.sqrt(settled.size)
+        assert abs(np.mean(white[0, lag:] * white[0, :-lag])) < 4 / np.sqrt(samples)
 
 
 def test_white_noise_that_is_whitened_as_another_is_not_white() -> None:
     """The twin: the check above notices a discrepancy that is left out."""
     series = simulated(np.array([0.5, 1.0, 20.0]), 20_000, np.random.default_rng(9))
-    left = DiscrepancyNoise(1.0).whiten(np.array([[1.2, 1e-9, 20.0]]), series[np.newaxis])[0]
+    theta = np.array([[1.2, 1e-9, 20.0]])
+    left = DiscrepancyNoise(1.0).whiten(theta, series[np.newaxis, np.newaxis])[0][0, 0]
     assert abs(np.mean(left[1:] * left[:-1])) > 4 / np.sqrt(left.size)
 
 
@@ -243,3 +241,31 @@ def test_marginal_sds_are_those_of_the_two_parts() -> None:
     assert (1.5, 0.5) == (discrepancy[0], sensor[0])
     discrepancy, sensor = WhiteNoise().marginal_sd(np.array([[0.5]]))
     assert (0.0, 0.5) == (discrepancy[0], sensor[0])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.sampled_from([0.0, 0.1, 0.5]))
+@settings(deadline=None, max_examples=60)
+def test_whitening_is_that_of_a_dense_covariance(seed: int, readings: int, missing: float) -> None:
+    """L⁻¹ of the Cholesky factor L, whatever readings are missing, for stretches of any length."""
+    generator = np.random.default_rng(seed)
+    theta = np.exp(generator.normal(0, 1, 3))
+    skipped = np.where(generator.uniform(size=readings) < missing, 1.5, 0.0)
+    skipped[0] = 0.0
+    series = generator.standard_normal((2, readings))
+    time = np.cumsum(1 + skipped)
+    apart = np.abs(np.subtract.outer(time, time))
+    dense = theta[1] ** 2 * np.exp(-apart / theta[2]) + theta[0] ** 2 * np.eye(readings)
+    factor = np.linalg.cholesky(dense)
+    (white,), (log_determinant,) = DiscrepancyNoise(1.0).whiten(
+        theta[np.newaxis], series[np.newaxis], skipped
+    )
+    np.testing.assert_allclose(white, np.linalg.solve(factor, series.T).T, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(log_determinant, 2 * np.sum(np.log(np.diag(factor))), atol=1e-8)
+
+
+def test_twin_a_gap_that_is_taken_for_one_step_is_found() -> None:
+    theta, series = np.array([[0.3, 1.0, 5.0]]), np.ones((1, 1, 80))
+    skipped = np.where(np.arange(80) == 40, 3.0, 0.0)
+    right = DiscrepancyNoise(1.0).whiten(theta, series, skipped)[0]
+    wrong = DiscrepancyNoise(1.0).whiten(theta, series, skipped / 3)[0]
+    assert np.max(np.abs(right - wrong)) > 1e-2

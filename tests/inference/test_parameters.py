@@ -19,7 +19,7 @@ from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, s
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
 ALL = (*HYSTERESIS, "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
-RANGES = Ranges(voltage=100.0, displacement=60.0, middle=3.0, interval=0.01)
+RANGES = Ranges(voltage=100.0, displacement=60.0, middle=3.0, time=0.5)
 
 WIDE = {
     # Priors that the constraints cut hard, on every side.
@@ -61,7 +61,7 @@ def test_coordinates_and_parameters_have_one_density(name: str) -> None:
     prior = PRIORS[name]
     z = 1.2 * np.random.default_rng(1).standard_normal((200, prior.dimensions))
     free, log_prior = prior.constrain(z)
-    step = 1e-5
+    step = 1e-4
     jacobians = np.empty((200, prior.dimensions, prior.dimensions))
     for column in range(prior.dimensions):
         move = step * np.eye(prior.dimensions)[column]

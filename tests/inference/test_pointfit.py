@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -12,7 +14,7 @@ from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator
+from bwbayes.model.actuator import Actuator, State
 from tests.inference.problems import posterior_of, short_posterior, truth
 
 CASES = ("white", "discrepancy", "lag")
@@ -100,36 +102,71 @@ def test_the_mode_is_the_first_optimum(fits: Fits, name: str) -> None:
     assert 1 == len(point.optima)
 
 
+@dataclass(frozen=True)
 class MirrorActuator(Actuator):
-    """A model that cannot tell the sign of its offset."""
+    """A model that tells the sign of its offset only by ``worse`` um from sample to sample."""
 
-    def displacement(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:  # type: ignore[override]
+    worse: float = 0.0
+
+    def advance(  # type: ignore[override]
+        self,
+        theta: FloatArray,
+        voltage: FloatArray,
+        state: State | None = None,
+        unrest: FloatArray | None = None,
+    ) -> tuple[FloatArray, State]:
         """Return the displacement, its offset taken as a size."""
-        return super().displacement(np.abs(theta), voltage)
+        moved, end = super().advance(np.abs(theta), voltage, state, unrest)
+        jagged = self.worse * (-1.0) ** np.arange(voltage.size)
+        return moved + jagged * (theta[:, -1:] < 0), end
 
 
-def test_several_optima_are_reported_as_distinct() -> None:
-    """A model with two mirrored solutions gives both, once each."""
+def mirrored(worse: float = 0.0) -> Posterior:
+    """Return a posterior with optima at offsets of 6 um and, worse or not, of -6 um."""
     usual = short_posterior(
         "white",
         200,
         fixed={"initial": 0.0, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172},
         priors={"offset": Distribution("normal", {"mean": 0.0, "sd": 10.0})},
     )
-    mirrored = Posterior(
+    return Posterior(
         usual.voltage,
         usual.displacement + 6.0,
         usual.training,
-        MirrorActuator("none", "first", 0.01),
+        MirrorActuator("none", "first", 0.01, worse),
         WhiteNoise(),
         usual.prior,
     )
-    point = fit(mirrored, np.random.default_rng(7))
-    assert ("d", "offset", "sensor_sd") == mirrored.names
-    free, _ = mirrored.prior.constrain(point.optima)
+
+
+def test_several_optima_are_reported_as_distinct() -> None:
+    """A model with two mirrored solutions gives both, once each."""
+    posterior = mirrored()
+    point = fit(posterior, np.random.default_rng(7))
+    assert ("d", "offset", "sensor_sd") == posterior.names
+    free, _ = posterior.prior.constrain(point.optima)
     np.testing.assert_allclose([-6.0, 6.0], np.sort(free[:, 1]), atol=0.15)
-    density = mirrored.log_density(point.optima)
+    density = posterior.log_density(point.optima)
     np.testing.assert_allclose(density[0], density[1], atol=1e-3)
+
+
+def test_the_mode_is_the_best_of_the_optima_and_one_not_much_worse_is_kept() -> None:
+    """The other is some nats worse: the sum of squares is 200 x 0.1^2 larger, at an sd of 0.3."""
+    posterior = mirrored(worse=0.1)
+    point = fit(posterior, np.random.default_rng(7))
+    free, _ = posterior.prior.constrain(point.optima)
+    np.testing.assert_allclose([6.0, -6.0], free[:, 1], atol=0.15)
+    density = posterior.log_density(point.optima)
+    assert density[0] == point.log_density
+    assert 3 < density[0] - density[1] < 30
+
+
+def test_an_optimum_that_is_much_worse_is_no_place_to_start_from() -> None:
+    """With residuals of 2 um instead of 0.3: two nats per sample."""
+    posterior = mirrored(worse=2.0)
+    point = fit(posterior, np.random.default_rng(7))
+    free, _ = posterior.prior.constrain(point.optima)
+    np.testing.assert_allclose([6.0], free[:, 1], atol=0.15)
 
 
 def test_noise_alone_can_be_fitted() -> None:
@@ -142,11 +179,22 @@ def test_noise_alone_can_be_fitted() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(residual**2)), sensor, rtol=0.01)
 
 
+class Impossible(WhiteNoise):
+    """A noise that no residual can have."""
+
+    def whiten(
+        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return innovations under an infinite determinant."""
+        white, log_determinant = super().whiten(theta, series, skipped)
+        return white, log_determinant + np.inf
+
+
 def test_without_a_finite_density_there_is_no_fit() -> None:
     usual = short_posterior("white", 50)
     posterior = posterior_of(
         usual.voltage, usual.displacement, usual.actuator, "white", {"initial": 0.0}
     )
-    posterior.displacement[10] = np.nan
+    posterior = replace(posterior, noise=Impossible())
     with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
         fit(posterior, np.random.default_rng(9))

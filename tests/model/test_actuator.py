@@ -68,6 +68,8 @@ def simulate(actuator: Actuator, theta: FloatArray, voltage: FloatArray) -> Floa
     follow = by_samples if model.exponent in (1.0, 2.0) else by_integration
     drive = value["d"] * voltage - follow(voltage, model, value["initial"])
     if actuator.dynamics == "none":
+        # A held drive changes just after the sample.
+        drive = drive if actuator.hold == "first" else np.concatenate([drive[:1], drive[:-1]])
         return np.asarray(drive + value["offset"])
     x, result = np.array([drive[0], 0.0]), [drive[0]]
     for now, following in pairwise(drive.tolist()):

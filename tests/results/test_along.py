@@ -130,6 +130,20 @@ def test_it_would_not_be_found_without_them(monkeypatch: pytest.MonkeyPatch) -> 
     assert errors(skewed_once(), noise(0.7)).max() > 100 * PROMISED
 
 
+@pytest.mark.parametrize("kind", ["skewed", "heavy"])
+def test_one_sample_whose_means_go_with_the_sds_is_found(kind: str) -> None:
+    """Draws have the same means at all samples, and at one of them wide draws have the far means.
+
+    On one side that is skewness, on both it is kurtosis; means alone, or sds alone, show neither.
+    """
+    sign, wide = np.tile([1.0, -1.0], 100), np.repeat([False, True], 100)
+    far = wide if kind == "heavy" else wide == (sign > 0)
+    means = np.tile(sign * np.tile(np.repeat([0.2, 1.0], 50), 2), (200, 1)).T
+    means[:, 85] = sign * np.where(far, 1.0, 0.2)
+    np.testing.assert_array_equal(np.sort(means[:, 0]), np.sort(means[:, 85]))
+    assert errors(means, np.where(wide, 1.5, 0.2)).max() < PROMISED
+
+
 def test_without_a_tolerance_every_promise_above_would_be_broken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

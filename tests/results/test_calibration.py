@@ -147,6 +147,13 @@ def test_band_holds_one_point_by_its_binomial_tails() -> None:
     assert np.max([below, above]) < 0.05 / 2
 
 
+def test_band_is_the_same_from_either_end() -> None:
+    """Uniform values less than u are as many as values above 1 - u."""
+    for count, level in ((150, 0.05), (500, 2e-4)):
+        band = ecdf_band(count, level)
+        np.testing.assert_allclose(band.lower, 1 - band.upper[::-1], atol=1e-12)
+
+
 # The verdict
 
 
@@ -182,6 +189,27 @@ def test_defect_of_one_statistic_is_told_by_its_name() -> None:
     assert all(text.startswith("e: ") for text in found.shortcomings), found.shortcomings
     assert found.statistics["e"].adjusted < FAMILY_LEVEL / 2
     assert found.statistics["e"].outside
+
+
+def test_ranks_among_199_draws_have_200_places() -> None:
+    """The lowest and the highest rank lie inside (0, 1) too, each over a 200th of it."""
+    made = entries(scores(RANKED + 1))
+    for rank, entry in enumerate(made):
+        entry["ranks"] = dict.fromkeys(NAMES, rank)
+    places = judged(made).positions * (RANKED + 1)
+    np.testing.assert_array_equal(np.arange(200)[:, np.newaxis] * np.ones(len(NAMES)), places // 1)
+
+
+def test_all_tests_together_share_the_family_level() -> None:
+    """Each of two tests of twelve statistics has a 24th of one in a hundred."""
+    found = judged(entries(scores(500)))
+    each = 0.01 / (2 * len(NAMES))
+    expected = ecdf_band(500, each)
+    np.testing.assert_array_equal(expected.lower, found.ecdf.lower)
+    np.testing.assert_array_equal(expected.upper, found.ecdf.upper)
+    assert smooth_power(500, each, 0.9) == found.power["10 % too small"]
+    # Twice the level is another band: counts are whole, and it could have been the same.
+    assert (ecdf_band(500, 2 * each).lower != found.ecdf.lower).any()
 
 
 def test_too_few_replicates_say_that_they_have_no_power() -> None:

@@ -12,13 +12,16 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 from bwbayes.results import prediction
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+from bwbayes.results.start import Started, started
 
 TRUTH = {
     "d": 0.7,
@@ -34,6 +37,10 @@ TRUTH = {
     "discrepancy_time": 0.2,
 }
 INTERVAL = 0.01
+
+
+def random() -> np.random.Generator:
+    return np.random.default_rng(2)
 
 
 def made(samples: int = 1200, offset: float = 5.0, start: float = 0.0) -> Record:
@@ -82,6 +89,7 @@ def posterior(record: Record) -> Posterior:
         actuator,
         noise,
         JointPrior(parameters),
+        from_rest=True,
     )
 
 
@@ -112,7 +120,9 @@ def accuracy(column: str) -> float:
 def test_bands_are_nested_in_level_and_in_kind(
     posterior: Posterior, draws: FloatArray, record: Record
 ) -> None:
-    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)})[0]
+    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)}, random())[
+        0
+    ]
     for inner, outer in pairwise(LEVELS):
         for kind in KINDS:
             assert (bands.lower[kind, outer] <= bands.lower[kind, inner]).all()
@@ -127,7 +137,7 @@ def test_a_window_is_the_same_part_of_the_whole_record(
 ) -> None:
     """One simulation from the first sample: a window does not start the model afresh."""
     windows = {"all": slice(0, record.samples), "late": slice(700, 900)}
-    whole, late = predict_windows(posterior, draws, record, windows)
+    whole, late = predict_windows(posterior, draws, record, windows, random())
     for (name, expected), (_, got) in zip(whole.columns(), late.columns(), strict=True):
         np.testing.assert_allclose(expected[700:900], got, atol=accuracy(name), err_msg=name)
     assert whole.training
@@ -138,9 +148,9 @@ def test_walking_through_in_other_pieces_changes_nothing(
     posterior: Posterior, draws: FloatArray, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     windows = {"late": slice(500, 1100)}
-    expected = predict_windows(posterior, draws, record, windows)[0]
+    expected = predict_windows(posterior, draws, record, windows, random())[0]
     monkeypatch.setattr(prediction, "PIECE", 97)
-    got = predict_windows(posterior, draws, record, windows)[0]
+    got = predict_windows(posterior, draws, record, windows, random())[0]
     for (name, one), (_, two) in zip(expected.columns(), got.columns(), strict=True):
         np.testing.assert_allclose(one, two, atol=accuracy(name), err_msg=name)
 
@@ -150,7 +160,9 @@ def test_the_mean_is_that_of_the_draws_simulations(
 ) -> None:
     theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
     expected = posterior.actuator.displacement(theta, record.voltage).mean(axis=0)
-    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)})[0]
+    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)}, random())[
+        0
+    ]
     np.testing.assert_allclose(expected, bands.mean, rtol=1e-9)
 
 
@@ -165,15 +177,27 @@ def test_an_unknown_state_widens_the_start_and_is_forgotten_later(
     assert width(unknown)[late].mean() < 0.5 * width(unknown)[:5].mean()
 
 
-def test_reachable_states_stay_inside_the_ceiling(
-    posterior: Posterior, draws: FloatArray, record: Record
-) -> None:
-    model = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
-    states = prediction._reachable(posterior, model, record.voltage, np.random.default_rng(0))
+def start_of(
+    posterior: Posterior, draws: FloatArray, record: Record, start: Start, seed: int = 0
+) -> Started:
+    theta = posterior.prior.theta(draws)
+    return started(posterior, theta, record, start, np.random.default_rng(seed))
+
+
+def initial(posterior: Posterior, begun: Started) -> FloatArray:
+    states: FloatArray = begun.model[:, posterior.actuator.parameters.index("initial")]
+    return states
+
+
+def test_reachable_states_stay_inside_the_ceiling(posterior: Posterior, draws: FloatArray) -> None:
+    planned = replace(made(), displacement=None, truth=None)
+    begun = start_of(posterior, draws, planned, Start())
     column = posterior.actuator.parameters.index
+    model = begun.model
     top = model[:, column("alpha")] / (model[:, column("beta")] + model[:, column("gamma")])
-    assert (np.abs(states) <= top).all()
-    assert (np.ptp(states, axis=0) > 0.5 * top).all()
+    part = initial(posterior, begun) / top
+    assert (np.abs(part) <= 1).all()
+    assert np.ptp(part) > 1
 
 
 def test_the_offset_comes_from_the_lead_in(posterior: Posterior, draws: FloatArray) -> None:
@@ -193,46 +217,167 @@ def test_the_lead_in_is_told_and_a_longer_one_tells_more(
     assert width(long).mean() < width(short).mean()
 
 
-def test_the_offsets_variance_is_that_of_the_conjugate_normal(
-    posterior: Posterior, draws: FloatArray
+@pytest.mark.parametrize("lead_in_from", [0.0, 2.0])
+def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
+    posterior: Posterior, draws: FloatArray, lead_in_from: float
 ) -> None:
-    """Against the dense normal equations for one draw."""
+    """Over many starts of one draw: mean and covariance of what is drawn, and the offset's sd."""
     record = made()
     assert record.displacement is not None
-    one = draws[:1]
-    mixed = prediction._draws(posterior, one)
-    states = np.zeros((1, 1))
-    informed = prediction._informed(
-        posterior, mixed, states, one, record, 100, np.random.default_rng(0)
-    )
-    sensor, sd, time = posterior.prior.theta(one)[0, -3:]
-    lags = np.abs(np.subtract.outer(np.arange(100), np.arange(100))) * INTERVAL
-    covariance = sd**2 * np.exp(-lags / time) + sensor**2 * np.eye(100)
-    model = mixed.model.copy()
-    model[:, posterior.actuator.parameters.index("initial")] = 0.0
-    model[:, posterior.actuator.parameters.index("offset")] = 0.0
-    rest = (
-        record.displacement[:100] - posterior.actuator.displacement(model, record.voltage[:100])[0]
-    )
-    weight = np.linalg.solve(covariance, np.ones(100))
-    wide = np.ptp(posterior.displacement)
-    precision = weight.sum() + 1 / wide**2
-    expected = (weight @ rest + np.mean(record.displacement[:100]) / wide**2) / precision
-    got = informed.model[0, posterior.actuator.parameters.index("offset")]
-    assert expected == pytest.approx(got, abs=1e-6)
-    assert precision**-0.5 == pytest.approx(informed.offset[0], rel=1e-6)
+    same = np.repeat(draws[:1], 4000, axis=0)
+    start = Start(lead_in=0.3, lead_in_from=lead_in_from)
+    begun = start_of(posterior, same, record, start)
+    offset = posterior.actuator.parameters.index("offset")
+    rows = np.arange(30) + round(lead_in_from / INTERVAL)
+    theta = posterior.prior.theta(draws[:1])
+    sensor, sd, time = theta[0, -3:]
+    lags = np.abs(np.subtract.outer(rows, rows)) * INTERVAL
+    noise = sd**2 * np.exp(-lags / time) + sensor**2 * np.eye(30)
+    lag = theta[0, posterior.prior.names.index("lag")]
+    response = np.stack([np.ones(30), np.exp(-rows * INTERVAL / lag)])
+    wide = np.ptp(posterior.readings.values), theta[0, 0] * np.ptp(record.voltage) / 2
+    # Of the starts drawn, those whose h lies near the median's: given h all is normal.
+    states = initial(posterior, begun)
+    near = np.abs(states - np.median(states)) < 0.2 * np.std(states)
+    model = begun.model[near].mean(axis=0)[np.newaxis]
+    model[:, offset] = 0.0
+    clean = posterior.actuator.displacement(model, record.voltage)[0]
+    residual = record.displacement[rows] - clean[rows]
+    centre = np.array([np.mean(record.displacement[rows]), 0.0])
+    inverse = np.linalg.inv(noise)
+    precision = np.diag(np.array(wide) ** -2.0) + response @ inverse @ response.T
+    covariance = np.linalg.inv(precision)
+    mean = centre + covariance @ response @ inverse @ (residual - centre @ response)
+    got = begun.model[near, offset].mean(), begun.unrest[near, 0].mean()
+    spread = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(mean, got, atol=0.1 * spread.max())
+    left = covariance[0, 0] - covariance[0, 1] ** 2 / covariance[1, 1]
+    np.testing.assert_allclose(begun.offset_sd, np.sqrt(left), rtol=1e-4)
+    total = np.sqrt(np.var(begun.model[near, offset]) + left)
+    assert total == pytest.approx(spread[0], rel=0.15)
 
 
 def test_a_lead_in_finds_the_initial_state(posterior: Posterior, draws: FloatArray) -> None:
     """With a record from rest, informed draws start nearer to rest than uninformed ones."""
     record = made()
-    mixed = prediction._draws(posterior, draws)
-    generator = np.random.default_rng(0)
-    states = prediction._reachable(posterior, mixed.model, record.voltage, generator)
-    states[0] = 0.0
-    informed = prediction._informed(posterior, mixed, states, draws, record, 200, generator)
-    start = informed.model[:, posterior.actuator.parameters.index("initial")]
-    assert np.sqrt(np.mean(start**2)) < 0.5 * np.sqrt(np.mean(states[1:] ** 2))
+    planned = replace(record, displacement=None, truth=None)
+    informed = initial(posterior, start_of(posterior, draws, record, Start(lead_in=2.0)))
+    blind = initial(posterior, start_of(posterior, draws, planned, Start()))
+    assert np.sqrt(np.mean(informed**2)) < 0.5 * np.sqrt(np.mean(blind**2))
+
+
+def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior) -> None:
+    """Mean and sd of the hysteretic state against 2,000 nodes, for three seeds."""
+    record = made(start=0.7)
+    centre = np.array([TRUTH[name] for name in posterior.names])
+    same = np.tile(centre, (2000, 1))
+    begun = [start_of(posterior, same, record, Start(), seed) for seed in range(3)]
+    states = [initial(posterior, one) for one in begun]
+    window = Start().window(record)
+    assert window is not None
+    assert record.displacement is not None
+    theta = np.tile(posterior.prior.theta(centre[np.newaxis]), (2000, 1))
+    nodes = np.linspace(np.min(states) - 1, np.max(states) + 1, 2000)
+    theta[:, posterior.prior.names.index("initial")] = nodes
+    theta[:, posterior.prior.names.index("offset")] = np.mean(record.displacement[window])
+    likelihood = Likelihood(
+        record.voltage,
+        Readings.of(record.displacement, [window]),
+        posterior.actuator,
+        posterior.noise,
+        "numpy",
+        from_rest=False,
+        half_range=float(np.ptp(np.concatenate([record.voltage, posterior.voltage]))) / 2,
+        offset_sd=float(np.ptp(posterior.readings.values)),
+    )
+    density = likelihood.log_density(theta)
+    weight = np.exp(density - density.max())
+    weight /= weight.sum()
+    mean = float(weight @ nodes)
+    sd = float(np.sqrt(weight @ (nodes - mean) ** 2))
+    for one in states:
+        assert np.mean(one) == pytest.approx(mean, abs=0.05 * sd)
+        assert np.std(one) == pytest.approx(sd, rel=0.05)
+
+
+def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray) -> None:
+    """A command acts when it is held, whatever the training record's voltage was."""
+    planned = replace(made(), displacement=None, truth=None)
+    output = predicted(posterior, draws, planned, Start(from_rest=True))
+    command = predicted(
+        posterior, draws, replace(planned, voltage_is="command"), Start(from_rest=True)
+    )
+    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
+    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
+    held = replace(posterior.actuator, hold="zero").displacement(theta, planned.voltage)
+    np.testing.assert_allclose(held.mean(axis=0), command.mean, rtol=1e-9)
+    assert np.max(np.abs(command.mean - output.mean)) > 0.5
+    given = predicted(
+        posterior,
+        draws,
+        replace(planned, voltage_is="command"),
+        Start(from_rest=True, hold="first"),
+    )
+    np.testing.assert_allclose(output.mean, given.mean, rtol=1e-9)
+
+
+def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
+    planned = replace(made(start=1.2), displacement=None, truth=None)
+    bands = predicted(posterior, draws, planned, Start(from_rest=True))
+    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
+    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
+    path = np.concatenate([[0.0], np.full(3000, planned.voltage[0]), planned.voltage])
+    expected = posterior.actuator.displacement(theta, path)[:, 3001:].mean(axis=0)
+    np.testing.assert_allclose(expected, bands.mean, atol=1e-6)
+
+
+def test_a_lead_in_that_fits_passes_and_one_of_another_actuator_does_not(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    record = made(start=0.4)
+    assert record.displacement is not None
+    good = predicted(posterior, draws, record, Start()).lead_in
+    drifting = replace(record, displacement=record.displacement + 40 * record.time**2)
+    stretched = replace(record, displacement=1.5 * record.displacement)
+    assert good is not None
+    assert good.p_value > 0.01
+    assert (good.start, good.stop, good.samples) == (0.0, 1.0, 100)
+    for bad in (drifting, stretched):
+        told = predicted(posterior, draws, bad, Start()).lead_in
+        assert told is not None
+        assert told.p_value < 0.002
+
+
+def test_a_window_of_another_record_is_that_part_of_the_whole(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    record = made(start=0.4)
+    whole = predicted(posterior, draws, record, Start())
+    part = predict_record(
+        posterior, draws, record, Start(), np.random.default_rng(3), window=(3.0, 7.0)
+    )
+    assert (100, 0) == (whole.scored_from, part.scored_from)
+    for (name, expected), (_, got) in zip(whole.columns(), part.columns(), strict=True):
+        np.testing.assert_allclose(expected[300:700], got, atol=accuracy(name), err_msg=name)
+    with pytest.raises(InputError, match="lead-in leaves nothing of the window"):
+        predict_record(
+            posterior, draws, record, Start(), np.random.default_rng(3), window=(0.0, 0.5)
+        )
+
+
+def test_missing_readings_are_not_judged_and_bands_go_on(
+    posterior: Posterior, draws: FloatArray
+) -> None:
+    record = made(start=0.4)
+    assert record.displacement is not None
+    reading = record.displacement.copy()
+    reading[::7] = np.nan
+    bands = predicted(posterior, draws, replace(record, displacement=reading), Start())
+    assert bands.pit is not None
+    assert bands.crps is not None
+    np.testing.assert_array_equal(np.isnan(reading), np.isnan(bands.pit))
+    np.testing.assert_array_equal(np.isnan(reading), np.isnan(bands.crps))
+    assert np.isfinite(bands.upper["sensor", 95]).all()
 
 
 def test_a_planned_voltage_has_the_training_records_offset(
@@ -252,7 +397,7 @@ def test_another_sampling_interval_gives_the_same_bands(
     posterior: Posterior, draws: FloatArray
 ) -> None:
     fine = replace(made(), displacement=None, truth=None)
-    coarse = fine.decimate(2)
+    coarse = replace(fine, voltage=fine.voltage[::2], interval=2 * fine.interval)
     expected = predicted(posterior, draws, fine, Start(from_rest=True))
     got = predicted(posterior, draws, coarse, Start(from_rest=True))
     # Straight lines between every second sample leave a little of the sine out.
@@ -266,6 +411,15 @@ def test_a_lead_in_that_leaves_nothing_is_refused(
 ) -> None:
     with pytest.raises(InputError, match="lead-in"):
         predicted(posterior, draws, made(), Start(lead_in=lead_in))
+
+
+def test_thinning_takes_draws_from_anywhere() -> None:
+    """A thousand of ten thousand: their mean is known to 87, and late ones are among them."""
+    every = np.arange(10_000.0)[:, np.newaxis]
+    kept = thinned(every, np.random.default_rng(0), 1000)
+    assert 5000 == pytest.approx(np.mean(kept), abs=4 * 87)
+    assert np.min(kept) < 100
+    assert np.max(kept) > 9900
 
 
 def test_thinning_takes_each_draw_at_most_once(draws: FloatArray) -> None:

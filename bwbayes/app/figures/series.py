@@ -73,7 +73,7 @@ def _around_largest_error(bands: Bands) -> slice:
     size = bands.time.size
     first = min(bands.scored_from, size - 1)
     error = bands.mean if bands.measured is None else bands.measured - bands.mean
-    at = first + int(np.argmax(np.abs(error[first:])))
+    at = first + int(np.argmax(np.nan_to_num(np.abs(error[first:]))))  # a reading may be missing
     width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
     reach = max(int(ZOOM_PART * size / 2), LEAST_ZOOM)
     near = bands.mean[max(at - reach, 0) : at + reach + 1]

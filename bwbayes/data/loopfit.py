@@ -1,0 +1,186 @@
+"""What the voltage alone says about the displacement: a quick regression that knows of loops.
+
+A displacement follows the voltage with a lag and along hysteresis loops. :func:`fit_loop` fits a
+sum of play operators of the lagged voltage (any loop that closes is one, nearly) by least squares:
+no physics to be had from it, but what it leaves over is what no actuator does by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.data.patterns import Decay, turning_points
+from bwbayes.data.record import Record
+
+__all__ = ["LoopFit", "fit_loop"]
+
+# Half widths of the plays, as parts of half the voltage's range.
+WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])
+FREE_STARTS = slice(2, None, 2)  # plays whose state at the start is free
+MOST_ROWS = 3000  # of each kind: evenly spaced, and extremes of the voltage
+EARLY_ROWS = 400
+LAGS = 9
+DECAYS = 20
+
+
+@dataclass(frozen=True)
+class LoopFit:
+    """What a record's displacement has to do with its voltage.
+
+    Parameters
+    ----------
+    rows : array (rows,)
+        The samples that were looked at, all with readings.
+    residual : array (rows,), um
+        What the loops, the decay and the trend leave over.
+    gain : float, um/V
+        Displacement per volt of a large, slow drive.
+    lag : float, s
+        Time constant with which the displacement follows.
+    decay : Decay
+        What dies out from the first reading on, whatever the voltage does; um and s.
+    trend : float, um
+        How far the displacement goes from the first reading to the last at equal voltages.
+    trend_told : float
+        Part of a trend that loops do not imitate, at most 1; with little of it `trend` means none.
+    explained : float
+        Part of the displacement's variance that the voltage explains, at most 1.
+    """
+
+    rows: IntArray
+    residual: FloatArray
+    gain: float
+    lag: float
+    decay: Decay
+    trend: float
+    trend_told: float
+    explained: float
+
+
+def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
+    """Fit loops to a record, but for the samples that are `left_out`, (samples,)."""
+    assert record.displacement is not None
+    kept = record.has_reading if left_out is None else record.has_reading & ~left_out
+    rows = _rows(record.voltage, np.flatnonzero(kept))
+    judged = kept[rows]
+    displacement = record.displacement[rows[judged]]
+    time = record.time[rows]
+    centred = displacement - displacement.mean()
+
+    elapsed = time[judged] - time[judged][0]
+    trend_shape = elapsed / elapsed[-1] - 0.5
+    times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, DECAYS)
+    decays = np.exp(-elapsed[:, np.newaxis] / times)
+
+    best: tuple[float, FloatArray, float, int] | None = None
+    for lag in _lags(record):
+        basis = _basis(_lagged(record.voltage, lag / record.interval)[rows], judged)
+        basis = np.column_stack([basis, trend_shape])
+        left, which = _best_decay(basis, decays, centred)
+        if best is None or left < best[0]:
+            best = left, basis, lag, which
+    assert best is not None
+    _, basis, lag, which = best
+    whole = np.column_stack([basis, decays[:, which]])
+    products = _products(whole, centred[:, np.newaxis])
+    among = _products(whole, whole)
+    coefficients = _inverse(among) @ products[:, 0]
+    loops = among[:-2, -2]  # the products of the loops' columns with the trend's
+    imitated = float(loops @ _inverse(among[:-2, :-2]) @ loops)
+    residual = centred - (whole * coefficients).sum(axis=1)
+    undriven = (whole[:, -2:] * coefficients[-2:]).sum(axis=1)
+    driven = centred - undriven
+    lagged = basis[:, 1] - basis[:, 1].mean()
+    return LoopFit(
+        rows[judged],
+        residual,
+        float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
+        lag,
+        Decay(float(coefficients[-1]), float(times[which])),
+        float(coefficients[-2]),
+        1 - imitated / float(trend_shape @ trend_shape),
+        1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
+    )
+
+
+def _rows(voltage: FloatArray, kept: IntArray) -> IntArray:
+    """Return the samples to look at: the voltage's extremes all along, and readings, more early."""
+    evenly = kept[:: -(-kept.size // MOST_ROWS)]
+    early = kept[np.geomspace(1, kept.size, EARLY_ROWS).astype(np.int64) - 1]
+    size = -(-2 * voltage.size // MOST_ROWS)
+    whole = voltage[: voltage.size // size * size].reshape(-1, size)
+    first = size * np.arange(len(whole))
+    extremes = np.concatenate([first + whole.argmin(axis=1), first + whole.argmax(axis=1)])
+    return np.unique(np.concatenate([[0], evenly, early, extremes]))
+
+
+def _lags(record: Record) -> FloatArray:
+    """Return the lags to try, s: none, and from half an interval to a part of a half turn."""
+    least = 0.1 * float(np.ptp(record.voltage))
+    turns = turning_points(record.voltage, least)
+    slowest = 0.3 * record.interval * float(np.median(np.diff(turns)))
+    lags = np.geomspace(0.5 * record.interval, max(slowest, record.interval), LAGS)
+    return np.concatenate([[0.0], lags])
+
+
+def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
+    """Return the voltage behind a first-order lag that is settled at its start."""
+    if samples == 0:
+        return voltage
+    kept = np.exp(-1 / samples)
+    shifted = voltage - voltage[0]
+    lagged: FloatArray = voltage[0] + lfilter([1 - kept], [1.0, -kept], shifted)
+    return lagged
+
+
+def _basis(voltage: FloatArray, judged: BoolArray) -> FloatArray:
+    """Return columns that span the loops of a voltage (rows,), at the rows that are judged."""
+    low, high = float(voltage.min()), float(voltage.max())
+    half = max((high - low) / 2, 1e-300)
+    scaled = (voltage - (low + high) / 2) / half
+    starts = scaled[0] + np.concatenate([np.zeros(WIDTHS.size), WIDTHS[FREE_STARTS]])
+    widths = np.concatenate([WIDTHS, WIDTHS[FREE_STARTS]])
+    plays = np.empty((scaled.size, widths.size))
+    state = starts
+    for row, value in enumerate(scaled):
+        state = np.minimum(np.maximum(state, value - widths), value + widths)
+        plays[row] = state
+    # What another state at the start would change, until the drive has wiped it out.
+    unknown = plays[:, WIDTHS.size :] - plays[:, : WIDTHS.size][:, FREE_STARTS]
+    plays = half * plays[:, : WIDTHS.size]
+    columns = [np.ones(scaled.size), half * scaled, *plays.T, scaled**2, *unknown.T]
+    return np.column_stack(columns)[judged]
+
+
+def _best_decay(basis: FloatArray, decays: FloatArray, values: FloatArray) -> tuple[float, int]:
+    """Return the least sum of squares with the basis and one decay, and which decay that is."""
+    columns = np.column_stack([decays, values])
+    among = _products(basis, columns)
+    left = _products(columns, columns) - among.T @ _inverse(_products(basis, basis)) @ among
+    power = np.diag(left)[:-1]
+    told = power > 1e-3 * (decays**2).sum(axis=0)
+    gained = np.where(told, left[-1, :-1] ** 2 / np.maximum(power, 1e-300), 0.0)
+    which = int(np.argmax(gained))
+    return float(left[-1, -1] - gained[which]), which
+
+
+def _products(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return ``left.T @ right`` of tall matrices, without the threads of a linear algebra library.
+
+    Their start takes many times longer than the work.
+    """
+    result: FloatArray = np.einsum("ni,nj->ij", left, right)
+    return result
+
+
+def _inverse(products: FloatArray) -> FloatArray:
+    """Return the inverse of a matrix of products, without directions that are nearly dependent."""
+    scale = np.sqrt(np.maximum(np.diag(products), 1e-300))
+    sizes, directions = np.linalg.eigh(products / np.outer(scale, scale))
+    kept = directions[:, sizes > 1e-9 * sizes[-1]] / scale[:, np.newaxis]
+    result: FloatArray = (kept / sizes[sizes > 1e-9 * sizes[-1]]) @ kept.T
+    return result

@@ -1,0 +1,90 @@
+"""A drive's own times and speeds, whatever the sampling rate.
+
+The voltage alone decides: a record and its every k-th sample have the same turning points, and
+noise on a measured voltage makes none, because a turn counts only where the voltage comes back by a
+part of its range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.model.boucwen import monotone_stretches
+
+__all__ = ["fastest", "stretch_times", "time_between_turns", "turning_points"]
+
+# Part of the range by which the voltage must come back for a turn to count. A sensor's noise and a
+# DAC's steps are well below it; the smallest loops of a decaying drive do not matter for a scale.
+RETURN = 0.05
+
+
+def turning_points(voltage: FloatArray, least: float | None = None) -> IntArray:
+    """Return the samples (turns,) at which a voltage (samples,) turns by ``least`` V or more.
+
+    By default a twentieth of the voltage's range.
+    """
+    least = RETURN * float(np.ptp(voltage)) if least is None else least
+    if not least > 0:
+        return np.array([], dtype=np.int64)
+    # Only where the voltage turns at all can it turn by that much.
+    ends = [stretch.last for stretch in monotone_stretches(voltage)]
+    turns: list[int] = []
+    direction, furthest = 1.0, 0
+    for end, reached in zip(ends, voltage[ends].tolist(), strict=True):
+        back = direction * (voltage[furthest] - reached)
+        if back <= 0:
+            furthest = end
+        elif back >= least:
+            turns.append(furthest)
+            direction, furthest = -direction, end
+    # A voltage that goes down first has turned nowhere yet.
+    return np.array([turn for turn in turns if turn > 0], dtype=np.int64)
+
+
+def stretch_times(
+    voltage: FloatArray, interval: float, windows: Sequence[slice] = (slice(None),)
+) -> FloatArray:
+    """Return how long the voltage goes one way, (stretches,), s, within windows of a record.
+
+    A window's borders cut stretches too; one without a turn is one stretch.
+    """
+    inside = np.concatenate([voltage[window] for window in windows])
+    least = RETURN * float(np.ptp(inside))
+    times = []
+    for window in windows:
+        part = voltage[window]
+        edges = np.concatenate([[0], turning_points(part, least), [part.size - 1]])
+        times.append(np.diff(edges) * interval)
+    joined = np.concatenate(times)
+    return joined[joined > 0]
+
+
+def time_between_turns(
+    voltage: FloatArray, interval: float, windows: Sequence[slice] = (slice(None),)
+) -> float:
+    """Return the typical time between turning points, s: of a sine, half its period.
+
+    For half of the time, the voltage is on a stretch that takes this long or longer; so a long rest
+    before the drive does not count for more than it lasts. At rest, or without a turn, it is the
+    length of the (longest) window.
+    """
+    times = np.sort(stretch_times(voltage, interval, windows))
+    if times.size == 0:
+        return interval
+    passed = np.cumsum(times)
+    return float(times[np.searchsorted(passed, passed[-1] / 2)])
+
+
+def fastest(
+    voltage: FloatArray, interval: float, over: float, windows: Sequence[slice] = (slice(None),)
+) -> float:
+    """Return the largest speed, V/s, at which the voltage moves for ``over`` s (a sample, if less).
+
+    A mean over that time, so that a measured voltage's noise counts for little.
+    """
+    lag = max(round(over / interval), 1)
+    moved = [np.abs(v[lag:] - v[:-lag]) for v in (voltage[w] for w in windows) if v.size > lag]
+    return max([float(np.max(one)) for one in moved], default=0.0) / (lag * interval)

@@ -1,0 +1,245 @@
+"""The likelihood of one record: forward model and noise, and what is unknown of its start.
+
+A record that starts in the middle of a drive finds the dynamics in motion: the displacement is not
+where the drive would hold it. How far off it is, and how fast it moves, adds a free response that
+dies out with the dynamics' own times. It enters the displacement linearly, and so does an offset
+of the record's own. Given the other parameters all of these are jointly normal, so a
+:class:`Likelihood` integrates them out exactly, and tells where they lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.noise import LOG_TWO_PI, Noise
+from bwbayes.inference.readings import Readings
+from bwbayes.model.actuator import Actuator
+
+__all__ = ["Likelihood", "LinearStart", "Moments", "batches"]
+
+# Models simulated together: enough to share the loop over turns, few enough for the memory.
+BATCH = 64
+ELEMENTS = 1 << 23
+CACHED = 1 << 16
+
+# What is below exp(-50) of its size adds nothing.
+FORGOTTEN = 50.0
+
+
+def batches(models: int, samples: int, elements: int = ELEMENTS) -> Iterator[slice]:
+    """Cut a number of models into batches of so many elements, by default what memory holds."""
+    size = min(max(elements // samples, 1), BATCH)
+    return (slice(i, min(i + size, models)) for i in range(0, models, size))
+
+
+class Moments(NamedTuple):
+    """What the density needs of whitened series: the residual, then the unknowns' responses.
+
+    ``products`` (models, 1 + unknowns, 1 + unknowns) are Σ zᵢ zⱼ, ``log_determinant`` (models,) is
+    that of the noise's covariance.
+    """
+
+    products: FloatArray
+    log_determinant: FloatArray
+
+
+class LinearStart(NamedTuple):
+    """The normal posterior of a record's unknown start, given all other parameters.
+
+    ``log_density`` (models,) of the readings, the start integrated out; ``squares`` (models,), the
+    squared distance of the readings from what is expected, which has a χ² distribution if the
+    model is right; ``mean`` (models, unknowns) and ``covariance`` (models, unknowns, unknowns), um
+    and um².
+    """
+
+    log_density: FloatArray
+    squares: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """The likelihood of one record.
+
+    The readings are r = x(θ) + Σ ξᵢ fᵢ + noise, with independent ξᵢ ~ N(0, σᵢ²): fᵢ are the free
+    responses of the dynamics, σᵢ = d times half the voltage's range; the record's own offset, if it
+    has one, comes first, with f = 1.
+
+    Parameters
+    ----------
+    voltage
+        (samples,), V, from the record's first sample on.
+    readings
+        What was read of the displacement, and when.
+    actuator, noise
+        The model; θ has the actuator's parameters, then the noise's. ``actuator.interval`` is that
+        of the samples.
+    engine
+        What computes it; see :mod:`bwbayes.inference.engine`.
+    from_rest
+        The actuator is demagnetised and at rest when the record starts: nothing is unknown, and
+        the initial h of θ is the one at zero volts before.
+    half_range
+        Half the range of the voltages that the actuator may have seen, V.
+    offset_sd
+        Prior sd of an offset of the record's own beside that of θ, um; zero if it has none.
+    """
+
+    voltage: FloatArray
+    readings: Readings
+    actuator: Actuator
+    noise: Noise
+    engine: Engine
+    from_rest: bool
+    half_range: float
+    offset_sd: float = 0.0
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """The readings (samples,), um, at their samples; zero elsewhere."""
+        values = np.zeros(self.readings.samples)
+        values[self.readings.rows] = self.readings.values
+        return values
+
+    @cached_property
+    def skipped(self) -> FloatArray:
+        """Readings missing just before each sample's (samples,); −1 where there is no reading."""
+        skipped = np.full(self.readings.samples, -1.0)
+        skipped[self.readings.rows] = self.readings.skipped
+        return skipped
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """Log density (models,) of the readings at θ (models, parameters)."""
+        return self.start(theta).log_density
+
+    def start(self, theta: FloatArray) -> LinearStart:
+        """Integrate the unknown start out at θ (models, parameters), and say where it lies.
+
+        With whitened series z₀ of the residual and Z of the responses, P = diag(σ²):
+
+            log p = −½ (|z₀ − Z μ|² + μᵀ P⁻¹ μ + log det V + log det(1 + P Zᵀ Z) + n log 2π),
+            μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
+        """
+        products, log_determinant = self.moments(theta)
+        sd = self.start_sd(theta)
+        scaled = products[:, 1:, 1:] * sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
+        precision = np.eye(sd.shape[1]) + scaled
+        pull = sd * products[:, 1:, 0]
+        covariance = np.linalg.inv(precision)
+        mean = np.einsum("mij,mj->mi", covariance, pull)
+        squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
+        logs = log_determinant + np.linalg.slogdet(precision)[1]
+        density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
+        covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
+        return LinearStart(density, squares, sd * mean, covariance)
+
+    def start_sd(self, theta: FloatArray) -> FloatArray:
+        """Prior sd (models, unknowns) of the unknown start, um."""
+        unknowns = 0 if self.from_rest else self.actuator.unknowns
+        gain = theta[:, self.actuator.parameters.index("d")]
+        sd = np.repeat((gain * self.half_range)[:, np.newaxis], unknowns, axis=1)
+        if self.offset_sd:
+            sd = np.concatenate([np.full((len(sd), 1), self.offset_sd), sd], axis=1)
+        return sd
+
+    @property
+    def spaced(self) -> Noise:
+        """The noise for the interval between readings."""
+        return self.noise.at(self.actuator.interval * self.readings.stride)
+
+    @property
+    def unknown(self) -> bool:
+        """Tell whether anything is unknown of the start."""
+        return bool(self.offset_sd) or not (self.from_rest or self.actuator.unknowns == 0)
+
+    def started(self, theta: FloatArray) -> FloatArray:
+        """Return θ (models, parameters) with the h at the record's first sample as initial one."""
+        if self.from_rest and self.voltage[0] != 0:
+            return self.actuator.at_rest(theta, float(self.voltage[0]))
+        return theta
+
+    def moments(self, theta: FloatArray) -> Moments:
+        """Whiten the residual and the unknowns' responses at θ (models, parameters)."""
+        theta = self.started(theta)
+        if self.engine == "numba":
+            # Here, because numba may not be installed, and takes half a second to load.
+            from bwbayes.inference import compiled  # noqa: PLC0415
+
+            return Moments(
+                *compiled.moments(
+                    theta,
+                    self.voltage[: self.readings.samples],
+                    self.values,
+                    self.skipped,
+                    self.actuator,
+                    self.spaced,
+                    int(self.offset_sd > 0),
+                    0 if self.from_rest else self.actuator.unknowns,
+                )
+            )
+        pieces = batches(len(theta), self.readings.samples)
+        parts = [self._moments(theta[piece]) for piece in pieces]
+        return Moments(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def _moments(self, theta: FloatArray) -> Moments:
+        """Do it with NumPy for one batch of models."""
+        size, readings = len(self.actuator.parameters), self.readings
+        model, noise = theta[:, :size], theta[:, size:]
+        simulated = self.actuator.displacement(model, self.voltage[: readings.samples])
+        residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
+        spaced = self.spaced
+        responses = self._responses(model, spaced.steady_state(noise).log_decay)
+        skipped, heard = readings.skipped, responses.shape[2]
+        parts = []
+        # A few models at a time: what is whitened then stays in the cache.
+        for piece in batches(len(theta), readings.rows.size, CACHED):
+            white, log_determinant = spaced.whiten(noise[piece], residual[piece], skipped)
+            pulls, _ = spaced.whiten(noise[piece], responses[piece], skipped[:heard])
+            series = [white[:, 0], *np.moveaxis(pulls, 1, 0)]
+            parts.append((_products(series, heard), log_determinant))
+        return Moments(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def _responses(self, model: FloatArray, log_decay: FloatArray) -> FloatArray:
+        """Unknowns' responses (models, unknowns, readings), as long as the noise hears of them.
+
+        An offset stays; a free response dies out with the dynamics, and the filter of the noise
+        (``log_decay`` per reading) forgets it.
+        """
+        rows = self.readings.rows
+        column = dict(zip(self.actuator.parameters, model.T, strict=True))
+        recursion = self.actuator.recursion(column)
+        unknowns = 0 if self.from_rest else recursion.unknowns
+        if self.offset_sd:
+            heard = rows.size
+        elif unknowns:
+            with np.errstate(divide="ignore"):
+                slowest = max(float(np.max(np.log(recursion.remembered))), -FORGOTTEN)
+            far = FORGOTTEN + rows * slowest < 0
+            far &= FORGOTTEN + np.arange(rows.size) * np.max(log_decay) < 0
+            heard = int(np.argmax(far)) if far[-1] else rows.size
+        else:
+            heard = 0
+        free = recursion.free_responses(int(rows[heard - 1]) + 1 if heard and unknowns else 0)
+        parts = [free[:, :unknowns, rows[:heard]] if unknowns else np.empty((len(model), 0, heard))]
+        if self.offset_sd:
+            parts.insert(0, np.ones((len(model), 1, heard)))
+        return np.concatenate(parts, axis=1)
+
+
+def _products(series: list[FloatArray], heard: int) -> FloatArray:
+    """Σ zᵢ zⱼ (models, series, series); all series but the first (models, readings) are shorter."""
+    products = np.empty((len(series[0]), len(series), len(series)))
+    for i, one in enumerate(series):
+        for j, other in enumerate(series[: i + 1]):
+            # Sums, not dot products: a linear algebra library may split those over threads.
+            product = np.sum(one**2 if i == j else one * other[:, :heard], axis=1)
+            products[:, i, j] = products[:, j, i] = product
+    return products

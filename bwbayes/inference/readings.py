@@ -1,0 +1,71 @@
+"""Readings: which samples of a record the likelihood looks at.
+
+The model is simulated along every voltage sample; only some samples have a reading that counts:
+those inside the training windows that are not missing. :class:`Readings` says which these are and
+how far apart, so that the noise knows how much of its discrepancy is left from one to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.errors import InputError
+
+__all__ = ["Readings"]
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of a record, in order of time.
+
+    Parameters
+    ----------
+    rows
+        (readings,) the sample of each.
+    values
+        (readings,), um.
+    stride
+        Samples from one reading to the next, where none is missing.
+    skipped
+        (readings,) readings that are missing just before each one: how much farther than ``stride``
+        it is from the one before, in strides.
+    """
+
+    rows: IntArray
+    values: FloatArray
+    stride: int
+    skipped: FloatArray
+
+    @classmethod
+    def of(cls, displacement: FloatArray, windows: Sequence[slice]) -> Readings:
+        """Take what windows (slices) of a displacement (samples,) have; nan is no reading.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        rows = np.concatenate([np.arange(w.start, w.stop) for w in windows]).astype(np.int64)
+        rows = rows[np.isfinite(displacement[rows])]
+        if not rows.size:
+            raise InputError("record.train: no reading is in it; give another window")
+        gaps = np.diff(rows)
+        stride = int(gaps.min()) if gaps.size else 1
+        skipped = np.concatenate([[0.0], (gaps - stride) / stride])
+        return cls(rows, displacement[rows], stride, skipped)
+
+    @property
+    def samples(self) -> int:
+        """Samples of the record up to the last reading."""
+        return int(self.rows[-1]) + 1
+
+    @property
+    def where(self) -> slice | IntArray:
+        """The rows as an index: a slice, which copies nothing, if no reading is missing."""
+        if self.skipped.any():
+            return self.rows
+        return slice(int(self.rows[0]), self.samples, self.stride)

@@ -1,0 +1,318 @@
+"""The start of another record: what is unknown of it, and what its first readings tell.
+
+A record that was not fitted brings unknowns of its own: the hysteretic state it starts from, how
+the dynamics are moving then, and its sensor's offset. Each posterior draw gets its own values. The
+readings of a lead-in, which is not judged later, choose them: offset and dynamics enter linearly
+and are integrated out exactly; the hysteretic state, one number, is found on a grid that closes in
+on where the lead-in allows it. The other parameters keep the posterior of the record that was
+fitted. Whether the lead-in fits the model at all is tested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy import stats
+from scipy.special import ndtri
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.readings import Readings
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.linear import Hold
+from bwbayes.results.bands import LeadIn
+
+__all__ = ["Start", "Started", "fitted", "started", "uniform"]
+
+# Nodes of the grid of hysteretic states, and how often it closes in at most.
+NODES = 17
+ROUNDS = 6
+
+# A node less probable than the best by this much (nats) is outside of the next grid.
+IMPROBABLE = 10.0
+
+# The grid is fine enough when neighbours within two nats of the best node differ by less than this.
+FINE = 1.5
+
+# Points between two nodes that a state is chosen from.
+BETWEEN = 8
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of the start of another record.
+
+    Parameters
+    ----------
+    from_rest
+        The actuator starts demagnetised and at rest: the voltage came from zero volts. Otherwise
+        h is a state that an earlier drive within the voltage range could have left, and the
+        dynamics may be moving.
+    own_offset
+        The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
+        the training record, as it is for a planned voltage without a measurement.
+    lead_in
+        Length of the lead-in, s.
+    lead_in_from
+        Time at which it begins, s; by default that of the record's first sample. What comes before
+        is simulated.
+    hold
+        What the voltage does between samples; by default what the record says of its voltage.
+    """
+
+    from_rest: bool = False
+    own_offset: bool = True
+    lead_in: float = 1.0
+    lead_in_from: float | None = None
+    hold: Hold | None = None
+
+    def window(self, record: Record) -> slice | None:
+        """Return the samples of the lead-in, or None if nothing is to be learnt from one.
+
+        Raises
+        ------
+        InputError
+            It reaches outside the record, leaves nothing of it, or holds no reading.
+        """
+        if record.displacement is None or (self.from_rest and not self.own_offset):
+            return None
+        begin = record.start if self.lead_in_from is None else self.lead_in_from
+        first = round((begin - record.start) / record.interval)
+        last = first + round(self.lead_in / record.interval)
+        if not (0 <= first < last < record.samples):
+            raise InputError(
+                f"{record.origin}: a lead-in of {self.lead_in:g} s from {begin:g} s on leaves "
+                f"nothing of the record from {record.start:g} to "
+                f"{record.start + record.duration:g} s; choose another one"
+            )
+        if not np.isfinite(record.displacement[first:last]).any():
+            raise InputError(
+                f"{record.origin}: no reading in its lead-in from {begin:g} to "
+                f"{begin + self.lead_in:g} s; choose another one"
+            )
+        return slice(first, last)
+
+
+@dataclass(frozen=True)
+class Started:
+    """What every draw takes for a record's start.
+
+    ``actuator`` with the record's interval and hold; ``model`` (draws, parameters of the actuator)
+    with initial h and offset; ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd``
+    (draws,), um, what is unsure of the offset still; ``lead_in`` says how that went, if there is
+    one, and ``judged_from`` is the first sample after it.
+    """
+
+    actuator: Actuator
+    model: FloatArray
+    unrest: FloatArray
+    offset_sd: FloatArray
+    lead_in: LeadIn | None = None
+    judged_from: int = 0
+
+
+def started(
+    posterior: Posterior,
+    theta: FloatArray,
+    record: Record,
+    start: Start,
+    generator: np.random.Generator,
+) -> Started:
+    """Give every draw θ (draws, parameters) a start of another record.
+
+    Raises
+    ------
+    InputError
+        A lead-in that does not fit into the record.
+    """
+    hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
+    actuator = replace(posterior.actuator, interval=record.interval, hold=hold)
+    window = start.window(record)
+    likelihood = _likelihood(posterior, actuator, record, start, window)
+    states = _States(actuator, theta, record.voltage, _voltages(posterior, record), start.from_rest)
+    if window is None:
+        return _unseen(likelihood, states, theta, generator)
+    if start.own_offset:
+        assert record.displacement is not None
+        theta = theta.copy()
+        offset = actuator.parameters.index("offset")
+        theta[:, offset] = np.nanmean(record.displacement[window])
+    chosen = states.at(_chosen(likelihood, states, generator))
+    return _informed(likelihood, chosen, record, window, generator)
+
+
+def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
+    """Give every draw θ (draws, parameters) the start that the training record tells."""
+    likelihood = posterior.likelihood
+    start = likelihood.start(theta)
+    unrest = _normal(start.mean, start.covariance, generator)
+    model = likelihood.started(theta)[:, : len(posterior.actuator.parameters)]
+    return Started(posterior.actuator, model, unrest, np.zeros(len(theta)))
+
+
+def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
+    """Uniform numbers (draws,), one from each of as many equal parts of 0 to 1, in any order."""
+    parts: FloatArray = (generator.permutation(draws) + generator.uniform(size=draws)) / draws
+    return parts
+
+
+def _voltages(posterior: Posterior, record: Record) -> tuple[float, float]:
+    """Return the least and the largest voltage of both records, V."""
+    both = record.voltage, posterior.voltage
+    return min(float(np.min(v)) for v in both), max(float(np.max(v)) for v in both)
+
+
+def _likelihood(
+    posterior: Posterior, actuator: Actuator, record: Record, start: Start, window: slice | None
+) -> Likelihood:
+    low, high = _voltages(posterior, record)
+    readings = Readings.of(np.zeros(1), [slice(0, 1)])
+    if window is not None:
+        assert record.displacement is not None
+        readings = Readings.of(record.displacement, [window])
+    own = start.own_offset and window is not None
+    return Likelihood(
+        record.voltage,
+        readings,
+        actuator,
+        posterior.noise,
+        posterior.engine,
+        start.from_rest,
+        (high - low) / 2,
+        # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
+        float(np.ptp(posterior.readings.values)) if own else 0.0,
+    )
+
+
+class _States:
+    """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
+
+    The highest and the lowest are those that sweeps through the whole range of voltages leave, from
+    below and from above, or none at all, as after small and smaller loops.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        theta: FloatArray,
+        voltage: FloatArray,
+        range_: tuple[float, float],
+        from_rest: bool,
+    ) -> None:
+        self.column = actuator.parameters.index("initial")
+        self.theta = theta
+        if from_rest:
+            self.low = self.high = np.zeros(len(theta))
+            return
+        values = dict(zip(actuator.parameters, theta.T, strict=False))
+        shape = {name: values[name] for name in ("alpha", "beta", "gamma", "exponent")}
+        low, high = range_
+        sweeps = [0.0, high, low, high, low, voltage[0]], [0.0, low, high, low, high, voltage[0]]
+        ends = [hysteresis(sweep, **shape)[:, -1] for sweep in sweeps]
+        self.low = np.minimum(np.min(ends, axis=0), 0.0)
+        self.high = np.maximum(np.max(ends, axis=0), 0.0)
+
+    def at(self, part: FloatArray) -> FloatArray:
+        """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
+        theta = self.theta.copy()
+        theta[:, self.column] = self.low + part * (self.high - self.low)
+        return theta
+
+
+def _unseen(
+    likelihood: Likelihood, states: _States, theta: FloatArray, generator: np.random.Generator
+) -> Started:
+    """Draw the start from what is known of it beforehand."""
+    draws = len(theta)
+    sd = likelihood.start_sd(theta)
+    unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
+    model = likelihood.started(states.at(uniform(generator, draws)))
+    size = len(likelihood.actuator.parameters)
+    return Started(likelihood.actuator, model[:, :size], unrest, np.zeros(draws))
+
+
+def _chosen(likelihood: Likelihood, states: _States, generator: np.random.Generator) -> FloatArray:
+    """Choose where every draw's state lies, (draws,), from 0 to 1, by what the lead-in says.
+
+    Beforehand all states between the lowest and the highest are equally probable.
+    """
+    draws = len(states.theta)
+    if not np.any(states.high > states.low):
+        return np.zeros(draws)
+    low, high = np.zeros(draws), np.ones(draws)
+    for _ in range(ROUNDS):
+        parts = np.linspace(low, high, NODES)
+        every = np.concatenate([states.at(part) for part in parts])
+        density = likelihood.log_density(every).reshape(NODES, draws)
+        density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
+        density = np.maximum(density - np.max(density, axis=0), -1e3)
+        if np.max(np.abs(np.diff(np.maximum(density, -2.0), axis=0))) < FINE:
+            break
+        possible = density > -IMPROBABLE
+        first = np.maximum(np.argmax(possible, axis=0) - 1, 0)
+        last = NODES - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
+        columns = np.arange(draws)
+        low, high = parts[first, columns], parts[last, columns]
+    return _drawn(parts, density, uniform(generator, draws))
+
+
+def _drawn(parts: FloatArray, density: FloatArray, uniform_: FloatArray) -> FloatArray:
+    """Draw from a log density (nodes, draws) that goes straight from node to node of ``parts``."""
+    inside = (np.arange(BETWEEN)[:, np.newaxis] + 0.5) / BETWEEN
+    fine, places = (
+        np.concatenate([a + inside * (b - a) for a, b in pairwise(nodes)])
+        for nodes in (density, parts)
+    )
+    weight = np.cumsum(np.exp(fine), axis=0)
+    index = np.sum(weight < uniform_ * weight[-1], axis=0)
+    drawn: FloatArray = places[index, np.arange(uniform_.size)]
+    return drawn
+
+
+def _informed(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    record: Record,
+    window: slice,
+    generator: np.random.Generator,
+) -> Started:
+    """Let the lead-in tell offset and unrest of draws θ whose initial h is chosen."""
+    posterior = likelihood.start(theta)
+    offsets = int(likelihood.offset_sd > 0)
+    mean, covariance = posterior.mean, posterior.covariance
+    unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
+    size = len(likelihood.actuator.parameters)
+    model = likelihood.started(theta)[:, :size].copy()
+    sd = np.zeros(len(theta))
+    if offsets:
+        # Given the unrest the offset is normal still.
+        pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
+        shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
+        left = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
+        model[:, likelihood.actuator.parameters.index("offset")] += mean[:, 0] + shift
+        sd = np.sqrt(np.maximum(left, 0.0))
+    readings = likelihood.readings.rows.size
+    lead_in = LeadIn(
+        float(record.time[window.start]),
+        float(record.time[window.stop]),
+        readings,
+        float(np.mean(stats.chi2.sf(posterior.squares, readings))),
+    )
+    return Started(likelihood.actuator, model, unrest, sd, lead_in, window.stop)
+
+
+def _normal(mean: FloatArray, covariance: FloatArray, generator: np.random.Generator) -> FloatArray:
+    """Draw (draws, n) from normal distributions, one a draw, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    score = np.zeros_like(mean)
+    for i in range(mean.shape[1]):
+        score[:, i] = ndtri(uniform(generator, len(mean)))
+    spread = np.sqrt(np.maximum(values, 0.0)) * score
+    drawn: FloatArray = mean + np.einsum("mij,mj->mi", vectors, spread)
+    return drawn

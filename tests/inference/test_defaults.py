@@ -1,0 +1,178 @@
+"""Default priors: scales of the drive, not of its sampling, and wide enough for what is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.teststand import RingBender
+from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.model.actuator import Actuator
+
+NAMES = tuple(name for name in CATALOGUE if name not in ("mass", "stiffness", "exponent"))
+HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
+
+
+def drive(amplitude: float = 100.0, interval: float = 1e-3, bias: float = 0.0) -> FloatArray:
+    """Return ten seconds of 1 Hz that decay to a half."""
+    time = np.arange(0, 10, interval)
+    voltage: FloatArray = bias + amplitude * np.sin(2 * np.pi * time) * (1 - 0.05 * time)
+    return voltage
+
+
+def displacement(voltage: FloatArray, interval: float = 1e-3, offset: float = 0.0) -> FloatArray:
+    """Return that of the ring bender with a lag of 20 ms, um."""
+    actuator = Actuator("lag", "first", interval)
+    table = RingBender()
+    theta = [0.02 if n == "lag" else getattr(table, n) for n in actuator.parameters]
+    clean: FloatArray = actuator.displacement(np.array([theta]), voltage)[0]
+    return clean + offset
+
+
+def prior(name: str, ranges: Ranges, exponent: float | Distribution = 1.0) -> Distribution:
+    found = default_prior(name, ranges, exponent, 4.1e5)
+    assert isinstance(found, Distribution)
+    return found
+
+
+def score(name: str, value: float, ranges: Ranges, exponent: float | Distribution = 1.0) -> float:
+    """Return how many prior sds a value lies from the median."""
+    found = prior(name, ranges, exponent)
+    ends = np.array([-np.inf, np.inf])
+    return float(found.to_normal(np.array([value]), ends[0], ends[1])[0])
+
+
+@settings(deadline=None, max_examples=30)
+@given(every=st.integers(1, 20), amplitude=st.floats(10, 150), bias=st.floats(-50, 50))
+def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
+    every: int, amplitude: float, bias: float
+) -> None:
+    voltage = drive(amplitude, bias=bias)
+    reading = displacement(voltage)
+    whole = Ranges.of(voltage, reading, 1e-3)
+    part = Ranges.of(voltage[::every], reading[::every], every * 1e-3)
+    for name in NAMES:
+        one, other = prior(name, whole), prior(name, part)
+        quantiles = [p.frozen.ppf([0.16, 0.5, 0.84]) for p in (one, other)]
+        # Within a tenth of the prior's sd.
+        sd = np.ptp(quantiles[0]) / 2
+        np.testing.assert_allclose(quantiles[0], quantiles[1], atol=0.1 * sd, err_msg=name)
+
+
+def test_the_same_drive_ten_times_slower_has_ten_times_the_times() -> None:
+    voltage = drive()
+    reading = displacement(voltage)
+    fast, slow = (Ranges.of(voltage, reading, interval) for interval in (1e-3, 1e-2))
+    for name in NAMES:
+        timely = name in ("lag", "damping", "discrepancy_time")
+        factor = prior(name, slow).frozen.median() - prior(name, fast).frozen.median() * (
+            10 if timely else 1
+        )
+        assert abs(factor) < 1e-9, name
+
+
+@pytest.mark.parametrize("rate", [25.0, 5000.0])
+def test_times_of_a_1_hz_drive_are_those_that_actuators_show(rate: float) -> None:
+    """A lag of 0.5 to 50 ms lies within 1.3 sds, a discrepancy's 0.1 to 0.7 s within 1.5."""
+    voltage = drive(interval=1 / rate)
+    ranges = Ranges.of(voltage, displacement(voltage, 1 / rate), 1 / rate)
+    for lag in (0.5e-3, 5e-3, 20e-3, 50e-3):
+        assert abs(score("lag", lag, ranges)) < 1.3
+        assert abs(score("damping", 4.1e5 * lag, ranges)) < 1.3
+    for time in (0.1, 0.25, 0.5, 0.7):
+        assert abs(score("discrepancy_time", time, ranges)) < 1.5
+    assert prior("discrepancy_time", ranges).frozen.median() == pytest.approx(0.25, rel=0.05)
+
+
+def share_below(ranges: Ranges, exponent: float | Distribution, **values: float) -> list[float]:
+    """Return the part of the cut prior below each value; |gamma| <= beta and others cut it."""
+    parameters = []
+    for name in HYSTERESIS:
+        known = exponent if name == "exponent" else prior(name, ranges, exponent)
+        if isinstance(known, Distribution):
+            parameters.append(Parameter(name, *CATALOGUE[name], prior=known))
+        else:
+            parameters.append(Parameter(name, *CATALOGUE[name], fixed=known))
+    cut = JointPrior(parameters)
+    draws = cut.draw(np.random.default_rng(1), 4000)
+    return [float(np.mean(draws[:, cut.free_names.index(n)] < v)) for n, v in values.items()]
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "bias"),
+    [(a, b) for a in (2.0, 5.0, 20.0, 100.0, 200.0) for b in (0.0, 1.0)]
+    + [(2.0, 20.0), (20.0, 4.0)],
+)
+def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bias: float) -> None:
+    """Within the central 98 % of the cut prior, and 95 % of the offset's."""
+    voltage = drive(amplitude, bias=bias * amplitude)
+    ranges = Ranges.of(voltage, displacement(voltage), 1e-3)
+    shares = share_below(ranges, 1.0, d=0.7, alpha=0.3575, beta=0.0272, gamma=0.0172)
+    assert 0.01 < min(shares), shares
+    assert max(shares) < 0.99, shares
+    assert abs(score("offset", 0.0, ranges)) < 2
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("free", [True, False])
+def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: bool) -> None:
+    """What is a rate of 0.0272 / V at an h of 8 um lies inside, be the exponent known or free."""
+    voltage = drive()
+    ranges = Ranges.of(voltage, displacement(voltage), 1e-3)
+    given = Distribution("uniform", {"lower": 1.0, "upper": 5.0}) if free else exponent
+    unit = 8.0 ** (1 - exponent)
+    shares = share_below(ranges, given, beta=0.0272 * unit, gamma=0.0172 * unit)
+    assert 0.01 < min(shares), shares
+    assert max(shares) < 0.99, shares
+
+
+def test_free_exponent_widens_beta_and_no_more_than_its_own_prior_says() -> None:
+    ranges = Ranges(100.0, 60.0, 0.0, 0.5)
+
+    def sigma(exponent: float | Distribution) -> float:
+        return prior("beta", ranges, exponent).arguments["sigma"]
+
+    wide, narrow = (Distribution("normal", {"mean": 2.0, "sd": sd}) for sd in (0.5, 0.001))
+    assert sigma(1.0) == sigma(3.0) == pytest.approx(sigma(narrow), rel=1e-3)
+    assert sigma(wide) > 1.05 * sigma(1.0)
+
+
+@pytest.mark.parametrize("arguments", [{"lower": 0.0, "upper": 0.9}, {"lower": 1.0, "upper": 1e4}])
+def test_odd_prior_of_the_exponent_leaves_numbers(arguments: dict[str, float]) -> None:
+    ranges = Ranges(100.0, 60.0, 0.0, 0.5)
+    assert prior("d", ranges, Distribution("uniform", arguments)).arguments["median"] > 0
+
+
+@pytest.mark.parametrize("offset", [12_345.6, -98_765.4321, 1e-4])
+def test_offset_is_as_exact_as_the_displacements_range_asks(offset: float) -> None:
+    """A sensor far from its zero: the prior's mean is off by a hundredth of its sd at most."""
+    voltage = drive(1.0)
+    reading = displacement(voltage, offset=offset)
+    ranges = Ranges.of(voltage, reading, 1e-3)
+    found = prior("offset", ranges).arguments
+    assert abs(found["mean"] - ranges.middle) < 0.01 * found["sd"]
+    assert len(f"{found['mean']:.12g}") <= 12
+
+
+def test_missing_readings_do_not_matter() -> None:
+    voltage = drive()
+    whole = displacement(voltage)
+    holes = whole.copy()
+    holes[1::2] = np.nan
+    one, other = (Ranges.of(voltage, reading, 1e-3) for reading in (whole, holes))
+    assert one.time == other.time
+    assert other.displacement == pytest.approx(one.displacement, rel=1e-3)
+
+
+def test_windows_alone_give_the_ranges() -> None:
+    voltage = np.concatenate([drive(), drive(10.0)])
+    reading = displacement(voltage)
+    window = slice(10_000, 20_000)
+    ranges = Ranges.of(voltage, reading, 1e-3, [window])
+    assert ranges.voltage == pytest.approx(np.ptp(voltage[window]) / 2)
+    assert ranges.displacement == pytest.approx(np.ptp(reading[window]) / 2)

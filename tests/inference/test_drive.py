@@ -1,0 +1,96 @@
+"""Turning points, times and speeds are the drive's own: noise and sampling rate do not show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.drive import fastest, stretch_times, time_between_turns, turning_points
+
+INTERVAL = 1e-3
+
+
+def sine(
+    frequency: float = 1.0, duration: float = 10.0, interval: float = INTERVAL, noise: float = 0.0
+) -> FloatArray:
+    """Return 100 V (samples,) with a measured voltage's noise (sd, V)."""
+    time = np.arange(0, duration, interval)
+    generator = np.random.default_rng(1)
+    voltage: FloatArray = 100 * np.sin(2 * np.pi * frequency * time)
+    return voltage + noise * generator.standard_normal(time.size)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("frequency", [0.5, 1.0, 5.0])
+def test_sine_turns_twice_a_period_noise_or_not(frequency: float, noise: float) -> None:
+    voltage = sine(frequency, noise=noise)
+    expected = (np.arange(20 * frequency) + 0.5) / (2 * frequency)
+    turns = turning_points(voltage) * INTERVAL
+    assert turns.size == expected.size
+    # Noise moves a turn as far as the sine falls by six sds: (2 pi f t)^2 / 2 = 6 sd / 100 V.
+    moved = np.sqrt(12 * noise / 100) / (2 * np.pi * frequency)
+    np.testing.assert_allclose(turns, expected, atol=INTERVAL + moved)
+    assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.5 / frequency, rel=0.15)
+
+
+def test_noise_would_turn_the_voltage_hundreds_of_times() -> None:
+    """The twin: without the least return, the noise of a measured voltage makes the times."""
+    assert turning_points(sine(noise=0.3), 1e-9).size > 1000
+
+
+@given(
+    every=st.integers(1, 20),
+    frequency=st.floats(0.2, 2.0),
+    duration=st.floats(8.0, 20.0),
+    phase=st.floats(0, 1),
+)
+def test_record_and_its_every_kth_sample_have_the_same_times_and_speeds(
+    every: int, frequency: float, duration: float, phase: float
+) -> None:
+    time = np.arange(0, duration, INTERVAL)
+    decay = 1 - 0.5 * time / duration
+    voltage = 50 + 50 * decay * np.sin(2 * np.pi * (frequency * time + phase))
+    whole = time_between_turns(voltage, INTERVAL)
+    thinned = time_between_turns(voltage[::every], every * INTERVAL)
+    assert thinned == pytest.approx(whole, abs=2 * every * INTERVAL)
+    speeds = [fastest(voltage[::k], k * INTERVAL, 0.05 / frequency) for k in (1, every)]
+    assert speeds[1] == pytest.approx(speeds[0], rel=0.1)
+
+
+def test_rest_before_the_drive_does_not_make_its_times_longer() -> None:
+    voltage = np.concatenate([np.zeros(3000), sine()])
+    assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "voltage", [np.zeros(1000), np.arange(1000.0), -np.arange(1000.0), np.repeat([0.0, 9.0], 500)]
+)
+def test_without_a_turn_the_time_is_the_length(voltage: FloatArray) -> None:
+    assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.999)
+
+
+def test_record_of_one_sample_has_a_time_too() -> None:
+    assert time_between_turns(np.zeros(1), INTERVAL) == INTERVAL
+
+
+def test_windows_alone_count_each_with_its_own_turns() -> None:
+    voltage = np.concatenate([sine(1.0, 5.0), sine(10.0, 5.0)])
+    slow, fast = slice(0, 5000), slice(5000, 10000)
+    assert time_between_turns(voltage, INTERVAL, [slow]) == pytest.approx(0.5)
+    assert time_between_turns(voltage, INTERVAL, [fast]) == pytest.approx(0.05)
+    assert stretch_times(voltage, INTERVAL, [slow, fast]).sum() == pytest.approx(9.998)
+
+
+def test_fastest_is_the_largest_slope_and_noise_counts_for_little() -> None:
+    slope = 2 * np.pi * 100
+    assert fastest(sine(), INTERVAL, 0.02) == pytest.approx(slope, rel=0.01)
+    assert fastest(sine(noise=0.3), INTERVAL, 0.05) == pytest.approx(slope, rel=0.1)
+    assert fastest(np.zeros(10), INTERVAL, 0.02) == 0
+
+
+def test_step_is_faster_than_any_sine() -> None:
+    step = np.repeat([0.0, 100.0], 5000)
+    assert fastest(step, INTERVAL, 0.05) > 2 * fastest(sine(), INTERVAL, 0.05)

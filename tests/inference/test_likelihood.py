@@ -1,0 +1,206 @@
+"""The likelihood of a record whose start is unknown, or whose readings are not all there.
+
+Everything is compared with a dense Gaussian: the covariance of the discrepancy and the sensor at
+the readings' times, with that of the unknown start added, all inverted at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.noise import NoiseKind
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.linear import Hold, first_order_lag, second_order
+from tests.inference.problems import (
+    INTERVAL,
+    decaying_sine,
+    posterior_of,
+    ring_bender,
+    short_posterior,
+)
+
+SLOW = {"mass": 0.00134, "stiffness": 4.1e5}
+COMPLEX = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
+MODELS: list[tuple[Dynamics, dict[str, float]]] = [
+    ("none", {}),
+    ("lag", {}),
+    ("second-order", SLOW),
+    ("second-order", COMPLEX),
+]
+
+
+def columns(likelihood: Likelihood, theta: FloatArray) -> dict[str, FloatArray]:
+    names = (*likelihood.actuator.parameters, *likelihood.noise.parameters)
+    return dict(zip(names, theta[np.newaxis].T, strict=True))
+
+
+def responses(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Responses (unknowns, readings) of the start, by a slow filter."""
+    recursion = likelihood.actuator.recursion(columns(likelihood, theta))
+    free = recursion.free_responses(likelihood.voltage.size)[0][:, likelihood.readings.rows]
+    parts = [] if likelihood.from_rest else list(free)
+    if likelihood.offset_sd:
+        parts.insert(0, np.ones(likelihood.readings.rows.size))
+    return np.array(parts).reshape(len(parts), likelihood.readings.rows.size)
+
+
+def dense(likelihood: Likelihood, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Log density of the readings, and mean and covariance of the start, at one θ."""
+    value = {name: float(v[0]) for name, v in columns(likelihood, theta).items()}
+    size = len(likelihood.actuator.parameters)
+    clean = likelihood.actuator.displacement(theta[:size], likelihood.voltage)[0]
+    rows = likelihood.readings.rows
+    time = rows * likelihood.actuator.interval
+    apart = np.abs(np.subtract.outer(time, time)) / value.get("discrepancy_time", 1.0)
+    noise = value.get("discrepancy_sd", 0.0) ** 2 * np.exp(-apart)
+    noise += value["sensor_sd"] ** 2 * np.eye(rows.size)
+    f = responses(likelihood, theta)
+    prior = np.diag(likelihood.start_sd(theta[np.newaxis])[0] ** 2)
+    residual = likelihood.readings.values - clean[rows]
+    factor = linalg.cho_factor(noise + f.T @ prior @ f)
+    logs = 2 * np.sum(np.log(np.diag(factor[0]))) + rows.size * np.log(2 * np.pi)
+    density = -0.5 * (residual @ linalg.cho_solve(factor, residual) + logs)
+    gain = linalg.cho_solve(factor, f.T @ prior).T
+    return float(density), gain @ residual, prior - gain @ f.T @ prior
+
+
+def moving(
+    noise: NoiseKind = "discrepancy",
+    dynamics: Dynamics = "lag",
+    fixed: dict[str, float] | None = None,
+    *,
+    hold: Hold = "first",
+    missing: float = 0.0,
+    stride: int = 1,
+    training: tuple[slice, ...] | None = None,
+) -> Posterior:
+    """Cut a record out of a running drive, with readings missing at random."""
+    actuator = Actuator(dynamics, hold, INTERVAL)
+    voltage = decaying_sine(300)[100:]
+    displacement = ring_bender(actuator, noise, voltage, 3) + 5 * np.exp(-np.arange(200) / 3)
+    lost = np.random.default_rng(4).uniform(size=200) < missing
+    displacement[lost | (np.arange(200) % stride != 0)] = np.nan
+    posterior = posterior_of(
+        voltage, np.nan_to_num(displacement), actuator, noise, fixed or {}, training=training
+    )
+    return replace(posterior, displacement=displacement, from_rest=False)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("noise", ["white", "discrepancy"])
+@pytest.mark.parametrize(("dynamics", "fixed"), MODELS, ids=["none", "lag", "slow", "complex"])
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_the_unknown_start_is_integrated_out(
+    engine: str, noise: NoiseKind, dynamics: Dynamics, fixed: dict[str, float], hold: Hold
+) -> None:
+    posterior = moving(noise, dynamics, fixed, hold=hold)
+    likelihood = replace(posterior.likelihood, engine=cast(Engine, engine), offset_sd=3.0)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 6))
+    start = likelihood.start(theta)
+    for row, one in enumerate(theta):
+        density, mean, covariance = dense(likelihood, one)
+        assert abs(density - start.log_density[row]) < 1e-7 * (200 + abs(density))
+        sd = likelihood.start_sd(one[np.newaxis])[0]
+        np.testing.assert_allclose(start.mean[row], mean, rtol=1e-5, atol=1e-6 * sd.max())
+        np.testing.assert_allclose(start.covariance[row], covariance, atol=1e-6 * sd.max() ** 2)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("missing", [0.0, 0.1, 0.7])
+@pytest.mark.parametrize("stride", [1, 2, 8])
+@pytest.mark.parametrize("training", [None, (slice(3, 4), slice(20, 90), slice(90, 180))])
+def test_missing_readings_are_left_out_and_nothing_else(
+    engine: str, missing: float, stride: int, training: tuple[slice, ...] | None
+) -> None:
+    """The simulation runs through, and one discrepancy goes through all gaps and windows."""
+    posterior = moving(missing=missing, stride=stride, training=training)
+    likelihood = replace(posterior.likelihood, engine=cast(Engine, engine))
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(6), 5))
+    got = likelihood.log_density(theta)
+    for row, one in enumerate(theta):
+        density, _, _ = dense(likelihood, one)
+        assert abs(density - got[row]) < 1e-7 * (200 + abs(density))
+
+
+def test_a_record_cut_into_adjacent_windows_is_the_whole_record() -> None:
+    windows = tuple(slice(first, first + 5) for first in range(0, 200, 5))
+    whole, cut = moving(), moving(training=windows)
+    theta = whole.prior.theta(whole.prior.draw(np.random.default_rng(7), 5))
+    np.testing.assert_allclose(whole.log_likelihood(theta), cut.log_likelihood(theta), rtol=1e-12)
+
+
+def test_a_long_memory_is_not_cut_short() -> None:
+    """A lag of two records' lengths, a discrepancy that hardly fades: both engines keep it."""
+    posterior = moving(fixed={"lag": 4.0, "discrepancy_time": 50.0, "sensor_sd": 2.0})
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(8), 5))
+    engines: tuple[Engine, ...] = ("numpy", "numba")
+    for engine in engines:
+        likelihood = replace(posterior.likelihood, engine=engine)
+        got = likelihood.log_density(theta)
+        expected = [dense(likelihood, one)[0] for one in theta]
+        np.testing.assert_allclose(got, expected, rtol=1e-7)
+
+
+def test_from_rest_means_a_path_from_zero_volts() -> None:
+    """A record from rest at 50 V is one from zero volts whose first samples were not read."""
+    usual = short_posterior(samples=200, dynamics="lag", fixed={})
+    approach = np.concatenate([np.zeros(1), np.full(400, 50.0)])
+    voltage = 50 + usual.voltage / 4
+    whole = np.concatenate([approach, voltage])
+    reading = ring_bender(usual.actuator, "discrepancy", whole, 9)
+    theta = usual.prior.theta(usual.prior.draw(np.random.default_rng(10), 5))
+    theta[:, usual.prior.names.index("initial")] = 0.0
+    settled = replace(
+        usual,
+        voltage=whole,
+        displacement=reading,
+        training=(slice(approach.size, whole.size),),
+    )
+    at_rest = replace(usual, voltage=voltage, displacement=reading[approach.size :])
+    np.testing.assert_allclose(
+        at_rest.log_likelihood(theta), settled.log_likelihood(theta), rtol=1e-9
+    )
+    wrong = replace(at_rest, voltage=voltage - 50).log_likelihood(theta)
+    assert np.min(np.abs(wrong - at_rest.log_likelihood(theta))) > 1
+
+
+def test_a_transient_at_the_start_does_not_bias_the_gain() -> None:
+    """The twin: taken for a record from rest, the same transient is far less probable."""
+    posterior = moving()
+    names = posterior.prior.names
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(11), 1))
+    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "lag": 0.03}
+    known |= {"initial": 0.0, "offset": 0.0, "sensor_sd": 0.3}
+    known |= {"discrepancy_sd": 0.8, "discrepancy_time": 0.2}
+    theta[0] = [known.get(name, 1.0) for name in names]
+    unknown, rest = (replace(posterior, from_rest=known) for known in (False, True))
+    assert unknown.log_likelihood(theta)[0] > rest.log_likelihood(theta)[0] + 10
+
+
+@pytest.mark.parametrize("dynamics", ["lag", "complex"])
+def test_free_responses_are_those_of_the_differential_equation(dynamics: str) -> None:
+    """A unit of displacement, and of speed in units of the natural frequency, dying out."""
+    time = np.arange(50) * INTERVAL
+    if dynamics == "lag":
+        recursion = first_order_lag(np.array([0.03]), INTERVAL, "zero")
+        np.testing.assert_allclose(
+            recursion.free_responses(50)[0], np.exp(-time / 0.03)[np.newaxis], atol=1e-12
+        )
+        return
+    m, b, k = (np.array([COMPLEX[name]]) for name in ("mass", "damping", "stiffness"))
+    recursion = second_order(m, b, k, INTERVAL, "first")
+    loss, natural = b[0] / (2 * m[0]), np.sqrt(k[0] / m[0])
+    ringing = np.sqrt(natural**2 - loss**2)
+    fade, sine = np.exp(-loss * time), np.sin(ringing * time) / ringing
+    expected = [fade * (np.cos(ringing * time) + loss * sine), natural * fade * sine]
+    np.testing.assert_allclose(recursion.free_responses(50)[0], expected, atol=1e-11)
+    assert recursion.remembered[0] == pytest.approx(np.exp(-loss * INTERVAL))
