@@ -8,7 +8,7 @@ bands that do not hold. The values are the same; whoever silences the warnings l
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,8 @@ from bwbayes.errors import InputWarning
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import prediction
 from bwbayes.results.bands import Bands
-from bwbayes.results.prediction import Start, beyond_training
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.prediction import Start
 from bwbayes.results.verdict import Background, assess
 
 __all__ = ["predict_record", "predict_windows", "resolve"]
@@ -48,7 +49,11 @@ def resolve(config: Config, folder: Path) -> Problem:
 
 
 def predict_windows(
-    posterior: Posterior, draws: FloatArray, record: Record, windows: Mapping[str, slice]
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    windows: Mapping[str, slice],
+    generator: np.random.Generator,
 ) -> list[Bands]:
     """Predict windows of the training record: one simulation, one offset.
 
@@ -62,13 +67,15 @@ def predict_windows(
         The training record, whole.
     windows
         Slices of its samples, by name.
+    generator
+        Draws the state of the dynamics at the record's start, where that is unknown.
 
     Warns
     -----
     InputWarning
         Bands that do not hold: which, by how much, the likeliest cause and what helps.
     """
-    made = prediction.predict_windows(posterior, draws, record, windows)
+    made = prediction.predict_windows(posterior, draws, record, windows, generator)
     for bands in made:
         _judge(bands, posterior, draws)
     return made
@@ -111,13 +118,16 @@ def predict_record(
         A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
     """
     made = prediction.predict_record(posterior, draws, record, start, generator, name, window)
-    if remark := beyond_training(posterior, record.voltage):
+    far = beyond_training(posterior, record.voltage, record.interval)
+    for remark in far:
         warnings.warn(f"{name}: {remark}", InputWarning, stacklevel=2)
-    _judge(made, posterior, draws)
+    _judge(made, posterior, draws, far)
     return made
 
 
-def _judge(bands: Bands, posterior: Posterior, draws: FloatArray) -> None:
-    verdict = assess(bands, Background.of(posterior, draws))
+def _judge(
+    bands: Bands, posterior: Posterior, draws: FloatArray, beyond: Sequence[str] = ()
+) -> None:
+    verdict = assess(bands, Background.of(posterior, draws), beyond=beyond)
     if verdict is not None and verdict.holds is False:
         warnings.warn(verdict.line, InputWarning, stacklevel=3)

@@ -55,6 +55,13 @@ CAPTIONS = {
         "predicted probability. Level is right; a hump means bands that are too wide, a bowl too "
         "narrow, a slope a bias.",
     ),
+    "innovations": (
+        "Innovations",
+        "What each fitted reading brings anew, over its standard deviation: its residual less what "
+        "the readings before it foretell. If model and noise model are right these are independent "
+        "standard normal numbers: white, on the line of the normal quantiles, of one size from the "
+        "start on, and the same wherever the drive is. Whiskers are 95 % of chance.",
+    ),
     "corner": (
         "Posterior",
         "Each parameter, and each pair of parameters; contours hold 50 and 90 % of the draws. "

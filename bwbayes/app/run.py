@@ -12,7 +12,7 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -37,12 +37,15 @@ from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from bwbayes.results import innovations
 from bwbayes.results.bands import Bands
+from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
+from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.result import Result, summary
-from bwbayes.results.scores import Scores, score
-from bwbayes.results.verdict import Background, assess
+from bwbayes.results.scores import score
+from bwbayes.results.verdict import Background, Verdict, assess
 
 __all__ = [
     "assemble",
@@ -273,14 +276,37 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     if not outcome.converged:
         return result
     bands = predictions(problem, result)
-    background = Background.of(posterior, result.flat_draws)
-    verdicts = {one.name: assess(one, background) for one in bands}
+    best = flat[int(np.argmax(result.log_density))]
+    found = innovations.innovations(posterior, best, problem.record.start)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), found)
     return replace(
         result,
         bands=bands,
-        scores=_scores(problem, bands),
-        verdicts={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+        scores={
+            one.name: score(one, scoring(problem.config.seed, one))
+            for one in bands
+            if one.name in verdicts
+        },
+        verdicts=verdicts,
+        innovations=found,
+        remarks=(*result.remarks, *innovations.remarks(found)),
     )
+
+
+def judged(
+    problem: Problem, bands: Iterable[Bands], background: Background, found: Innovations
+) -> dict[str, Verdict]:
+    """Judge all bands that have readings, by name."""
+    start = innovations.odd_start(found)
+    verdicts = {}
+    for one in bands:
+        # Of several training windows the first one holds the start.
+        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
+        far = beyond_training(problem.posterior, one.voltage, one.interval)
+        verdict = assess(one, background, start=start if at_start else None, beyond=far)
+        if verdict is not None:
+            verdicts[one.name] = verdict
+    return verdicts
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
@@ -305,14 +331,6 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
         ),
         "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
         "engine": posterior.engine,
-    }
-
-
-def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
-    return {
-        one.name: score(one, scoring(problem.config.seed, one))
-        for one in bands
-        if one.measured is not None
     }
 
 

@@ -18,7 +18,16 @@ from scipy import ndimage, stats
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["GROUPS", "LAGS", "Innovations", "OddStart", "innovations", "odd_start", "remarks"]
+__all__ = [
+    "GROUPS",
+    "LAGS",
+    "Innovations",
+    "OddStart",
+    "innovations",
+    "numbers",
+    "odd_start",
+    "remarks",
+]
 
 # Lags of the autocorrelation that is looked at.
 LAGS = 40
@@ -91,8 +100,11 @@ class OddStart:
     size: float
 
 
-def innovations(posterior: Posterior, free: FloatArray) -> Innovations:
-    """Return the innovations of the fitted readings at one set of free parameters (free,)."""
+def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> Innovations:
+    """Return the innovations of the fitted readings at one set of free parameters (free,).
+
+    ``begin`` is the time of the record's first sample, s.
+    """
     readings = posterior.readings
     theta = posterior.prior.theta(free[np.newaxis])
     simulated = posterior.simulate(theta, readings.rows)
@@ -104,9 +116,8 @@ def innovations(posterior: Posterior, free: FloatArray) -> Innovations:
     smooth = max(1, posterior.voltage.size // 500)
     slow = ndimage.uniform_filter1d(posterior.voltage, smooth, mode="nearest")
     rate = np.gradient(slow) / interval if slow.size > 1 else np.zeros_like(slow)
-    return Innovations(
-        readings.rows * interval, white[0, 0], posterior.voltage[readings.rows], rate[readings.rows]
-    )
+    time = begin + interval * readings.rows.astype(np.float64)
+    return Innovations(time, white[0, 0], posterior.voltage[readings.rows], rate[readings.rows])
 
 
 def remarks(found: Innovations) -> tuple[str, ...]:
@@ -124,17 +135,51 @@ def odd_start(found: Innovations) -> OddStart | None:
 
     The first innovations are summed up over 4, 8, ... readings, up to an eighth of all. A sum that
     is odd is larger than chance allows, and than all sums of as many readings in the second half.
+    The start lasts until what comes after it is odd no longer.
     """
-    size, best = found.white.size, None
-    length = 4
+    size = _oddness(found.white)
+    if not size:
+        return None
+    first = 0
+    # Up to a third of the record: what is odd for longer is no start.
+    while first < found.white.size // 3 and _oddness(found.white[first:]):
+        first = max(first + 1, round(1.2 * first))
+    return OddStart(float(found.time[0]), float(found.time[first]), size)
+
+
+def _oddness(white: FloatArray) -> float:
+    """Return the largest odd sum of first innovations, in sds; 0 if none is odd."""
+    size, largest, length = white.size, 0.0, 4
     while length <= size // 8:
-        sums = ndimage.uniform_filter1d(found.white, length, mode="nearest") * np.sqrt(length)
-        first = float(np.sum(found.white[:length]) / np.sqrt(length))
+        sums = ndimage.uniform_filter1d(white, length, mode="nearest") * np.sqrt(length)
+        first = float(abs(np.sum(white[:length])) / np.sqrt(length))
         usual = float(np.max(np.abs(sums[size // 2 : size - length])))
-        if abs(first) > max(ODD, MORE * usual) and (best is None or abs(first) > best.size):
-            best = OddStart(float(found.time[0]), float(found.time[length]), abs(first))
+        if first > max(ODD, MORE * usual):
+            largest = max(largest, first)
         length *= 2
-    return best
+    return largest
+
+
+def numbers(found: Innovations) -> dict[str, object]:
+    """Return what ``summary.json`` says of the innovations."""
+    correlation = found.correlation
+    return {
+        "readings": found.white.size,
+        "sd": float(np.std(found.white)),
+        "autocorrelation_1": float(correlation[0]) if correlation.size else None,
+        "largest_autocorrelation": (
+            float(correlation[np.argmax(np.abs(correlation))]) if correlation.size else None
+        ),
+        "excess_kurtosis": found.kurtosis,
+        "by": {
+            what: {
+                name: {"mean": float(np.mean(part)), "sd": float(np.std(part))}
+                for name, part in found.by(what)
+                if part.size
+            }
+            for what in ("rate", "voltage", "direction")
+        },
+    }
 
 
 def _correlated(found: Innovations) -> list[str]:

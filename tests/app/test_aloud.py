@@ -42,7 +42,8 @@ def test_bands_that_hold_are_silent(fit: tuple[Problem, FloatArray]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         windows = {"training": made.posterior.training[0]}
-        (bands,) = aloud.predict_windows(made.posterior, flat, made.record, windows)
+        generator = np.random.default_rng(1)
+        (bands,) = aloud.predict_windows(made.posterior, flat, made.record, windows, generator)
     assert bands.training
 
 

@@ -1,4 +1,4 @@
-"""Innovations of the fitted readings: are they white, normal, and the same along the drive?"""
+"""Innovations of the fitted readings: whether they are white, normal, and even along the drive."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _draw_correlation(panel: Axes, found: Innovations) -> None:
     panel.axhspan(-bound, bound, color="#dddddd", lw=0, label="95 % of independent ones")
     panel.vlines(lags, 0, correlation, color=COLOURS[0], lw=2)
     panel.axhline(0, color=MEASURED_COLOUR, lw=0.8)
-    reach = max(float(np.max(np.abs(correlation))), 2 * float(bound)) * 1.15
+    reach = max(float(np.max(np.abs(correlation))), 2 * float(bound), 0.1) * 1.15
     panel.set(ylim=(-reach, reach), xlim=(0, lags[-1] + 1))
     panel.set(title="Are they white?", xlabel="lag (readings)", ylabel="autocorrelation")
     panel.legend(loc="lower right")
@@ -81,7 +81,9 @@ def _draw_time(panel: Axes, found: Innovations) -> None:
 
 def _draw_drive(panel: Axes, found: Innovations) -> None:
     """Draw mean and sd in parts of the drive, with the errors that chance gives them."""
-    place, names, edges = 0.0, [], []
+    place = 0.0
+    names: list[tuple[float, str]] = []
+    edges: list[tuple[float, str]] = []
     for what in ("rate", "voltage", "direction"):
         for name, values in found.by(what):
             if values.size < 2:
