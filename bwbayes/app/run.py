@@ -43,6 +43,7 @@ from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
+from bwbayes.results.refit import Moved, without_start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
 from bwbayes.results.verdict import Background, Verdict, assess
@@ -278,7 +279,10 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
     found = innovations.innovations(posterior, best, problem.record.start)
-    verdicts = judged(problem, bands, Background.of(posterior, flat), found)
+    # By a second point fit, without the record's start.
+    source = generator(problem.config.seed, "without start")
+    moved = without_start(posterior, thinned(flat, source), source, problem.record.start)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
     return replace(
         result,
         bands=bands,
@@ -294,7 +298,11 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
 
 
 def judged(
-    problem: Problem, bands: Iterable[Bands], background: Background, found: Innovations
+    problem: Problem,
+    bands: Iterable[Bands],
+    background: Background,
+    found: Innovations,
+    moved: Moved | None,
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name."""
     start = innovations.odd_start(found)
@@ -303,7 +311,11 @@ def judged(
         # Of several training windows the first one holds the start.
         at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
         far = beyond_training(problem.posterior, one.voltage, one.interval)
-        verdict = assess(one, background, start=start if at_start else None, beyond=far)
+        verdict = (
+            assess(one, background, start=start, moved=moved, beyond=far)
+            if at_start
+            else assess(one, background, beyond=far)
+        )
         if verdict is not None:
             verdicts[one.name] = verdict
     return verdicts

@@ -49,6 +49,9 @@ FEWEST = 100
 # stretch of that length does.
 ODD, MORE = 5.5, 2.0
 
+# An odd start has ended where what comes next is this part as odd.
+ENDED = 0.6
+
 
 @dataclass(frozen=True)
 class Innovations:
@@ -142,19 +145,22 @@ def odd_start(found: Innovations) -> OddStart | None:
         return None
     first = 0
     # Up to a third of the record: what is odd for longer is no start.
-    while first < found.white.size // 3 and _oddness(found.white[first:]):
+    while first < found.white.size // 3 and _oddness(found.white[first:], ENDED):
         first = max(first + 1, round(1.2 * first))
     return OddStart(float(found.time[0]), float(found.time[first]), size)
 
 
-def _oddness(white: FloatArray) -> float:
-    """Return the largest odd sum of first innovations, in sds; 0 if none is odd."""
+def _oddness(white: FloatArray, part: float = 1.0) -> float:
+    """Return the largest odd sum of first innovations, in sds; 0 if none is odd.
+
+    ``part`` is that of what is odd elsewhere.
+    """
     size, largest, length = white.size, 0.0, 4
     while length <= size // 8:
         sums = ndimage.uniform_filter1d(white, length, mode="nearest") * np.sqrt(length)
         first = float(abs(np.sum(white[:length])) / np.sqrt(length))
         usual = float(np.max(np.abs(sums[size // 2 : size - length])))
-        if first > max(ODD, MORE * usual):
+        if first > part * max(ODD, MORE * usual):
             largest = max(largest, first)
         length *= 2
     return largest

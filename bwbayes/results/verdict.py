@@ -25,6 +25,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.causes import Cause, Residuals, cause, likeliest
 from bwbayes.results.innovations import OddStart
+from bwbayes.results.refit import Moved
 
 __all__ = ["Background", "Verdict", "assess"]
 
@@ -157,6 +158,7 @@ def assess(
     background: Background,
     *,
     start: OddStart | None = None,
+    moved: Moved | None = None,
     beyond: Sequence[str] = (),
 ) -> Verdict | None:
     """Judge bands by the readings after ``scored_from``; None if there are none.
@@ -171,6 +173,8 @@ def assess(
         What is known of the fit.
     start
         Of a fitted record, a start that does not go with the rest.
+    moved
+        Of a fitted record, a parameter that is another one without the start.
     beyond
         In what the record's drive leaves the one that was fitted, a line each.
     """
@@ -185,6 +189,7 @@ def assess(
     reasons = [
         *_lead_in(bands),
         *_odd(start),
+        *_moved(moved),
         *_coverage(bands, judged, standard),
         *_size(standard),
         *_leaning(bands, judged, standard),
@@ -197,8 +202,9 @@ def assess(
         why = likeliest(residuals) if reasons else cause("noise", residuals)
         if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
             why = cause("lead-in", residuals)
-        if start is not None and why.kind not in ("sign", "outliers"):
-            why = cause("start", residuals, start.until)
+        if (start or moved) and why.kind not in ("sign", "outliers", "drift"):
+            until = max(one.until for one in (start, moved) if one is not None)
+            why = cause("start", residuals, until)
         if beyond and why.kind in ("gain", "delay", "loop", "noise", "unknown"):
             why = Cause(
                 "extrapolation",
@@ -336,6 +342,17 @@ def _odd(start: OddStart | None) -> list[str]:
     return [
         f"the first readings, until {start.until:.4g} s, do not go with the rest "
         f"({start.size:.2g} sds)"
+    ]
+
+
+def _moved(moved: Moved | None) -> list[str]:
+    """Say that the parameters of a fit hang on the record's start."""
+    if moved is None:
+        return []
+    (whole, sd), (rest, its_sd) = moved.whole, moved.rest
+    return [
+        f"without the readings before {moved.until:.4g} s {moved.name} is {rest:.4g} +- "
+        f"{its_sd:.2g} {moved.unit}, with them {whole:.4g} +- {sd:.2g}"
     ]
 
 
