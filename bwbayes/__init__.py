@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 __all__ = [
     "Actuator",
+    "Background",
     "Bands",
     "Calibration",
     "Chain",
@@ -43,8 +44,10 @@ __all__ = [
     "SamplingPlan",
     "Scores",
     "Start",
+    "Verdict",
     "VirtualTestStand",
     "Waveform",
+    "assess",
     "draws",
     "first_chain",
     "hysteresis",
@@ -67,10 +70,11 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from bwbayes.app.aloud import predict_record, predict_windows, resolve
     from bwbayes.app.config import Config
     from bwbayes.app.config import load as load_config
     from bwbayes.app.config import parse as parse_config
-    from bwbayes.app.problem import Problem, resolve
+    from bwbayes.app.problem import Problem
     from bwbayes.data.files import read_record, write_record
     from bwbayes.data.inspection import Finding, inspect
     from bwbayes.data.record import Record
@@ -89,13 +93,15 @@ if TYPE_CHECKING:
     from bwbayes.model.boucwen import hysteresis
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
-    from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+    from bwbayes.results.prediction import Start, thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
+    from bwbayes.results.verdict import Background, Verdict, assess
 else:
     # The module of each name, and what it is called there if not the same.
     HOMES = {
         "Actuator": "model.actuator",
+        "Background": "results.verdict",
         "Bands": "results.bands",
         "Calibration": "results.calibration",
         "Chain": "inference.chain",
@@ -116,8 +122,10 @@ else:
         "SamplingPlan": "inference.sampling",
         "Scores": "results.scores",
         "Start": "results.prediction",
+        "Verdict": "results.verdict",
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",
+        "assess": "results.verdict",
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
         "hysteresis": "model.boucwen",
@@ -127,11 +135,11 @@ else:
         "noise_model": "inference.noise",
         "parse_config": "app.config:parse",
         "point_fit": "inference.pointfit:fit",
-        "predict_record": "results.prediction",
-        "predict_windows": "results.prediction",
+        "predict_record": "app.aloud",
+        "predict_windows": "app.aloud",
         "read_record": "data.files",
         "replicates": "results.replicates",
-        "resolve": "app.problem",
+        "resolve": "app.aloud",
         "sample": "inference.sampling",
         "score": "results.scores",
         "signal": "data.waveforms",

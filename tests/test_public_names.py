@@ -15,7 +15,8 @@ import bwbayes
 # A name that leaves this list breaks somebody's program.
 PUBLIC = {
     "bwbayes.app.config": {"Config", "load as load_config", "parse as parse_config"},
-    "bwbayes.app.problem": {"Problem", "resolve"},
+    "bwbayes.app.aloud": {"predict_record", "predict_windows", "resolve"},
+    "bwbayes.app.problem": {"Problem"},
     "bwbayes.data.files": {"read_record", "write_record"},
     "bwbayes.data.inspection": {"Finding", "inspect"},
     "bwbayes.data.record": {"Record"},
@@ -34,8 +35,9 @@ PUBLIC = {
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
-    "bwbayes.results.prediction": {"Start", "predict_record", "predict_windows", "thinned"},
+    "bwbayes.results.prediction": {"Start", "thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
+    "bwbayes.results.verdict": {"Background", "Verdict", "assess"},
 }
 HOMES = {
     text.split(" as ")[-1]: (module, text.split(" as ")[0])

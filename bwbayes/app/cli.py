@@ -334,7 +334,7 @@ def _finish(
     engine: Engine | None = None,
 ) -> int:
     from bwbayes.app.folder import RunFolder  # noqa: PLC0415
-    from bwbayes.app.run import carry_on  # noqa: PLC0415
+    from bwbayes.app.run import carry_on, going_on, load_run  # noqa: PLC0415
     from bwbayes.app.screen import show_result  # noqa: PLC0415
 
     folder = RunFolder.open(path)
@@ -357,7 +357,7 @@ def _finish(
         return 0
     click.echo(
         f"NOT CONVERGED: {result.outcome.stop_reason}; no interval is given. Go on with "
-        f"`bwbayes resume {path} --steps N`, and look at the traces in {path}/report.html",
+        f"`{going_on(path, load_run(folder))}`, and look at the traces in {path}/report.html",
         err=True,
     )
     return NOT_CONVERGED

@@ -102,9 +102,18 @@ class RunFolder:
             There is no run.
         """
         folder = cls(path)
-        if not (folder.config.is_file() and folder._is_of_its_kind()):
-            raise InputError(f"{path}: no {cls.KIND} here; start one with `{cls.BEGIN} {path}`")
-        return folder
+        if folder.config.is_file() and folder._has_records() and folder._is_of_its_kind():
+            return folder
+        where = f"{path}: no {cls.KIND} here"
+        if path.is_file():
+            raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
+        if folder.config.is_file() and folder._has_records():
+            raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
+        raise InputError(f"{where}; start one with `{cls.BEGIN} {path}`")
+
+    def _has_records(self) -> bool:
+        """Tell a folder that was made from one that holds a config alone."""
+        return (self.path / "records/record.h5").is_file()
 
     def _is_of_its_kind(self) -> bool:
         """Tell a run's folder from a calibration's."""
@@ -113,9 +122,8 @@ class RunFolder:
 
     def _may_go(self) -> bool:
         """Tell whether nothing of another kind would be lost with this folder."""
-        record = self.path / "records/record.h5"
         empty = self.path.is_dir() and not any(self.path.iterdir())
-        its_own = self.config.is_file() and record.is_file() and self._is_of_its_kind()
+        its_own = self.config.is_file() and self._has_records() and self._is_of_its_kind()
         return empty or its_own
 
     @contextmanager

@@ -74,7 +74,7 @@ def predict(
     remarks = list(beyond_training(posterior, other.voltage, other.interval))
     source = generator(seed, f"predict {other.sha256}")
     bands = predict_record(posterior, chosen, other, start, source, name, window)
-    verdict = assess(bands, Background.of(posterior, flat))
+    verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
     scores = None if verdict is None else score(bands, scoring(seed, bands))
     if verdict is not None:
         show_verdicts([verdict], console)

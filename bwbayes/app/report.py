@@ -55,6 +55,13 @@ CAPTIONS = {
         "predicted probability. Level is right; a hump means bands that are too wide, a bowl too "
         "narrow, a slope a bias.",
     ),
+    "innovations": (
+        "Innovations",
+        "What each fitted reading brings anew, over its standard deviation: its residual less what "
+        "the readings before it foretell. If model and noise model are right these are independent "
+        "standard normal numbers: white, on the line of the normal quantiles, of one size from the "
+        "start on, and the same wherever the drive is. Whiskers are 95 % of chance.",
+    ),
     "corner": (
         "Posterior",
         "Each parameter, and each pair of parameters; contours hold 50 and 90 % of the draws. "
@@ -89,7 +96,8 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         The run.
     summary
         Its numbers, as :func:`bwbayes.results.result.summary` returns them; ``seed``, ``wall_s``,
-        ``versions`` and ``data_sha256`` are shown too if they are there.
+        ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
+        ``go_on``, the command that goes on.
     pictures
         PNG files by the name of their figure, in their order.
     """
@@ -105,6 +113,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
             for name, (proposed, kept) in result.moves.items()
         ],
         pareto_k=None if check.pareto_k is None else f"{check.pareto_k:.2f}",
+        go_on=summary.get("go_on") or "bwbayes resume FOLDER --steps N",
         remarks=result.remarks,
         free=list(_free(result, summary)),
         truth_known=any(p.name in result.truth for p in result.free),

@@ -12,7 +12,7 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -29,6 +29,7 @@ from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
 from bwbayes.app.workers import executor, one_thread
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import conflict, identifiability, pointfit
 from bwbayes.inference.chain import PHASES
@@ -37,12 +38,16 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import passive_remark
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
+from bwbayes.results import innovations
 from bwbayes.results.bands import Bands
+from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
+from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
+from bwbayes.results.refit import Moved, without_start
 from bwbayes.results.result import Result, summary
-from bwbayes.results.scores import Scores, score
-from bwbayes.results.verdict import Background, assess
+from bwbayes.results.scores import score
+from bwbayes.results.verdict import Background, Verdict, assess
 
 __all__ = [
     "assemble",
@@ -275,14 +280,48 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     if not outcome.converged:
         return result
     bands = predictions(problem, result)
-    background = Background.of(posterior, result.flat_draws)
-    verdicts = {one.name: assess(one, background) for one in bands}
+    best = flat[int(np.argmax(result.log_density))]
+    found = innovations.innovations(posterior, best, problem.record.start)
+    # By a second point fit, without the record's start.
+    source = generator(problem.config.seed, "without start")
+    moved = without_start(posterior, thinned(flat, source), source, problem.record.start)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
     return replace(
         result,
         bands=bands,
-        scores=_scores(problem, bands),
-        verdicts={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+        scores={
+            one.name: score(one, scoring(problem.config.seed, one))
+            for one in bands
+            if one.name in verdicts
+        },
+        verdicts=verdicts,
+        innovations=found,
+        remarks=(*result.remarks, *innovations.remarks(found)),
     )
+
+
+def judged(
+    problem: Problem,
+    bands: Iterable[Bands],
+    background: Background,
+    found: Innovations,
+    moved: Moved | None,
+) -> dict[str, Verdict]:
+    """Judge all bands that have readings, by name."""
+    start = innovations.odd_start(found)
+    verdicts = {}
+    for one in bands:
+        # Of several training windows the first one holds the start.
+        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
+        far = beyond_training(problem.posterior, one.voltage, one.interval)
+        verdict = (
+            assess(one, background, start=start, moved=moved, beyond=far)
+            if at_start
+            else assess(one, background, beyond=far)
+        )
+        if verdict is not None:
+            verdicts[one.name] = verdict
+    return verdicts
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
@@ -310,12 +349,16 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     }
 
 
-def _scores(problem: Problem, bands: tuple[Bands, ...]) -> dict[str, Scores]:
-    return {
-        one.name: score(one, scoring(problem.config.seed, one))
-        for one in bands
-        if one.measured is not None
-    }
+def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
+    """Return the log likelihood of each draw, nats, shaped as ``result.log_density``."""
+    prior = posterior.prior
+    _, log_prior = prior.constrain(prior.unconstrain(result.flat_draws))
+    return result.log_density - log_prior.reshape(result.log_density.shape)
+
+
+def going_on(path: Path, problem: Problem) -> str:
+    """Return the command that goes on with a run, with twice the budget that it had."""
+    return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
@@ -328,13 +371,18 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
     """Write everything that a run leaves; the summary last, as the sign that all is there."""
     numbers = summary(result) | {
         "seed": problem.config.seed,
+        "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
     record = problem.record
-    assert record.displacement is not None
-    write_posterior(folder.path / "posterior.nc", result, record.voltage, record.displacement)
+    write_posterior(
+        folder.path / "posterior.nc",
+        result,
+        log_likelihood(problem.posterior, result),
+        record,
+    )
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)

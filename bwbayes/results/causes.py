@@ -268,14 +268,14 @@ def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
     return far & (matters and bool(few))
 
 
-def cause(kind: Kind, r: Residuals) -> Cause:
-    """Put a cause and its remedy into words."""
+def cause(kind: Kind, r: Residuals, settled: float | None = None) -> Cause:
+    """Put a cause and its remedy into words; ``settled`` is when an odd start ends, if known."""
     text, for_fit, for_other = _WORDS[kind]
     words = {
         "name": r.name,
         "begin": f"{r.time[0]:.4g}",
         "end": f"{r.time[-1] + r.interval:.4g}",
-        "settled": f"{_settled(r):.4g}",
+        "settled": f"{_settled(r) if settled is None else settled:.4g}",
         "size": f"{np.mean(r.residual):+.3g}",
         "low": f"{r.fitted[0]:.4g}",
         "high": f"{r.fitted[1]:.4g}",

@@ -15,29 +15,49 @@ import arviz_base
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
 
 __all__ = ["write_bands", "write_posterior", "write_summary"]
 
 
-def write_posterior(path: Path, result: Result, voltage: FloatArray, reading: FloatArray) -> None:
-    """Write the draws as arviz groups: posterior, sample_stats, observed_data, constant_data.
+def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, record: Record) -> None:
+    """Write the draws as arviz groups, and whether they have converged.
 
-    A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say which.
-    ``voltage`` and ``reading`` are the training record, (samples,), V and um.
+    Groups: posterior, sample_stats, log_likelihood (of all readings together), observed_data and
+    constant_data. A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say
+    which. The attribute ``converged`` is 1 or 0: without convergence the draws are none of the
+    posterior.
+
+    Parameters
+    ----------
+    path
+        The file.
+    result
+        The run.
+    log_likelihood
+        (steps, ensembles, walkers), nats.
+    record
+        The training record.
     """
     _, ensembles, walkers, _ = result.draws.shape
-    chains = np.moveaxis(result.draws, 0, 2).reshape(ensembles * walkers, -1, len(result.free))
-    density = np.moveaxis(result.log_density, 0, 2).reshape(ensembles * walkers, -1)
+
+    def chains(values: FloatArray) -> FloatArray:
+        return np.moveaxis(values, 0, 2).reshape(
+            ensembles * walkers, len(values), *values.shape[3:]
+        )
+
+    drawn = chains(result.draws)
     tree = arviz_base.from_dict(
         {
-            "posterior": {p.name: chains[..., i] for i, p in enumerate(result.free)},
-            "sample_stats": {"lp": density},
-            "observed_data": {"displacement": reading},
-            "constant_data": {"voltage": voltage},
+            "posterior": {p.name: drawn[..., i] for i, p in enumerate(result.free)},
+            "sample_stats": {"lp": chains(result.log_density)},
+            "observed_data": {"displacement": np.asarray(record.displacement)},
+            "constant_data": {"voltage": record.voltage},
         },
-        dims={"displacement": ["sample"], "voltage": ["sample"]},
+        coords={"time": record.time},
+        dims={"displacement": ["time"], "voltage": ["time"]},
         check_conventions=False,  # more walkers than steps are as they should be
     )
     along = {
@@ -46,6 +66,16 @@ def write_posterior(path: Path, result: Result, voltage: FloatArray, reading: Fl
     }
     for group in ("posterior", "sample_stats"):
         tree[group] = tree[group].to_dataset().assign_coords(along)
+    density = ("chain", "draw"), chains(log_likelihood)
+    statistics = tree["sample_stats"].to_dataset()
+    tree["log_likelihood"] = statistics.drop_vars("lp").assign(displacement=density)
+    for group, name, unit in (
+        ("observed_data", "displacement", "um"),
+        ("constant_data", "voltage", "V"),
+    ):
+        tree[group][name].attrs["units"] = unit
+        tree[group]["time"].attrs["units"] = "s"
+    tree.attrs["converged"] = tree["posterior"].attrs["converged"] = int(result.outcome.converged)
     for parameter in result.free:
         tree["posterior"][parameter.name].attrs["units"] = parameter.unit
     temporary = path.with_suffix(".partial")

@@ -16,7 +16,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
+from bwbayes.results import innovations
 from bwbayes.results.bands import Bands
+from bwbayes.results.innovations import Innovations
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.verdict import Verdict
 
@@ -47,6 +49,8 @@ class Result:
         with a measurement. Both empty unless converged.
     verdicts
         Whether the bands hold, by their name, for those with a measurement.
+    innovations
+        What each fitted reading brings anew, at the most probable draw; None unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -64,6 +68,7 @@ class Result:
     bands: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    innovations: Innovations | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -105,6 +110,7 @@ def summary(result: Result) -> dict[str, object]:
         "remarks": list(result.remarks),
         "parameters": None,
         "validation": None,
+        "innovations": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -112,6 +118,8 @@ def summary(result: Result) -> dict[str, object]:
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
+        if result.innovations is not None:
+            known["innovations"] = innovations.numbers(result.innovations)
     return known
 
 

@@ -14,6 +14,7 @@ A verdict that says no names the likeliest cause (:mod:`bwbayes.results.causes`)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.causes import Cause, Residuals, cause, likeliest
+from bwbayes.results.innovations import OddStart
+from bwbayes.results.refit import Moved
 
 __all__ = ["Background", "Verdict", "assess"]
 
@@ -150,10 +153,30 @@ class _Standard:
     unsure: float
 
 
-def assess(bands: Bands, background: Background) -> Verdict | None:
+def assess(
+    bands: Bands,
+    background: Background,
+    *,
+    start: OddStart | None = None,
+    moved: Moved | None = None,
+    beyond: Sequence[str] = (),
+) -> Verdict | None:
     """Judge bands by the readings after ``scored_from``; None if there are none.
 
     A good record, one that the fitted model describes, fails with a probability below 1 %.
+
+    Parameters
+    ----------
+    bands
+        Bands with readings.
+    background
+        What is known of the fit.
+    start
+        Of a fitted record, a start that does not go with the rest.
+    moved
+        Of a fitted record, a parameter that is another one without the start.
+    beyond
+        In what the record's drive leaves the one that was fitted, a line each.
     """
     if bands.measured is None:
         return None
@@ -165,6 +188,8 @@ def assess(bands: Bands, background: Background) -> Verdict | None:
     residuals = Residuals.of(bands, judged, background.fitted)
     reasons = [
         *_lead_in(bands),
+        *_odd(start),
+        *_moved(moved),
         *_coverage(bands, judged, standard),
         *_size(standard),
         *_leaning(bands, judged, standard),
@@ -177,6 +202,15 @@ def assess(bands: Bands, background: Background) -> Verdict | None:
         why = likeliest(residuals) if reasons else cause("noise", residuals)
         if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
             why = cause("lead-in", residuals)
+        if (start or moved) and why.kind not in ("sign", "outliers", "drift"):
+            until = max(one.until for one in (start, moved) if one is not None)
+            why = cause("start", residuals, until)
+        if beyond and why.kind in ("gain", "delay", "loop", "noise", "unknown"):
+            why = Cause(
+                "extrapolation",
+                f"extrapolation: {beyond[0]}",
+                "fit a record that is driven as far and as fast",
+            )
         return Verdict(bands.name, bands.training, False, (*reasons, *wide), why)
     if standard.for_size < FEWEST:
         few = f"the record is worth {standard.for_size:.1f} independent readings: too few to tell"
@@ -298,6 +332,27 @@ def _missed(bands: Bands, judged: BoolArray) -> list[str]:
         return []
     return [
         f"the mean misses the readings that were fitted by {rms / extent:.1%} of their range (rms)"
+    ]
+
+
+def _odd(start: OddStart | None) -> list[str]:
+    """Say that the start of a fitted record does not go with the rest."""
+    if start is None:
+        return []
+    return [
+        f"the first readings, until {start.until:.4g} s, do not go with the rest "
+        f"({start.size:.2g} sds)"
+    ]
+
+
+def _moved(moved: Moved | None) -> list[str]:
+    """Say that the parameters of a fit hang on the record's start."""
+    if moved is None:
+        return []
+    (whole, sd), (rest, its_sd) = moved.whole, moved.rest
+    return [
+        f"without the readings before {moved.until:.4g} s {moved.name} is {rest:.4g} +- "
+        f"{its_sd:.2g} {moved.unit}, with them {whole:.4g} +- {sd:.2g}"
     ]
 
 

@@ -103,6 +103,16 @@ def test_folder_without_a_run_cannot_be_opened(tmp_path: Path) -> None:
             RunFolder.open(path)
 
 
+def test_what_only_looks_like_a_run_cannot_be_opened(tmp_path: Path) -> None:
+    """A folder with a config alone is somebody's project, and a file is no folder."""
+    config = tmp_path / "config.toml"
+    config.write_text(small.TEXT)
+    with pytest.raises(InputError, match="no run here; start one with"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(InputError, match=r"config.toml: no run here, but a file; give the folder"):
+        RunFolder.open(config)
+
+
 def hold(path: Path, held: Event, enough: Event) -> None:
     with RunFolder(path).locked():
         held.set()

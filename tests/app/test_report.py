@@ -141,10 +141,12 @@ def test_verdict_of_a_converged_run() -> None:
 
 
 def test_verdict_without_convergence_says_why_and_what_to_do() -> None:
-    text = page(example.run(converged=False))
+    run = example.run(converged=False)
+    go_on = {"go_on": "bwbayes resume results/a --steps 40000"}
+    text = render(run, summary(run) | go_on, PICTURES)
     assert "<strong>NOT CONVERGED</strong>" in text
     assert "budget of 120 steps used up: R-hat 1.2" in text
-    assert "<code>bwbayes resume DIR</code>" in text
+    assert "<code>bwbayes resume results/a --steps 40000</code>" in text
     for place in ("trace", "ranks"):
         assert f'href="#{place}"' in text
         assert f'id="{place}"' in text

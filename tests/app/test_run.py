@@ -192,6 +192,30 @@ def test_posterior_is_the_chain(run: Path) -> None:
                 np.testing.assert_array_equal(draws[:, e, w, i], posterior[name].values[number])
 
 
+def test_posterior_says_whether_it_has_converged_and_when_samples_were(run: Path) -> None:
+    record = read_record(run / "records/record.h5")
+    with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
+        assert 1 == tree.attrs["converged"] == tree["posterior"].attrs["converged"]
+        for group, name in (("observed_data", "displacement"), ("constant_data", "voltage")):
+            values = tree[group].to_dataset()[name]
+            assert ("time",) == values.dims
+            np.testing.assert_array_equal(record.time, values["time"].values)
+            assert "s" == values["time"].attrs["units"]
+            np.testing.assert_array_equal(getattr(record, name), values.values)
+
+
+def test_posterior_has_the_log_likelihood_of_each_draw(run: Path) -> None:
+    """It is that of all readings together, and with the log prior it makes the log density."""
+    posterior = module.load_run(RunFolder(run)).posterior
+    with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
+        found = tree["log_likelihood"].to_dataset()["displacement"]
+        drawn = tree["posterior"].to_dataset()
+        free = np.array([[float(drawn[n][c, 3]) for n in posterior.names] for c in (0, 20, 71)])
+        expected = posterior.log_likelihood(posterior.prior.theta(free))
+        np.testing.assert_allclose(found.values[[0, 20, 71], 3], expected, rtol=0, atol=1e-6)
+        assert found.shape == tree["sample_stats"].to_dataset()["lp"].shape
+
+
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open() as file:
         return list(csv.DictReader(file))

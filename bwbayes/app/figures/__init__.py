@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
+from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.series import draw_bands
 from bwbayes.app.figures.style import STYLE
@@ -30,9 +31,9 @@ __all__ = ["draw_all", "draw_alone", "save", "save_one"]
 def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
-    ``loop``, ``bands_NAME`` for each of the result's bands, ``coverage``, ``corner``, ``trace`` and
-    ``ranks``. Without convergence only the last two; without bands or a measurement to hold them
-    against, what needs them is left out.
+    ``loop``, ``bands_NAME`` for each of the result's bands, ``coverage``, ``innovations``,
+    ``corner``, ``trace`` and ``ranks``. Without convergence only the last two; without bands or a
+    measurement to hold them against, what needs them is left out.
     """
     figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
@@ -42,6 +43,8 @@ def draw_all(result: Result) -> dict[str, Figure]:
             figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
             if result.scores:
                 figures["coverage"] = draw_coverage(result.bands, result.scores)
+            if result.innovations is not None:
+                figures["innovations"] = draw_innovations(result.innovations)
             figures["corner"] = draw_corner(result)
         figures["trace"] = draw_trace(result)
         figures["ranks"] = draw_ranks(result)

@@ -1,0 +1,246 @@
+"""Innovations: what a fit's residuals bring anew at each reading, and whether it is pure chance.
+
+Where model and noise model are right, a residual less what the readings before it foretell, over
+its standard deviation, is an independent standard normal number. Four things can be seen in these
+innovations that the residuals hide: whether they are white, whether they are normal, whether their
+size depends on the drive (its rate, its voltage, its direction), and whether the record starts as
+it goes on. A remark is made where a departure is both beyond chance and large enough to matter;
+on a record that the model describes this happens to fewer than one in a hundred.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, stats
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Posterior
+
+__all__ = [
+    "GROUPS",
+    "LAGS",
+    "Innovations",
+    "OddStart",
+    "innovations",
+    "numbers",
+    "odd_start",
+    "remarks",
+]
+
+# Lags of the autocorrelation that is looked at.
+LAGS = 40
+
+# Probability of a false alarm of each of the tests; there are about ten.
+ALARM = 1e-4
+
+# Departures that are smaller do not matter, however sure they are: an autocorrelation; an excess
+# kurtosis; a ratio of sds between parts of the drive; a mean in sds.
+CORRELATED, HEAVY, UNEVEN, ONE_SIDED = 0.1, 1.0, 1.3, 0.15
+
+# Parts of the drive that are compared.
+GROUPS = 3
+
+# Fewer innovations show nothing.
+FEWEST = 100
+
+# A start is odd where its innovations sum up to so many sds, and to so many times what any other
+# stretch of that length does.
+ODD, MORE = 5.5, 2.0
+
+# An odd start has ended where what comes next is this part as odd.
+ENDED = 0.6
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Normalised innovations of the readings that were fitted, and the drive there.
+
+    All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s.
+    """
+
+    time: FloatArray
+    white: FloatArray
+    voltage: FloatArray
+    rate: FloatArray
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Autocorrelation at lags 1 to LAGS, (lags,)."""
+        centred = self.white - np.mean(self.white)
+        total = float(np.sum(centred**2))
+        lags = range(1, min(LAGS, centred.size - 1) + 1)
+        return np.array([np.sum(centred[lag:] * centred[:-lag]) / total for lag in lags])
+
+    @property
+    def kurtosis(self) -> float:
+        """Excess kurtosis: 0 of a normal distribution, positive with heavy tails."""
+        return float(stats.kurtosis(self.white))
+
+    def by(self, what: str) -> tuple[tuple[str, FloatArray], ...]:
+        """Return innovations in parts of the drive, by its "rate", "voltage" or "direction"."""
+        if what == "direction":
+            return (
+                ("falling", self.white[self.rate < 0]),
+                ("rising", self.white[self.rate > 0]),
+            )
+        values, names = {
+            "rate": (np.abs(self.rate), ("slow", "medium", "fast")),
+            "voltage": (self.voltage, ("low", "middle", "high")),
+        }[what]
+        edges = np.quantile(values, np.linspace(0, 1, GROUPS + 1)[1:-1])
+        place = np.searchsorted(edges, values)
+        return tuple((name, self.white[place == i]) for i, name in enumerate(names))
+
+
+@dataclass(frozen=True)
+class OddStart:
+    """A start of the record that does not go with the rest: until when, and how far off."""
+
+    begin: float
+    until: float
+    size: float
+
+
+def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> Innovations:
+    """Return the innovations of the fitted readings at one set of free parameters (free,).
+
+    ``begin`` is the time of the record's first sample, s.
+    """
+    readings = posterior.readings
+    theta = posterior.prior.theta(free[np.newaxis])
+    simulated = posterior.simulate(theta, readings.rows)
+    residual = readings.values - simulated
+    noise = theta[:, len(posterior.actuator.parameters) :]
+    white, _ = posterior.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
+    interval = posterior.actuator.interval
+    # A measured voltage is noisy, and its change noisier: a five-hundredth of the record.
+    smooth = max(1, posterior.voltage.size // 500)
+    slow = ndimage.uniform_filter1d(posterior.voltage, smooth, mode="nearest")
+    rate = np.gradient(slow) / interval if slow.size > 1 else np.zeros_like(slow)
+    time = begin + interval * readings.rows.astype(np.float64)
+    return Innovations(time, white[0, 0], posterior.voltage[readings.rows], rate[readings.rows])
+
+
+def remarks(found: Innovations) -> tuple[str, ...]:
+    """Say, one line each, in what the innovations are not what the noise model takes them for."""
+    if found.white.size < FEWEST:
+        return ()
+    lines = [*_correlated(found), *_heavy(found)]
+    for what in ("rate", "voltage", "direction"):
+        lines += _uneven(found, what)
+    return tuple(f"noise model: {line}" for line in lines)
+
+
+def odd_start(found: Innovations) -> OddStart | None:
+    """Find a start of the record that the noise model cannot have made, if there is one.
+
+    The first innovations are summed up over 4, 8, ... readings, up to an eighth of all. A sum that
+    is odd is larger than chance allows, and than all sums of as many readings in the second half.
+    The start lasts until what comes after it is odd no longer.
+    """
+    size = _oddness(found.white)
+    if not size:
+        return None
+    first = 0
+    # Up to a third of the record: what is odd for longer is no start.
+    while first < found.white.size // 3 and _oddness(found.white[first:], ENDED):
+        first = max(first + 1, round(1.2 * first))
+    return OddStart(float(found.time[0]), float(found.time[first]), size)
+
+
+def _oddness(white: FloatArray, part: float = 1.0) -> float:
+    """Return the largest odd sum of first innovations, in sds; 0 if none is odd.
+
+    ``part`` is that of what is odd elsewhere.
+    """
+    size, largest, length = white.size, 0.0, 4
+    while length <= size // 8:
+        sums = ndimage.uniform_filter1d(white, length, mode="nearest") * np.sqrt(length)
+        first = float(abs(np.sum(white[:length])) / np.sqrt(length))
+        usual = float(np.max(np.abs(sums[size // 2 : size - length])))
+        if first > part * max(ODD, MORE * usual):
+            largest = max(largest, first)
+        length *= 2
+    return largest
+
+
+def numbers(found: Innovations) -> dict[str, object]:
+    """Return what ``summary.json`` says of the innovations."""
+    correlation = found.correlation
+    return {
+        "readings": found.white.size,
+        "sd": float(np.std(found.white)),
+        "autocorrelation_1": float(correlation[0]) if correlation.size else None,
+        "largest_autocorrelation": (
+            float(correlation[np.argmax(np.abs(correlation))]) if correlation.size else None
+        ),
+        "excess_kurtosis": found.kurtosis,
+        "by": {
+            what: {
+                name: {"mean": float(np.mean(part)), "sd": float(np.std(part))}
+                for name, part in found.by(what)
+                if part.size
+            }
+            for what in ("rate", "voltage", "direction")
+        },
+    }
+
+
+def _correlated(found: Innovations) -> list[str]:
+    correlation = found.correlation
+    bound = stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(found.white.size)
+    lag = int(np.argmax(np.abs(correlation)))
+    if abs(correlation[lag]) <= max(bound, CORRELATED):
+        return []
+    after = found.time[lag + 1] - found.time[0]
+    return [
+        f"innovations {after:.3g} s apart correlate by {correlation[lag]:.2f}, and should not: "
+        "the discrepancy is no process that forgets exponentially, or the sensor filters"
+    ]
+
+
+def _heavy(found: Innovations) -> list[str]:
+    excess, error = found.kurtosis, np.sqrt(24 / found.white.size)
+    # Kurtosis of few numbers is skewed: one more sd than its size would need.
+    if excess <= max(HEAVY, (stats.norm.isf(ALARM) + 2) * error):
+        return []
+    far = int(np.sum(np.abs(found.white) > 4))
+    return [
+        f"the innovations have heavy tails (excess kurtosis {excess:.1f}, {far} of "
+        f"{found.white.size} beyond 4 sds): look for outliers, or for jumps of the drive"
+    ]
+
+
+def _uneven(found: Innovations, what: str) -> list[str]:
+    """Compare the sds, and the means, of the innovations in parts of the drive."""
+    groups = [(name, values) for name, values in found.by(what) if values.size >= FEWEST // GROUPS]
+    if len(groups) < 2:
+        return []
+    lines = []
+    sds = [float(np.std(values)) for _, values in groups]
+    high, low = int(np.argmax(sds)), int(np.argmin(sds))
+    # The variance of tails that are heavy is less sure.
+    heavy = 1 + max(found.kurtosis, 0) / 2
+    error = np.sqrt(heavy * sum(0.5 / values.size for _, values in groups))
+    ratio = sds[high] / max(sds[low], np.finfo(float).tiny)
+    bound = stats.norm.isf(ALARM / 6) * error
+    if ratio > UNEVEN and np.log(ratio) > bound:
+        lines.append(
+            f"the innovations are {ratio:.2g} times as large where the {_part(what, groups[high])} "
+            f"as where it is {groups[low][0]}: the noise depends on the drive's {what}"
+        )
+    means = [float(np.mean(v)) * np.sqrt(v.size) / max(float(np.std(v)), 1e-300) for _, v in groups]
+    worst = int(np.argmax(np.abs(means)))
+    mean = float(np.mean(groups[worst][1]))
+    if abs(means[worst]) > stats.norm.isf(ALARM / 6) and abs(mean) > ONE_SIDED:
+        lines.append(
+            f"the innovations average {mean:+.2f} sds where the {_part(what, groups[worst])}: "
+            "the model misses something that follows the loop"
+        )
+    return lines
+
+
+def _part(what: str, group: tuple[str, FloatArray]) -> str:
+    return f"voltage is {group[0]}" if what != "rate" else f"drive is {group[0]}"

@@ -1,0 +1,106 @@
+"""Whether a fit hangs on the start of its record: a second point fit without it tells.
+
+A switch-on transient, or a first part that belongs to something else, can drag the parameters far
+away while the noise model covers what is then missed everywhere, so that neither bands nor
+innovations show it. Parameters that many readings tell do not move by many standard deviations
+when the first fifth of the readings is left out. Where they do, the fit belongs to the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+
+__all__ = ["Moved", "without_start"]
+
+# Part of the readings that is left out.
+PART = 0.2
+
+# A parameter has moved when it is off by so many sds of both fits together. Independent errors
+# are off by as much once in a million; those of nested fits are less apart.
+MOVED = 5.0
+
+# Draws of the Gaussian approximation.
+DRAWS = 400
+
+# Fewer readings than this tell too little without their first part.
+FEWEST = 200
+
+# Parameters of the start itself.
+OF_THE_START = ("initial", "offset")
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The parameter that moves most when a record's start is left out.
+
+    ``until`` in s is where the start ends; ``whole`` and ``rest`` are mean and sd with it and
+    without it.
+    """
+
+    name: str
+    unit: str
+    until: float
+    whole: tuple[float, float]
+    rest: tuple[float, float]
+
+
+def without_start(
+    posterior: Posterior, draws: FloatArray, generator: np.random.Generator, begin: float = 0.0
+) -> Moved | None:
+    """Fit again without the first readings; return the parameter that moves most, if one does.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units.
+    generator
+        Starts the point fit and draws from its approximation.
+    begin
+        Time of the record's first sample, s.
+    """
+    rows = posterior.readings.rows
+    if rows.size < FEWEST:
+        return None
+    first = int(rows[round(PART * rows.size)])
+    later = [slice(max(w.start, first), w.stop) for w in posterior.training if w.stop > first]
+    rest = replace(posterior, training=tuple(later))
+    try:
+        point = pointfit.fit(rest, generator)
+    except InputError:
+        return None
+    coordinates = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    free, density = posterior.prior.constrain(coordinates)
+    free = free[np.isfinite(density)]
+    physical = [
+        i
+        for i, p in enumerate(posterior.prior.free)
+        if p.name in posterior.actuator.parameters and p.name not in OF_THE_START
+    ]
+    if not physical or len(free) < DRAWS // 4:
+        return None
+    (mean, sd), (other, its_sd) = (_middle(some[:, physical]) for some in (draws, free))
+    moved = np.abs(other - mean) / np.sqrt(sd**2 + its_sd**2 + np.finfo(float).tiny)
+    worst = int(np.argmax(moved))
+    if moved[worst] <= MOVED:
+        return None
+    parameter = posterior.prior.free[physical[worst]]
+    until = begin + posterior.actuator.interval * first
+    whole = float(mean[worst]), float(sd[worst])
+    return Moved(
+        parameter.name, parameter.unit, until, whole, (float(other[worst]), float(its_sd[worst]))
+    )
+
+
+def _middle(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Median and half the width of the middle 68 % of draws (draws, parameters)."""
+    low, middle, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
+    return middle, (high - low) / 2

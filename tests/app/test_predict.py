@@ -1,0 +1,64 @@
+"""A prediction leaves bands, scores and a picture, says what does not hold, replaces nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bwbayes.app.predict import predict
+from bwbayes.data import Record, read_record, write_record
+from bwbayes.errors import InputError
+from bwbayes.results.prediction import Start
+from tests.app import small
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+@pytest.fixture
+def record(run: Path) -> Record:
+    return read_record(run / "records/sine.h5")
+
+
+def test_scores_and_a_picture_lie_beside_the_bands(
+    run: Path, record: Record, tmp_path: Path
+) -> None:
+    write_record(record, tmp_path / "sine.h5")
+    out = tmp_path / "new/bands.csv"
+    arguments = run, tmp_path / "sine.h5", None, Start(from_rest=True), out, small.quiet()
+    assert 0 == predict(*arguments, window=(2.0, 3.5))
+    found = json.loads(out.with_suffix(".json").read_text())
+    assert (2.0, 3.5) == pytest.approx((found["from_s"], found["to_s"]))
+    assert 75 == found["samples"]
+    assert 0 < found["scores"]["nrmse"]
+    assert found["holds"] in (True, None)
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    out.unlink()
+    with pytest.raises(InputError, match=r"bands.json: exists; choose another name, or give --ov"):
+        predict(*arguments)
+    assert not out.exists()
+    with pytest.raises(InputError, match=r"give a name that ends in \.csv"):
+        predict(*arguments[:4], tmp_path / "bands.png", small.quiet())
+
+
+def test_record_that_goes_the_other_way_ends_with_status_3(
+    run: Path, record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert record.displacement is not None
+    write_record(replace(record, displacement=-record.displacement), tmp_path / "turned.h5")
+    said = StringIO()
+    out = tmp_path / "bands.csv"
+    start = Start(from_rest=True)
+    assert 3 == predict(run, tmp_path / "turned.h5", None, start, out, Console(file=said))
+    assert said.getvalue().startswith("DOES NOT HOLD: turned, not fitted: does not hold: ")
+    assert "the displacement goes against the voltage" in said.getvalue()
+    assert f"DOES NOT HOLD: turned; see {tmp_path / 'bands.png'}\n" in capsys.readouterr().err
+    found = json.loads(out.with_suffix(".json").read_text())
+    assert (False, "sign") == (found["holds"], found["cause"])

@@ -1,0 +1,108 @@
+"""Innovations: silent on what the noise model describes, and a remark on each departure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures.innovations import draw_innovations
+from bwbayes.arrays import FloatArray
+from bwbayes.results.innovations import Innovations, innovations, numbers, odd_start, remarks
+from tests.inference import problems
+
+
+def along(white: FloatArray) -> Innovations:
+    """Return innovations along a sine of 1 Hz at 200 Hz."""
+    time = 0.005 * np.arange(white.size, dtype=np.float64)
+    voltage = 100 * np.sin(2 * np.pi * time)
+    return Innovations(time, white, voltage, np.gradient(voltage) / 0.005)
+
+
+def test_innovations_of_the_right_model_raise_no_remark() -> None:
+    """At most 4 false alarms of 400, 1 %; of 1,000 others there were three."""
+    generator = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(400):
+        found = along(generator.normal(size=int(generator.choice([200, 1000, 4000]))))
+        alarms += bool(remarks(found) or odd_start(found))
+    assert alarms <= 4
+
+
+def coloured(white: FloatArray, _: Innovations) -> FloatArray:
+    return white + 0.3 * np.concatenate([[0.0], white[:-1]])
+
+
+def heavy(white: FloatArray, _: Innovations) -> FloatArray:
+    return white * np.sqrt(3 / np.random.default_rng(1).chisquare(3, white.size))
+
+
+def fast(white: FloatArray, found: Innovations) -> FloatArray:
+    return white * (1 + 0.8 * (np.abs(found.rate) > 500))
+
+
+def high(white: FloatArray, found: Innovations) -> FloatArray:
+    return white * (1 + 0.8 * (found.voltage > 50))
+
+
+def rising(white: FloatArray, found: Innovations) -> FloatArray:
+    return white + 0.3 * (found.rate > 0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "part"),
+    [
+        (coloured, "innovations 0.005 s apart correlate by 0."),
+        (heavy, "heavy tails"),
+        (fast, "times as large where the drive is fast"),
+        (high, "times as large where the voltage is high"),
+        (rising, "sds where the voltage is rising"),
+    ],
+)
+def test_each_departure_is_remarked_on(
+    spoil: Callable[[FloatArray, Innovations], FloatArray], part: str
+) -> None:
+    """In 20 of 20 records of 2,000 readings."""
+    for seed in range(20):
+        white = np.random.default_rng([2, seed]).normal(size=2000)
+        lines = remarks(along(spoil(white, along(white))))
+        assert any(part in line for line in lines), (seed, lines)
+        assert all(line.startswith("noise model: ") for line in lines)
+
+
+def test_a_start_that_is_pushed_is_odd_and_its_end_is_told() -> None:
+    for seed in range(20):
+        white = np.random.default_rng([3, seed]).normal(size=4000)
+        white[:100] -= 1.0
+        found = odd_start(along(white))
+        assert found is not None
+        assert 0.1 < found.until < 1.0
+        assert 5.5 < found.size
+
+
+def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
+    """At the truth: mean within 4.5 standard errors of 0, sd of 1, and no remark."""
+    posterior = problems.short_posterior(samples=3000, seed=4)
+    theta = problems.truth(posterior)[0]
+    free = np.array([theta[posterior.prior.names.index(n)] for n in posterior.names])
+    found = innovations(posterior, free, begin=7.0)
+    assert 7.0 == found.time[0]
+    assert abs(np.mean(found.white)) < 4.5 / np.sqrt(3000)
+    assert abs(np.std(found.white) - 1) < 4.5 / np.sqrt(6000)
+    assert () == remarks(found)
+    assert odd_start(found) is None
+    said = numbers(found)
+    assert 3000 == said["readings"]
+    assert {"rate", "voltage", "direction"} == set(said["by"])  # type: ignore[call-overload]
+
+
+def test_the_picture_has_its_four_parts() -> None:
+    figure = draw_innovations(along(np.random.default_rng(1).normal(size=1000)))
+    assert isinstance(figure, Figure)
+    titles = [panel.get_title() for panel in figure.axes]
+    assert 4 == len(titles)
+    assert all(title.endswith("?") for title in titles)
+    short = draw_innovations(along(np.random.default_rng(1).normal(size=30)))
+    assert 4 == len(short.axes)
