@@ -320,6 +320,15 @@ def test_interrupted_command_says_how_to_go_on(
     assert 1 == ChainFile.read(made.chain).blocks("pilot")
 
 
+def test_posterior_that_presses_against_the_passive_bound_is_remarked_on(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, chain, outcome = module.finished(RunFolder(run))
+    monkeypatch.setattr(module, "passive_remark", lambda _, every: f"pressed {every.ndim}")
+    unconverged = replace(outcome, converged=False)
+    assert "pressed 4" in module.assemble(problem, chain, unconverged).remarks
+
+
 def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
     problem = module.load_run(RunFolder(run))
     _, _, outcome = module.finished(RunFolder(run))
