@@ -27,7 +27,7 @@ PART = 0.2
 MOVED = 5.0
 
 # Log density, nats, that the draws must lack on the rest of the readings; draws compared.
-WORSE = 15.0
+WORSE = 8.0
 COMPARED = 100
 
 # Draws of the Gaussian approximation.
