@@ -26,6 +26,10 @@ PART = 0.2
 # are off by as much once in a million; those of nested fits are less apart.
 MOVED = 5.0
 
+# Log density, nats, that the draws must lack on the rest of the readings; draws compared.
+WORSE = 8.0
+COMPARED = 100
+
 # Draws of the Gaussian approximation.
 DRAWS = 400
 
@@ -76,6 +80,10 @@ def without_start(
     try:
         point = pointfit.fit(rest, generator)
     except InputError:
+        return None
+    # Only where the rest is told far worse by what was sampled: else it has two optima.
+    sampled = rest.log_density(posterior.prior.unconstrain(draws[:COMPARED]))
+    if point.log_density - float(np.max(sampled)) <= WORSE:
         return None
     coordinates = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
     free, density = posterior.prior.constrain(coordinates)

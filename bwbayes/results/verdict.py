@@ -331,7 +331,8 @@ def _missed(bands: Bands, judged: BoolArray) -> list[str]:
     if extent == 0 or slow <= POOR * extent or slow <= fast:
         return []
     return [
-        f"the mean misses the readings that were fitted by {rms / extent:.1%} of their range (rms)"
+        f"the mean misses the readings that were fitted by {_percent(rms / extent)} of their "
+        "range (rms)"
     ]
 
 
