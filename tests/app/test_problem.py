@@ -10,7 +10,7 @@ import pytest
 
 from bwbayes.app.config import Config, dump, parse
 from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.run import load_run
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
@@ -79,6 +79,22 @@ def beyond(problem: Problem) -> list[str]:
 
 def by_name(problem: Problem) -> dict[str, Parameter]:
     return {parameter.name: parameter for parameter in problem.parameters}
+
+
+def test_each_purpose_and_each_seed_has_a_random_stream_of_its_own() -> None:
+    purposes = (
+        "fit",
+        "sampling",
+        "draws",
+        "ranks",
+        "predict a",
+        "predict b",
+        "score a",
+        "record a",
+    )
+    streams = [generator(seed, purpose) for seed in (0, 1, 256) for purpose in purposes]
+    assert len(streams) == len({stream.integers(2**62) for stream in streams})
+    assert generator(1, "fit").integers(2**62) == generator(1, "fit").integers(2**62)
 
 
 def test_default_priors_depend_on_ranges_and_times_of_the_drive_alone(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.sampling import SamplingPlan
@@ -18,6 +19,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.results import replicates as module
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
+from tests.app import example
 from tests.inference.problems import decaying_sine, posterior_of, short_posterior
 
 # Three free parameters, so that a replicate takes a fraction of a second.
@@ -76,6 +78,21 @@ def test_replicate_out_of_budget_is_ranked_and_not_converged() -> None:
     entry = replicate(small(plan=replace(PLAN, most_steps=10)), 1, 0).entry()
     assert (False, 10) == (entry["converged"], entry["steps"])
     assert 6 == len(entry["ranks"])
+
+
+def test_each_band_is_held_against_what_it_is_for() -> None:
+    """Model, truth and readings lie 10 um apart, and each kind of band around its own."""
+    model = np.zeros(80)
+    record = Record(model, model + 20, 0.01, truth=model + 10)
+    middles = zip(KINDS, (0.0, 10.0, 20.0), strict=True)
+    around = {(kind, level): middle for kind, middle in middles for level in LEVELS}
+    bands = replace(
+        example.bands(samples=20),
+        lower={key: np.full(20, middle - 1) for key, middle in around.items()},
+        upper={key: np.full(20, middle + 1) for key, middle in around.items()},
+    )
+    covered = module._covered(small(), [bands], record, model)
+    assert dict.fromkeys((f"{kind} {level}" for kind, level in around), 1.0) == covered
 
 
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
