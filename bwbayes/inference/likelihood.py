@@ -223,7 +223,9 @@ class Likelihood:
             with np.errstate(divide="ignore"):
                 slowest = max(float(np.max(np.log(recursion.remembered))), -FORGOTTEN)
             far = FORGOTTEN + rows * slowest < 0
-            far &= FORGOTTEN + np.arange(rows.size) * np.max(log_decay) < 0
+            # White noise decays at once: its rate is infinite.
+            decay = max(float(np.max(log_decay)), -FORGOTTEN)
+            far &= FORGOTTEN + np.arange(rows.size) * decay < 0
             heard = int(np.argmax(far)) if far[-1] else rows.size
         else:
             heard = 0
