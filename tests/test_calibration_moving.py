@@ -7,7 +7,7 @@ of its start: the hysteretic state is free, the dynamics may be moving. Each rep
 another record with the same truth, cut from another drive at another rate, with a state, an unrest
 and an offset of its own, and predicts it from the posterior after a lead-in of a second.
 
-The default suite makes 60 replicates with the lag. All parameters are tested together
+The default suite makes 40 replicates with the lag. All parameters are tested together
 (:mod:`tests.together`), and each by the calibration's own tests; twins plant a wrong width and a
 bias on the draws. Coverages of the 18 bands are held to the spread between replicates: by chance
 one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` makes
@@ -37,7 +37,7 @@ from tests.found import keep
 from tests.together import LEVEL, Plant, narrowed, shifted, together_test
 
 SEED = 1
-QUICK = 60
+QUICK = 40
 REPLICATES = 150
 
 # Probability that one of a sound calibration's bands is off by more than is allowed.

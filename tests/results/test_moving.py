@@ -6,12 +6,13 @@ coverages are held to the spread between records. Before the start of the dynami
 95 % band of the records with a lag of 38 ms covered 77 %; a twin takes the dynamics to be at rest,
 and fails.
 
-``-m slow`` goes through 72 cases of 200 records each. Each case gives three t-values, of the 50, 90
-and 95 % bands. By chance alone one in 370 of the 216 is beyond three standard errors, so all are
-held to three by a rule that is right for the whole family: none may be beyond the limit that 216
-leave once in 100 times (Bonferroni), and no more cases may have one beyond three than once in 100
-times, if every t-value were a case of its own. As coverages of a case go together, both are on the
-safe side; as they are skewed, t-values are not quite Student's.
+``-m slow`` goes through 72 cases of 200 records each, 24 for each kind of dynamics. Each case gives
+three t-values, of the 50, 90 and 95 % bands. By chance alone one in 330 of the 216 is beyond three
+standard errors, so all are held to three by a rule that is right for the whole family: none may be
+beyond the limit that 216 pass once in 100 times (Bonferroni), and for no kind of dynamics may more
+cases have one beyond three than happens once in 300 times, if every t-value were a case of its own.
+As coverages of a case go together, both are on the safe side; as they are skewed, t-values are not
+quite Student's.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
+from bwbayes.results import start
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start
 from bwbayes.results.start import started
@@ -57,13 +59,19 @@ FALSE_ALARM = 0.01
 # Part of good records whose lead-in may be taken for one that does not fit.
 MOST_ALARMS = 0.01
 
+KINDS_OF_DYNAMICS = (SECOND, Case(lag=38e-3), Case(lag=3.8e-3))
 CUTS: tuple[Cut, ...] = ("any", "turn", "speed", "knocked")
 EVERY = [
     replace(kind, discrepancy=discrepancy, lead_in=lead_in, cut=cut)
     for kind, discrepancy, lead_in, cut in product(
-        (Case(lag=3.8e-3), Case(lag=38e-3), SECOND), (0.3, 1.5), (0.3, 1.0, 3.0), CUTS
+        KINDS_OF_DYNAMICS, (0.3, 1.5), (0.3, 1.0, 3.0), CUTS
     )
 ]
+
+
+def name_of(case: Case) -> str:
+    """Name the dynamics of a case."""
+    return f"lag {1e3 * case.lag:g} ms" if case.dynamics == "lag" else case.dynamics
 
 
 def off(every: list[Bands]) -> dict[int, float]:
@@ -212,53 +220,75 @@ def test_a_lead_in_that_does_not_fit_is_found(spoil: Spoil) -> None:
     assert max(lead_ins(Case(), spoil, 50, seed=4)) < LEAD_IN_ALARM
 
 
-def test_good_lead_ins_raise_few_false_alarms() -> None:
-    """Their p-values are even besides: all but one in a thousand samples of 100 pass."""
-    p = np.array(list(lead_ins(Case(), None, 100, seed=5)))
-    assert np.mean(p < LEAD_IN_ALARM) <= stats.binom.isf(1e-3, p.size, LEAD_IN_ALARM) / p.size
-    assert stats.kstest(p, "uniform").pvalue > 1e-3
+def test_a_drift_is_found_within_a_discrepancy_of_its_pace() -> None:
+    """The sum of all squares does not see it in half of the records."""
+    case = Case(discrepancy=1.5)
+    p = np.array(list(lead_ins(case, drift, 50, seed=4)))
+    assert np.sum(p >= LEAD_IN_ALARM) <= 5
+    with patch.object(start, "MANY", 10**9):
+        p = np.array(list(lead_ins(case, drift, 50, seed=4)))
+    assert np.sum(p >= LEAD_IN_ALARM) > 15
+
+
+@pytest.mark.parametrize("case", [Case(), SECOND, Case(discrepancy=1.5, lead_in=0.3)], ids=str)
+def test_good_lead_ins_raise_no_more_false_alarms_than_stated(case: Case) -> None:
+    """At any level; a p-value that takes the better of two tests may be too large, not too small.
+
+    One in a thousand samples of 100 has more.
+    """
+    p = np.array(list(lead_ins(case, None, 100, seed=5)))
+    for level in (LEAD_IN_ALARM, 0.01, 0.05, 0.2):
+        assert np.sum(p < level) <= stats.binom.isf(1e-3, p.size, level)
 
 
 @pytest.mark.slow
 def test_all_kinds_of_lead_ins_that_do_not_fit_are_found() -> None:
-    """Fifty records of every kind and case with a lead-in of a second or more."""
+    """Fifty records of every kind and case with a lead-in of a second; figures are of 150.
+
+    A discrepancy of 1.5 um and 0.3 s nearly makes a drift of 20 um/s itself, and a transient of 20
+    um and 0.38 s: some of those are missed, at most one in ten.
+    """
     missed: dict[str, int] = {}
-    tried = 0
     cases = [case for case in EVERY if case.lead_in == 1.0 and case.cut == "any"]
     for (number, case), spoil in product(enumerate(cases), SPOILT):
         p = np.array(list(lead_ins(case, spoil, 50, seed=100 + number)))
-        missed[spoil.__name__] = missed.get(spoil.__name__, 0) + int(np.sum(p >= LEAD_IN_ALARM))
-        tried += p.size
-    keep("lead-ins that do not fit", {"records": tried, "missed": missed})
-    assert not any(missed.values())
+        name = f"{spoil.__name__}, {case.discrepancy:g} um"
+        missed[name] = missed.get(name, 0) + int(np.sum(p >= LEAD_IN_ALARM))
+    records = 50 * len(KINDS_OF_DYNAMICS)
+    keep("lead-ins that do not fit", {"records": records, "missed": missed})
+    nearly = {"drift, 1.5 um", "transient, 1.5 um"}
+    assert {} == {name: count for name, count in missed.items() if count and name not in nearly}
+    assert max(missed[name] for name in nearly) <= records / 10
 
 
 @pytest.mark.slow
-def test_bands_cover_all_kinds_of_moving_records() -> None:
-    t, alarmed = {}, 0
-    cells = {}
-    for number, case in enumerate(EVERY):
+@pytest.mark.parametrize("kind", KINDS_OF_DYNAMICS, ids=name_of)
+def test_bands_cover_all_kinds_of_moving_records(kind: Case) -> None:
+    cases = [case for case in EVERY if name_of(case) == name_of(kind)]
+    t, alarmed, cells = {}, 0, {}
+    for number, case in enumerate(cases):
         every = studied(case, RECORDS, seed=1000 + number)
         t[case] = off(every)
         alarmed += alarms(every)
-        means = {level: float(np.mean(covered(every, level))) for level in LEVELS}
         cells[label(case)] = {
-            str(level): [round(means[level], 4), round(t[case][level], 2)] for level in LEVELS
+            str(level): [round(float(np.mean(covered(every, level))), 4), round(t[case][level], 2)]
+            for level in LEVELS
         }
     values = np.array([list(one.values()) for one in t.values()])
+    comparisons = len(EVERY) * len(LEVELS)
     beyond = int(np.sum(np.any(np.abs(values) > LIMIT, axis=1)))
-    strict = float(stats.t.isf(FALSE_ALARM / 2 / values.size, RECORDS - 1))
+    strict = float(stats.t.isf(FALSE_ALARM / 2 / comparisons, RECORDS - 1))
     chance = 2 * stats.t.sf(LIMIT, RECORDS - 1)
-    allowed = int(stats.binom.isf(FALSE_ALARM, values.size, chance))
+    allowed = int(stats.binom.isf(FALSE_ALARM / len(KINDS_OF_DYNAMICS), values.size, chance))
     keep(
-        "moving",
+        f"moving, {name_of(kind)}",
         {
             "records of each case": RECORDS,
             "cases": len(t),
-            "largest t": float(np.max(np.abs(values))),
+            "largest t": round(float(np.max(np.abs(values))), 2),
             "cases beyond three standard errors": beyond,
             "allowed beyond": allowed,
-            "limit of one t": strict,
+            "limit of one t": round(strict, 2),
             "false alarms of the lead-in": alarmed / (RECORDS * len(t)),
             "coverage and t": cells,
         },
@@ -269,6 +299,5 @@ def test_bands_cover_all_kinds_of_moving_records() -> None:
 
 
 def label(case: Case) -> str:
-    """Name a case."""
-    kind = f"lag {1e3 * case.lag:g} ms" if case.dynamics == "lag" else case.dynamics
-    return f"{kind}, {case.discrepancy:g} um, lead-in {case.lead_in:g} s, {case.cut}"
+    """Name what is special about a case beside its dynamics."""
+    return f"{case.discrepancy:g} um, lead-in {case.lead_in:g} s, {case.cut}"
