@@ -7,7 +7,11 @@ of its start: the hysteretic state is free, the dynamics may be moving. Each rep
 another record with the same truth, cut from another drive at another rate, with a state, an unrest
 and an offset of its own, and predicts it from the posterior after a lead-in of a second.
 
-The default suite makes 40 replicates with the lag. All parameters are tested together
+Default priors are so wide that a few truths have next to no hysteresis; their posteriors are long
+and curved, and take some ten thousand steps. Here a replicate ends after 3,000 and is ranked as it
+is; at most one in ten may.
+
+The default suite makes 30 replicates with the lag. All parameters are tested together
 (:mod:`tests.together`), and each by the calibration's own tests; twins plant a wrong width and a
 bias on the draws. Coverages of the 18 bands are held to the spread between replicates: by chance
 one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` makes
@@ -18,6 +22,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,15 +35,18 @@ from bwbayes.app.workers import one_thread
 from bwbayes.data.files import write_record
 from bwbayes.data.record import Record
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.calibration import judge
+from bwbayes.results.calibration import Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from bwbayes.results.simulated import discrepancy
 from tests.found import keep
 from tests.together import LEVEL, Plant, narrowed, shifted, together_test
 
 SEED = 1
-QUICK = 40
+QUICK = 30
 REPLICATES = 150
+
+# Part of the replicates that may end before they have converged.
+MOST_UNCONVERGED = 0.1
 
 # Probability that one of a sound calibration's bands is off by more than is allowed.
 FALSE_ALARM = 0.01
@@ -53,6 +61,7 @@ dynamics = "{dynamics}"
 
 [sampling]
 ess = 500
+steps = 3000
 walkers = 32
 block = 25
 
@@ -140,14 +149,19 @@ def off(every: list[Replicate]) -> dict[str, float]:
     return result
 
 
-def figures(common: Experiment, every: list[Replicate]) -> dict[str, object]:
+def remarks(found: Calibration) -> list[str]:
+    """Return a calibration's shortcomings but for replicates that have not converged."""
+    return [text for text in found.shortcomings if "did not converge" not in text]
+
+
+def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
     """Return what is kept of a calibration."""
     found = judge([one.entry() for one in every], np.random.default_rng(SEED))
     ranked = [one for one in every if len(one.draws)]
     return {
         "replicates": len(every),
         "unconverged": len(found.unconverged),
-        "shortcomings": list(found.shortcomings),
+        "shortcomings": remarks(found),
         "smallest adjusted p": round(min(one.adjusted for one in found.statistics.values()), 4),
         "all parameters together, p": round(together_test(ranked, common.posterior.prior), 4),
         "bands, standard errors off": {name: round(t, 2) for name, t in off(every).items()},
@@ -166,7 +180,8 @@ Sound = tuple[Experiment, list[Replicate]]
 def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> None:
     common, every = sound
     found = judge([one.entry() for one in every], np.random.default_rng(SEED))
-    assert () == found.shortcomings
+    assert [] == remarks(found)
+    assert len(found.unconverged) <= MOST_UNCONVERGED * QUICK
     assert together_test(every, common.posterior.prior) > LEVEL
 
 
@@ -189,6 +204,7 @@ def test_every_variant_is_calibrated(variant: str, tmp_path: Path) -> None:
     found = figures(common, every)
     keep(f"calibration, {variant}", found)
     assert [] == found["shortcomings"]
+    assert found["unconverged"] <= MOST_UNCONVERGED * REPLICATES
     assert together_test(every, common.posterior.prior) > LEVEL
     limit = band_limit(18, REPLICATES)
     assert {} == {name: t for name, t in off(every).items() if not abs(t) < limit}
