@@ -18,7 +18,7 @@ from scipy import ndimage
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.results.bands import Bands
 
-__all__ = ["Cause", "Kind", "Residuals", "cause", "likeliest"]
+__all__ = ["Cause", "Kind", "Residuals", "cause", "drifts", "likeliest"]
 
 Kind = Literal[
     "sign",
@@ -147,6 +147,16 @@ def likeliest(r: Residuals) -> Cause:
         return cause("outliers", r)
     forgets = _correlation(r.residual[1:], r.residual[:-1]) < 0.5 if r.residual.size > 2 else False
     return cause("noise" if forgets else "unknown", r)
+
+
+def drifts(r: Residuals, after: float) -> bool:
+    """Tell whether the residuals after a time, s, still drift: a bad start alone does not."""
+    late = r.time >= after
+    if np.sum(late) < 3:
+        return False
+    at = r.time[late] - after
+    residual = r.residual[late] - np.mean(r.residual[late])
+    return _explained(residual, at, at**2) > EXPLAINS
 
 
 def _energy(values: FloatArray) -> float:
