@@ -129,6 +129,19 @@ class Residuals:
         largest = float(np.max(np.abs(self.residual[self.spikes])))
         return [f"{count} isolated readings lie up to {largest:.3g} um off"]
 
+    @property
+    def reversed(self) -> list[str]:
+        """Say that the readings go against the voltage, where it goes up and down by enough.
+
+        A lag of many seconds and a gain beyond all reason can follow even these.
+        """
+        up, down = (np.sum(np.maximum(way * self.rate, 0)) * self.interval for way in (1, -1))
+        low, high = self.fitted
+        together = _correlation(self.voltage, self.measured)
+        if min(up, down) < (high - low) / 2 or together >= REVERSED:
+            return []
+        return [f"the readings fall where the voltage rises (correlation {together:.2f})"]
+
 
 def likeliest(r: Residuals) -> Cause:
     """Return the likeliest cause of residuals that are too large."""

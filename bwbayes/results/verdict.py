@@ -187,6 +187,7 @@ def assess(
     standard = _standardised(bands, judged, background)
     residuals = Residuals.of(bands, judged, background.fitted)
     reasons = [
+        *residuals.reversed,
         *_lead_in(bands),
         *_odd(start),
         *_moved(moved),
