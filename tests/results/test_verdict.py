@@ -112,6 +112,16 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
     assert causes.count(kind) >= 45  # type: ignore[arg-type]
 
 
+def test_a_lean_that_the_memory_does_not_excuse_is_a_reason() -> None:
+    """Off by 0.7 sds: a minute of readings shows it, and a fifth of a memory cannot."""
+    for memory, told in ((0.1, True), (300.0, False)):
+        record = made(np.random.default_rng(12), 60, memory=0.1, sensor=0.1, parameters=0.02)
+        sd = float(record.sds["sensor"].mean())
+        verdict = assess(bands_of(record, 0.7 * sd), Background(memory, 0.0, FITTED))
+        assert verdict is not None
+        assert told == any("um off the mean" in reason for reason in verdict.reasons)
+
+
 def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
     for number in range(50):
         record = made(np.random.default_rng([8, number]), length=30)
