@@ -87,6 +87,14 @@ def test_engines_agree_on_a_start_that_is_long_remembered(discrepancy_sd: float)
     assert_engines_agree(posterior, theta)
 
 
+def test_engines_agree_after_a_gap_that_unsettles_the_filter() -> None:
+    """It was in its steady state before, and takes longer to get there again than one piece."""
+    windows = (slice(0, 3000), slice(3400, 4200))
+    posterior = short_posterior(samples=4200, dynamics="lag", fixed={}, training=windows)
+    theta = changed(posterior, sensor_sd=1.0, discrepancy_sd=1.0, discrepancy_time=20.0)
+    assert_engines_agree(posterior, theta)
+
+
 def test_a_general_exponent_is_left_to_numpy() -> None:
     posterior = short_posterior(dynamics="lag", fixed={"initial": 2.0})
     theta = np.repeat(truth(posterior), 5, axis=0)

@@ -176,6 +176,23 @@ def test_a_long_memory_is_not_cut_short() -> None:
         np.testing.assert_allclose(got, expected, rtol=1e-7)
 
 
+def test_a_memory_is_kept_as_long_as_it_is_heard() -> None:
+    """A lag and a filter that forget within the record, to the last digit and not before."""
+    posterior = moving(fixed={"lag": 0.05, "discrepancy_sd": 0.3, "discrepancy_time": 0.1})
+    posterior = replace(posterior, engine="numpy")
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(13), 1))
+    theta[0, posterior.prior.names.index("sensor_sd")] = 0.1
+    expected, _, _ = dense(posterior.likelihood, theta[0])
+    np.testing.assert_allclose(posterior.log_likelihood(theta), expected, rtol=1e-9)
+
+
+def test_the_starts_sd_is_the_gain_times_half_the_range() -> None:
+    posterior = moving()
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(12), 5))
+    expected = theta[:, posterior.prior.names.index("d")] * np.ptp(posterior.voltage) / 2
+    np.testing.assert_allclose(posterior.likelihood.start_sd(theta)[:, 0], expected, rtol=1e-12)
+
+
 def test_from_rest_means_a_path_from_zero_volts() -> None:
     """A record from rest at 50 V is one from zero volts whose first samples were not read."""
     usual = short_posterior(samples=200, dynamics="lag", fixed={})

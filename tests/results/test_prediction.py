@@ -254,7 +254,22 @@ def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
     left = covariance[0, 0] - covariance[0, 1] ** 2 / covariance[1, 1]
     np.testing.assert_allclose(begun.offset_sd, np.sqrt(left), rtol=1e-4)
     total = np.sqrt(np.var(begun.model[near, offset]) + left)
+    together = np.cov(begun.model[near, offset], begun.unrest[near, 0])[0, 1]
     assert total == pytest.approx(spread[0], rel=0.15)
+    assert together == pytest.approx(covariance[0, 1], rel=0.15, abs=1e-3)
+
+
+def test_unrest_is_part_of_the_simulation(posterior: Posterior, draws: FloatArray) -> None:
+    """The bands' mean is that of the draws' simulations from their own starts."""
+    record = made(start=1.2)
+    bands = predicted(posterior, draws, record, Start(), seed=0)
+    begun = start_of(posterior, draws, record, Start())
+    own, at_rest = (
+        begun.actuator.advance(begun.model, record.voltage, unrest=unrest)[0].mean(axis=0)
+        for unrest in (begun.unrest, None)
+    )
+    np.testing.assert_allclose(own, bands.mean, atol=1e-9)
+    assert np.max(np.abs(own - at_rest)) > 0.1
 
 
 def test_a_lead_in_finds_the_initial_state(posterior: Posterior, draws: FloatArray) -> None:
