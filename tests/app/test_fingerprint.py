@@ -111,6 +111,19 @@ def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key:
         require_same(fingerprint(load(run / "config.toml")), changed, Path("x"))
 
 
+def test_a_priors_numbers_are_part_of_it() -> None:
+    text = """
+    [record]
+    file = "record.csv"
+    [parameters.d]
+    prior = { distribution = "lognormal", median = 0.7, sigma = 0.3 }
+    """
+    before, after = parse(text, ""), parse(text.replace("0.3", "0.4"), "")
+    with pytest.raises(InputError, match=r"parameters\.d\.prior was .*0\.3.* is .*0\.4"):
+        require_same(fingerprint(before), after, Path("x"))
+    require_same(fingerprint(before), before, Path("x"))
+
+
 def test_a_bound_that_was_not_set_is_named(run: Path) -> None:
     config = load(run / "config.toml")
     d = config.parameters["d"].model_copy(update={"lower": 0.5})
