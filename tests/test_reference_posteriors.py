@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.config import load
+from bwbayes.app.config import RecordConfig, load
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
+from bwbayes.data import Record, write_record
 from bwbayes.inference import pointfit
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
@@ -52,10 +53,21 @@ class Reference:
 
 
 @pytest.fixture(scope="module", params=["virtual", pytest.param("measured", marks=absent)])
-def reference(request: pytest.FixtureRequest) -> Reference:
-    config = FOLDER / f"{request.param}.toml"
-    found = json.loads(config.with_suffix(".json").read_text(encoding="utf-8"))
-    return Reference(resolve(load(config), FOLDER), load_case(config), found)
+def reference(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Reference:
+    """Let both read a case; the plain code thins the measured record, voltage and all, for both."""
+    path = FOLDER / f"{request.param}.toml"
+    found = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    config, case, folder = load(path), load_case(path), FOLDER
+    if request.param == "measured":
+        folder = tmp_path_factory.mktemp("thinned")
+        assert config.record.start is not None
+        thinned = Record(case.voltage, case.displacement, case.interval, config.record.start)
+        write_record(thinned, folder / "thinned.h5")
+        source = RecordConfig(file="thinned.h5", train=config.record.train)
+        config = config.model_copy(update={"record": source})
+    return Reference(resolve(config, folder), case, found)
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +169,18 @@ def test_twin_draws_that_are_too_narrow_are_found(
     assert all(off[f"{name} sd"] > 1 for name in reference.case.free), off
 
 
+class Slower(DiscrepancyNoise):
+    """Noise that takes readings to be half as far apart again."""
+
+    def at(self, interval: float) -> DiscrepancyNoise:
+        """Return the noise for another interval."""
+        return DiscrepancyNoise(1.5 * interval)
+
+
 def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> None:
     """Its correlation decays as if the samples were half as far apart again."""
     problem = reference.problem
-    wrong = DiscrepancyNoise(1.5 * reference.case.interval)
+    wrong = Slower(reference.case.interval)
     planted = replace(
         problem,
         posterior=replace(problem.posterior, noise=wrong),

@@ -18,7 +18,7 @@ from scipy import ndimage
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.results.bands import Bands
 
-__all__ = ["Cause", "Kind", "Residuals", "cause", "likeliest"]
+__all__ = ["Cause", "Kind", "Residuals", "cause", "drifts", "likeliest"]
 
 Kind = Literal[
     "sign",
@@ -129,6 +129,19 @@ class Residuals:
         largest = float(np.max(np.abs(self.residual[self.spikes])))
         return [f"{count} isolated readings lie up to {largest:.3g} um off"]
 
+    @property
+    def reversed(self) -> list[str]:
+        """Say that the readings go against the voltage, where it goes up and down by enough.
+
+        A lag of many seconds and a gain beyond all reason can follow even these.
+        """
+        up, down = (np.sum(np.maximum(way * self.rate, 0)) * self.interval for way in (1, -1))
+        low, high = self.fitted
+        together = _correlation(self.voltage, self.measured)
+        if min(up, down) < (high - low) / 2 or together >= REVERSED:
+            return []
+        return [f"the readings fall where the voltage rises (correlation {together:.2f})"]
+
 
 def likeliest(r: Residuals) -> Cause:
     """Return the likeliest cause of residuals that are too large."""
@@ -147,6 +160,16 @@ def likeliest(r: Residuals) -> Cause:
         return cause("outliers", r)
     forgets = _correlation(r.residual[1:], r.residual[:-1]) < 0.5 if r.residual.size > 2 else False
     return cause("noise" if forgets else "unknown", r)
+
+
+def drifts(r: Residuals, after: float) -> bool:
+    """Tell whether the residuals after a time, s, still drift: a bad start alone does not."""
+    late = r.time >= after
+    if np.sum(late) < 3:
+        return False
+    at = r.time[late] - after
+    residual = r.residual[late] - np.mean(r.residual[late])
+    return _explained(residual, at, at**2) > EXPLAINS
 
 
 def _energy(values: FloatArray) -> float:

@@ -23,7 +23,7 @@ from scipy import special, stats
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import LEVELS, Bands, Kind
-from bwbayes.results.causes import Cause, Residuals, cause, likeliest
+from bwbayes.results.causes import Cause, Residuals, cause, drifts, likeliest
 from bwbayes.results.innovations import OddStart
 from bwbayes.results.refit import Moved
 
@@ -187,6 +187,7 @@ def assess(
     standard = _standardised(bands, judged, background)
     residuals = Residuals.of(bands, judged, background.fitted)
     reasons = [
+        *residuals.reversed,
         *_lead_in(bands),
         *_odd(start),
         *_moved(moved),
@@ -202,9 +203,11 @@ def assess(
         why = likeliest(residuals) if reasons else cause("noise", residuals)
         if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
             why = cause("lead-in", residuals)
-        if (start or moved) and why.kind not in ("sign", "outliers", "drift"):
+        if (start or moved) and why.kind not in ("sign", "outliers"):
             until = max(one.until for one in (start, moved) if one is not None)
-            why = cause("start", residuals, until)
+            # A start that is off bends the fit, and looks like a drift that ends soon.
+            if why.kind != "drift" or not drifts(residuals, until):
+                why = cause("start", residuals, until)
         if beyond and why.kind in ("gain", "delay", "loop", "noise", "unknown"):
             why = Cause(
                 "extrapolation",

@@ -147,15 +147,16 @@ def closed_form(posterior: Posterior) -> Normal:
     base = displacement(prior_mean)
     columns = [displacement(prior_mean + step) - base for step in np.eye(prior_mean.size)]
     design = np.stack(columns, axis=1)[rows]
-    blocks = [covariance(known, window.stop - window.start) for window in WINDOWS]
-    weighted = linalg.solve(linalg.block_diag(*blocks), design, assume_a="pos")
+    # One discrepancy goes through both windows.
+    noise = covariance(known, posterior.voltage.size)[np.ix_(rows, rows)]
+    weighted = linalg.solve(noise, design, assume_a="pos")
     precision = design.T @ weighted + np.diag(prior_sd**-2.0)
     shift = linalg.solve(precision, weighted.T @ (posterior.displacement - base)[rows])
     return Normal(prior_mean + shift, linalg.inv(precision))
 
 
 def covariance(known: dict[str, float], samples: int) -> FloatArray:
-    """Dense covariance (samples, samples) of the noise in one window."""
+    """Dense covariance (samples, samples) of the noise."""
     lags = np.zeros(samples)
     if "discrepancy_sd" in known:
         kept = np.exp(-INTERVAL * np.arange(samples) / known["discrepancy_time"])

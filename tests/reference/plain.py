@@ -55,7 +55,8 @@ class Case:
 
     ``voltage`` (samples,), V; ``displacement`` (samples,), um; ``interval``, s; ``training``, the
     slices that count; ``names`` of all parameters; ``priors`` of the free ones, each the name of a
-    distribution and its arguments; ``fixed`` values of the others.
+    distribution and its arguments; ``fixed`` values of the others; ``from_rest``, that the record
+    starts with an actuator at rest.
     """
 
     voltage: Floats
@@ -67,6 +68,7 @@ class Case:
     names: tuple[str, ...]
     priors: Mapping[str, tuple[str, tuple[float, ...]]]
     fixed: Mapping[str, float]
+    from_rest: bool = True
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -182,10 +184,24 @@ def simulate(case: Case, theta: Mapping[str, float], loops: Loops = PLAIN) -> Fl
 
 
 def log_likelihood(case: Case, theta: Mapping[str, float], loops: Loops = PLAIN) -> float:
-    """Log likelihood at all parameters, free and fixed, by name."""
-    residual = case.displacement - simulate(case, theta, loops)
+    """Log likelihood at all parameters, free and fixed, by name; one training window.
+
+    Unless the record starts from rest, the lag has a distance c from rest at its first sample, with
+    a prior sd of d times half the voltage's range. The log density is quadratic in c, so three
+    values of c give it whole, and its integral.
+    """
+    (part,) = case.training
+    residual = (case.displacement - simulate(case, theta, loops))[part]
     noise = [theta[name] for name in NOISE]
-    return sum(loops.kalman(residual[part], case.interval, *noise) for part in case.training)
+    usual = loops.kalman(residual, case.interval, *noise)
+    if case.from_rest:
+        return usual
+    spread = theta["d"] * float(np.ptp(case.voltage)) / 2
+    time = case.interval * np.arange(case.voltage.size)[part]
+    response = spread * np.exp(-time / theta["lag"])
+    more, less = (loops.kalman(residual - c * response, case.interval, *noise) for c in (1.0, -1.0))
+    slope, bend = (more - less) / 2, 2 * usual - more - less
+    return usual + slope**2 / (2 * (1 + bend)) - math.log(1 + bend) / 2
 
 
 def log_prior(case: Case, theta: Mapping[str, float]) -> float:
@@ -241,6 +257,7 @@ def load_case(path: Path) -> Case:
         names,
         priors,
         {name: given[name]["fixed"] for name in names if name not in priors},
+        source.get("from_rest", False),
     )
 
 

@@ -74,3 +74,12 @@ def test_a_fit_that_hangs_on_its_start_does_not_hold() -> None:
     assert verdict.cause is not None
     assert "start" == verdict.cause.kind
     assert "exclude = [[0, 2.4]] in [record]" in verdict.cause.remedy
+
+
+def test_a_drift_all_along_is_no_bad_start() -> None:
+    """What a bad start leaves in the fit looks like a drift, but ends; a drift goes on."""
+    record = made(np.random.default_rng(1), length=30)
+    for added, kind in ((record.time, "drift"), (30 * np.exp(-record.time / 1.2), "start")):
+        verdict = judged(bands_of(record, added - np.mean(added), training=True), PUSHED)
+        assert verdict.cause is not None
+        assert kind == verdict.cause.kind

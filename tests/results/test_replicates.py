@@ -259,7 +259,10 @@ def test_white_noise_has_no_discrepancy() -> None:
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:
-    """As the likelihood takes it: over 200 records, neighbours on a border are as correlated."""
+    """As the likelihood takes it: over 200 records, neighbours on a border are correlated too.
+
+    Less than those in a window only because correlation times that the prior draws differ.
+    """
     windows = (slice(0, 30), slice(30, 60))
     fixed = FIXED | {"discrepancy_time": 0.2}
     posterior = short_posterior("discrepancy", 80, fixed=fixed, training=windows)
@@ -270,8 +273,9 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
         assert made.record.truth is not None
         away.append((made.record.truth - made.model) / theta["discrepancy_sd"])
     last_but_one, last, first = np.array(away)[:, 28:31].T
-    assert np.corrcoef(last_but_one, last)[0, 1] > 0.9
-    assert np.corrcoef(last, first)[0, 1] > 0.9
+    within, across = (np.corrcoef(last, other)[0, 1] for other in (last_but_one, first))
+    assert across > 0.5
+    assert across == pytest.approx(within, abs=0.2)
 
 
 def test_a_record_that_starts_in_motion_is_simulated_so() -> None:

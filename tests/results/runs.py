@@ -1,0 +1,143 @@
+"""Runs in short: records of a simulated stand, fitted, predicted and judged as a run does it.
+
+The draws are those of the Gaussian approximation around the point fit, weighted towards the
+posterior and chosen again by their weights: a run in two seconds. All else is the run's own code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.app.config import parse
+from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.run import judged
+from bwbayes.arrays import FloatArray
+from bwbayes.data import Record
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.results.bands import Bands
+from bwbayes.results.innovations import innovations
+from bwbayes.results.prediction import predict_record, predict_windows
+from bwbayes.results.refit import without_start
+from bwbayes.results.verdict import Background, Verdict
+
+__all__ = ["Judged", "Stand", "covered", "judge", "noise", "posterior_draws", "problem_of"]
+
+# Draws of the approximation, and those of them that stay.
+DRAWS, KEPT = 600, 250
+
+# No draw's weight is more than so many times the mean.
+HEAVIEST = 10.0
+
+
+def noise(samples: int, kept: float, generator: np.random.Generator) -> FloatArray:
+    """Draw a process of unit variance that keeps the part ``kept`` of itself each sample."""
+    shocks = generator.standard_normal(samples)
+    shocks[1:] *= np.sqrt(1 - kept**2)
+    drawn: FloatArray = lfilter([1.0], [1.0, -kept], shocks)
+    return drawn
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The paper's ring bender with a lag (s), its discrepancy (um, s) and its sensor (um)."""
+
+    lag: float = 0.02
+    discrepancy: float = 0.3
+    memory: float = 0.3
+    sensor: float = 0.1
+    rate: float = 100.0
+    d: float = 0.7
+
+    def measure(
+        self,
+        voltage: FloatArray,
+        generator: np.random.Generator,
+        *,
+        offset: float = 2.0,
+        cut: int = 0,
+    ) -> Record:
+        """Drive it from rest along ``voltage`` (samples,) and record all but the first ``cut``."""
+        actuator = Actuator("lag", "first", 1 / self.rate)
+        known = {"d": self.d, "alpha": self.d * 0.51, "beta": 0.0272, "gamma": 0.0172}
+        known |= {"exponent": 1.0, "initial": 0.0, "lag": self.lag, "offset": offset}
+        theta = np.array([[known[name] for name in actuator.parameters]])
+        displacement = actuator.displacement(theta, voltage)[0]
+        kept = float(np.exp(-1 / self.rate / self.memory))
+        displacement += self.discrepancy * noise(voltage.size, kept, generator)
+        displacement += self.sensor * generator.standard_normal(voltage.size)
+        return Record(voltage[cut:], displacement[cut:], 1 / self.rate, origin="stand")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a run says: draws (draws, free), bands and verdicts by name."""
+
+    problem: Problem
+    draws: FloatArray
+    bands: Mapping[str, Bands]
+    verdicts: Mapping[str, Verdict]
+
+    def column(self, name: str) -> FloatArray:
+        """Return the draws of one parameter."""
+        return self.draws[:, self.problem.posterior.names.index(name)]
+
+
+def problem_of(text: str, folder: Path) -> Problem:
+    """Resolve a config's text, its files in ``folder``."""
+    return resolve(parse(text, "config"), folder)
+
+
+def posterior_draws(posterior: Posterior, generator: np.random.Generator) -> FloatArray:
+    """Fit, and draw (draws, free) in the parameters' own units."""
+    point = pointfit.fit(posterior, generator)
+    places = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    density = posterior.log_density(places)
+    away = places - point.mode
+    gaussian = -0.5 * np.einsum("ij,ij->i", away, np.linalg.solve(point.covariance, away.T).T)
+    ratio = np.where(np.isfinite(density), density - gaussian, -np.inf)
+    weight = np.exp(np.clip(ratio - np.max(ratio), -30, 0)) * np.isfinite(density)
+    weight = np.minimum(weight, HEAVIEST * np.mean(weight))
+    chosen = generator.choice(DRAWS, KEPT, p=weight / np.sum(weight))
+    free, _ = posterior.prior.constrain(places[chosen])
+    return free
+
+
+def judge(problem: Problem, generator: np.random.Generator, *, again: bool = True) -> Judged:
+    """Fit, predict all that the config names, and judge it.
+
+    Without a second fit (``again``) only the verdict on the training window is another one.
+    """
+    posterior, record = problem.posterior, problem.record
+    draws = posterior_draws(posterior, generator)
+    windows = {"training": posterior.training[0]}
+    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
+    bands = predict_windows(posterior, draws, record, windows, generator)
+    for name, other in problem.validations.items():
+        if other.record is not None:
+            bands.append(
+                predict_record(
+                    posterior, draws, other.record, other.start, generator, name, other.judged
+                )
+            )
+    best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
+    odd = innovations(posterior, best, record.start)
+    moved = without_start(posterior, draws, generator, record.start) if again else None
+    verdicts = judged(problem, bands, Background.of(posterior, draws), odd, moved)
+    return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
+
+
+def covered(bands: Bands, level: int = 95) -> float:
+    """Part of the judged readings inside the sensor band."""
+    assert bands.measured is not None
+    judged_part = slice(bands.scored_from, None)
+    inside = (bands.lower["sensor", level] <= bands.measured) & (
+        bands.measured <= bands.upper["sensor", level]
+    )
+    return float(np.mean(inside[judged_part]))
