@@ -76,7 +76,7 @@ def told(record: Record, folder: Path, model: str = "") -> Judged:
     write_record(record, folder / "record.h5")
     text = '[record]\nfile = "record.h5"\ntrain = [[0.0, 12.0]]\n[validation.rest]\n'
     text += f"window = [12.0, 16.0]\n{model}"
-    return judge(problem_of(text, folder), np.random.default_rng(4))
+    return judge(problem_of(text, folder), np.random.default_rng(4), again=False)
 
 
 def width(bands: Bands) -> float:
