@@ -93,9 +93,10 @@ if TYPE_CHECKING:
     from bwbayes.model.boucwen import hysteresis
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
-    from bwbayes.results.prediction import Start, thinned
+    from bwbayes.results.prediction import thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
+    from bwbayes.results.start import Start
     from bwbayes.results.verdict import Background, Verdict, assess
 else:
     # The module of each name, and what it is called there if not the same.
@@ -121,7 +122,7 @@ else:
         "Replicate": "results.replicates",
         "SamplingPlan": "inference.sampling",
         "Scores": "results.scores",
-        "Start": "results.prediction",
+        "Start": "results.start",
         "Verdict": "results.verdict",
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",

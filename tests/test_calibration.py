@@ -29,7 +29,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import linalg, stats
 
 from bwbayes.app.calibrate import experiment
 from bwbayes.app.config import load, parse
@@ -42,12 +41,12 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import LIMIT, Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
+from tests.together import LEVEL, Plant, narrowed, narrowed_a_tenth, shifted, together_test, widened
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
 SEED = 1
 REPLICATES = 150
 FEW = 10
-LEVEL = 0.01
 
 EVERY_SAMPLE = slice(None)
 
@@ -83,68 +82,6 @@ def sound() -> list[Replicate]:
 @pytest.fixture(scope="module")
 def prior() -> JointPrior:
     return problem().posterior.prior
-
-
-Plant = Callable[[FloatArray], FloatArray]
-
-
-def nothing(draws: FloatArray) -> FloatArray:
-    return draws
-
-
-def narrowed(draws: FloatArray) -> FloatArray:
-    """Make the sds of draws (draws, free) a fifth smaller."""
-    middle = np.mean(draws, axis=0)
-    return middle + 0.8 * (draws - middle)
-
-
-def narrowed_a_tenth(draws: FloatArray) -> FloatArray:
-    """Make the sds a tenth smaller."""
-    middle = np.mean(draws, axis=0)
-    return middle + 0.9 * (draws - middle)
-
-
-def widened(draws: FloatArray) -> FloatArray:
-    """Make the sds a quarter larger."""
-    middle = np.mean(draws, axis=0)
-    return middle + 1.25 * (draws - middle)
-
-
-def shifted(draws: FloatArray) -> FloatArray:
-    """Put a bias of 0.3 sd on every coordinate."""
-    return draws + 0.3 * np.std(draws, axis=0)
-
-
-def whitened_positions(found: Replicate, prior: JointPrior, plant: Plant) -> FloatArray:
-    """Where the truth lies among the draws, along each whitened coordinate: (free,) in (0, 1).
-
-    The axes are those of the covariance of truth and draws together, by its symmetric root, so
-    that they do not tell one from the other, and a bias of one sign keeps it.
-    """
-    free = prior.dimensions
-    draws = plant(prior.unconstrain(found.draws[:, :free]))
-    both = np.concatenate([prior.unconstrain(found.truth[np.newaxis, :free]), draws])
-    both = (both - np.mean(both, axis=0)) / np.std(both, axis=0)
-    variances, axes = linalg.eigh(np.atleast_2d(np.corrcoef(both.T)))
-    white = both @ (axes / np.sqrt(variances)) @ axes.T
-    jitter = np.random.default_rng([SEED, found.number]).uniform(size=free)
-    positions: FloatArray = (np.sum(white[1:] < white[0], axis=0) + jitter) / len(both)
-    return positions
-
-
-def together_test(found: list[Replicate], prior: JointPrior, plant: Plant = nothing) -> float:
-    """P-value of the smooth test of all parameters together.
-
-    A replicate gives the means of b₁ and b₂ over its whitened coordinates; Hotelling's test asks
-    whether both means over replicates are zero, with the covariance that replicates show.
-    """
-    u = np.stack([whitened_positions(one, prior, plant) for one in found])
-    b = np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u**2 - 6 * u + 1)], axis=-1)
-    each = np.mean(b, axis=1)
-    count = len(found)
-    mean = np.mean(each, axis=0)
-    squared = count * mean @ linalg.solve(np.cov(each.T), mean)
-    return float(stats.f.sf(squared * (count - 2) / (2 * (count - 1)), 2, count - 2))
 
 
 def test_calibration_passes(sound: list[Replicate]) -> None:

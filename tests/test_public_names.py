@@ -35,8 +35,9 @@ PUBLIC = {
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
-    "bwbayes.results.prediction": {"Start", "thinned"},
+    "bwbayes.results.prediction": {"thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
+    "bwbayes.results.start": {"Start"},
     "bwbayes.results.verdict": {"Background", "Verdict", "assess"},
 }
 HOMES = {

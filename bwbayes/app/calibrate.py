@@ -33,6 +33,7 @@ from bwbayes.errors import InputError
 from bwbayes.results.calibration import Calibration, judge, summary
 from bwbayes.results.files import write_summary
 from bwbayes.results.replicates import RANKED, Entry, Experiment, replicates
+from bwbayes.results.simulated import OtherRecord
 
 __all__ = ["carry_on", "experiment", "start"]
 
@@ -74,7 +75,8 @@ def start(
 def experiment(problem: Problem) -> Experiment:
     """Return what the replicates of a problem have in common.
 
-    Held out are the validation windows of its own record; other records take no part.
+    Held out are the validation windows of its own record; other records are made anew with each
+    replicate's truth, at the times and with the voltage that they have.
 
     Raises
     ------
@@ -83,7 +85,12 @@ def experiment(problem: Problem) -> Experiment:
     """
     problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
     windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    return Experiment(problem.posterior, problem.plan, windows)
+    others = {
+        name: OtherRecord(v.record, v.start, v.judged)
+        for name, v in problem.validations.items()
+        if v.record is not None
+    }
+    return Experiment(problem.posterior, problem.plan, windows, others)
 
 
 def carry_on(

@@ -6,6 +6,7 @@ One HTML file that needs nothing else, as the report of a run.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 from bwbayes.app.figures.style import unit_text
@@ -104,13 +105,14 @@ def _rows(problem: Problem, calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _bands(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return a row for each kind of band, if any were predicted."""
-    if not calibration.bands:
-        return []
+    """Return a row for each kind of band of held-out windows and of other records, if any."""
     rows = []
-    for kind in KINDS:
-        found = [calibration.bands[f"{kind} {level}"] for level in LEVELS]
-        rows.append({"kind": kind, "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in found]})
+    for other, kind in product(calibration.predicted, KINDS):
+        found = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
+        of = other or "held-out samples"
+        rows.append(
+            {"kind": kind, "of": of, "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in found]}
+        )
     return rows
 
 

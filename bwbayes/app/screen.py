@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import product
 
 from rich.console import Console
 from rich.markup import escape
@@ -114,10 +115,11 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
         table.add_row(name, f"{one.p:.2g}", f"{one.adjusted:.2g}", ecdf, *covered)
     console.print(table)
     if calibration.bands:
-        table = Table("held-out band", *(f"{level} %" for level in LEVELS))
-        for kind in KINDS:
-            found = (calibration.bands[f"{kind} {level}"] for level in LEVELS)
-            table.add_row(kind, *(f"{one.mean:.1%} ± {one.error:.1%}" for one in found))
+        table = Table("band", "of", *(f"{level} %" for level in LEVELS))
+        for other, kind in product(calibration.predicted, KINDS):
+            found = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
+            covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in found)
+            table.add_row(kind, escape(other) or "held-out samples", *covered)
         console.print(table)
     for text, power in calibration.power.items():
         console.print(f"power of a smooth test against sds {text}: {power:.2f}", highlight=False)

@@ -141,6 +141,44 @@ class Likelihood:
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         return LinearStart(density, squares, sd * mean, covariance)
 
+    def taken(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
+        """Squares (models,) that shapes (shapes, readings) in the readings would take away.
+
+        With the whitened shapes S, and as in :meth:`start`, U = Sᵀ (z₀ − Z μ):
+
+            taken = Uᵀ (Sᵀ S − Sᵀ Z C Zᵀ S)⁻¹ U
+
+        has a χ² distribution with a degree of freedom for each shape, if the model is right.
+        """
+        theta = self.started(theta)
+        parts = []
+        for piece in batches(len(theta), self.readings.rows.size, CACHED):
+            series = self._whitened(theta[piece], shapes)
+            products = np.einsum("mit,mjt->mij", series, series)
+            sd = self.start_sd(theta[piece])
+            first = 1 + sd.shape[1]
+            prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
+            precision = np.eye(sd.shape[1]) + prior * products[:, 1:first, 1:first]
+            covariance = np.linalg.inv(precision) * prior
+            pulls, rest = products[:, 1:first], products[:, first:]
+            left = rest - np.einsum("mui,muv,mvj->mij", pulls[:, :, first:], covariance, pulls)
+            score, information = left[:, :, :1], left[:, :, first:]
+            parts.append(np.sum(score * np.linalg.solve(information, score), axis=(1, 2)))
+        return np.concatenate(parts)
+
+    def _whitened(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
+        """Whiten residual, unknowns' responses and shapes: (models, series, readings)."""
+        size, readings, spaced = len(self.actuator.parameters), self.readings, self.spaced
+        model, noise = theta[:, :size], theta[:, size:]
+        simulated = self.actuator.displacement(model, self.voltage[: readings.samples])
+        responses = self._responses(model, spaced.steady_state(noise).log_decay)
+        heard = responses.shape[2]
+        series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
+        series[:, 0] = readings.values - simulated[:, readings.where]
+        series[:, 1 : 1 + responses.shape[1], :heard] = responses
+        series[:, 1 + responses.shape[1] :] = shapes
+        return spaced.whiten(noise, series, readings.skipped)[0]
+
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
         unknowns = 0 if self.from_rest else self.actuator.unknowns
@@ -223,7 +261,9 @@ class Likelihood:
             with np.errstate(divide="ignore"):
                 slowest = max(float(np.max(np.log(recursion.remembered))), -FORGOTTEN)
             far = FORGOTTEN + rows * slowest < 0
-            far &= FORGOTTEN + np.arange(rows.size) * np.max(log_decay) < 0
+            # White noise decays at once: its rate is infinite.
+            decay = max(float(np.max(log_decay)), -FORGOTTEN)
+            far &= FORGOTTEN + np.arange(rows.size) * decay < 0
             heard = int(np.argmax(far)) if far[-1] else rows.size
         else:
             heard = 0

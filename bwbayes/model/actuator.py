@@ -139,7 +139,8 @@ class Actuator:
 
         Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here:
         h is θ's initial one and the dynamics are at rest at the first drive, or ``unrest``
-        (models, unknowns) away from there, um, as in :class:`~bwbayes.model.linear.Recursion`.
+        (models, unknowns) away from there, um, as in :class:`~bwbayes.model.linear.Recursion`;
+        (models, 0) stands for rest.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):
@@ -157,7 +158,7 @@ class Actuator:
         drive -= h
         rest = drive[:, 0].copy() if state is None else state.rest
         memory = recursion.at_rest() if state is None else state.filter.copy()
-        if state is None and unrest is not None:
+        if state is None and unrest is not None and unrest.size:
             memory += np.einsum("mu,mut->mt", unrest, recursion.free)
         # The recursion sees the drive's distance from rest, so that it starts at zero exactly.
         drive -= rest[:, np.newaxis]

@@ -23,7 +23,7 @@ from scipy.stats import binom, poisson
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.bands import LEVELS
 from bwbayes.results.replicates import RANKED, Entry
 
 __all__ = [
@@ -130,7 +130,8 @@ class Calibration:
     limits
         Binomial limits of the intervals' coverage, by level.
     bands
-        Coverage of held-out samples, by kind and level ("sensor 95"); may be empty.
+        Coverage of held-out samples by kind and level ("sensor 95"), and of other records by name,
+        kind and level ("NAME sensor 95"); may be empty.
     power
         Probability that the smooth test finds a posterior sd that is wrong by so much.
     shortcomings
@@ -151,6 +152,11 @@ class Calibration:
     def passed(self) -> bool:
         """Whether nothing speaks against the posteriors."""
         return not self.shortcomings
+
+    @property
+    def predicted(self) -> tuple[str, ...]:
+        """What the bands are of: "" for the held-out windows together, and other records' names."""
+        return tuple(dict.fromkeys(_whose(name) for name in self.bands))
 
     @property
     def telling(self) -> bool:
@@ -309,14 +315,18 @@ def _binomial_limits(count: int, level: int) -> tuple[float, float]:
 
 
 def _bands(entries: Sequence[Entry]) -> dict[str, Coverage]:
-    """Mean coverage and its standard error, by kind and level."""
+    """Mean coverage and its standard error, by the bands' names."""
     found = {}
-    for name in (f"{kind} {level}" for kind in KINDS for level in LEVELS):
-        covered = np.array([e["covered"][name] for e in entries if name in e["covered"]])
-        if covered.size:
-            error = np.std(covered, ddof=1) / np.sqrt(covered.size) if covered.size > 1 else np.nan
-            found[name] = Coverage(float(np.mean(covered)), float(error))
+    for name in entries[0]["covered"]:
+        covered = np.array([entry["covered"][name] for entry in entries])
+        error = np.std(covered, ddof=1) / np.sqrt(covered.size) if covered.size > 1 else np.nan
+        found[name] = Coverage(float(np.mean(covered)), float(error))
     return found
+
+
+def _whose(band: str) -> str:
+    """Return the name of the other record in a band's name, "" if it is of held-out windows."""
+    return " ".join(band.split(" ")[:-2])
 
 
 def _unconverged_remark(unconverged: int, replicates: int) -> list[str]:
@@ -342,11 +352,11 @@ def _band_remarks(bands: Mapping[str, Coverage]) -> list[str]:
     """Say which bands do not keep their promise; written so that nan fails."""
     remarks = []
     for name, one in bands.items():
-        kind, level = name.split()
+        other, (kind, level) = _whose(name), name.split()[-2:]
         if not abs(one.mean - int(level) / 100) <= LIMIT * one.error:
             remarks.append(
-                f"the {level} % {kind} band covers {one.mean:.1%} ± {one.error:.1%} of held-out "
-                "samples"
+                f"the {level} % {kind} band covers {one.mean:.1%} ± {one.error:.1%} of "
+                + (f"the record {other}" if other else "held-out samples")
             )
     return remarks
 

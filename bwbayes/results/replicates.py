@@ -19,7 +19,6 @@ from itertools import islice
 from typing import TypedDict
 
 import numpy as np
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
@@ -27,8 +26,9 @@ from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
-from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import predict_windows, thinned
+from bwbayes.results.simulated import OtherRecord, Simulated, covered, discrepancy
 
 __all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
 
@@ -66,6 +66,9 @@ class Experiment:
     held_out
         Windows (slices of the voltage) for which bands are predicted and held against the
         simulated record.
+    others
+        Other records, by name: made with the same truth, but with a start and an offset of their
+        own, and predicted with the parameters from the posterior.
     source
         Where truths and records come from, if not from ``posterior``; its parameters must include
         those of ``posterior``. A calibration then must fail: it says how an analysis fares on
@@ -80,6 +83,7 @@ class Experiment:
     posterior: Posterior
     plan: SamplingPlan
     held_out: Mapping[str, slice] = field(default_factory=dict)
+    others: Mapping[str, OtherRecord] = field(default_factory=dict)
     source: Posterior | None = None
 
     def __post_init__(self) -> None:
@@ -102,8 +106,14 @@ class Experiment:
 
     @property
     def bands(self) -> tuple[str, ...]:
-        """Names of the bands that are held against the held-out samples ("sensor 95")."""
-        return tuple(f"{kind} {level}" for kind in KINDS for level in LEVELS if self.held_out)
+        """Names of the bands that are held against samples that were not fitted.
+
+        Those of the held-out windows together ("sensor 95"), and of each other record
+        ("NAME sensor 95").
+        """
+        names = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
+        own = names if self.held_out else []
+        return (*own, *(f"{other} {name}" for other in self.others for name in names))
 
     @cached_property
     def level(self) -> float:
@@ -164,7 +174,7 @@ class Replicate:
     draws
         (RANKED, statistics) their posterior draws; empty if there are not so many.
     covered
-        Part of the held-out samples inside each band, by its kind and level; empty without draws.
+        Part of the samples inside each of the experiment's bands, by name; empty without draws.
     """
 
     number: int
@@ -231,8 +241,9 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
         The prior draws a model without a finite displacement.
     """
     generator = np.random.default_rng([seed, number])
-    simulating, fitting, sampling, choosing, predicting = generator.spawn(5)
-    theta, record, model = _simulated(experiment, simulating)
+    simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
+    theta, made = _simulated(experiment, simulating)
+    record = made.record
     assert record.displacement is not None
     posterior = replace(experiment.posterior, displacement=record.displacement)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
@@ -250,16 +261,16 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     if len(free) < RANKED:
         return Replicate(number, *ended, names, truth, nothing, {})
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
-    bands = predict_windows(posterior, flat, record, experiment.held_out, predicting)
+    inside = _held_out(experiment, posterior, flat, made, predicting)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
-    covered = _covered(experiment, bands, record, model)
-    return Replicate(number, *ended, names, truth, drawn, covered)
+    inside |= _others(experiment, posterior, flat, theta, record, others)
+    return Replicate(number, *ended, names, truth, drawn, inside)
 
 
 def _simulated(
     experiment: Experiment, generator: np.random.Generator
-) -> tuple[dict[str, FloatArray], Record, FloatArray]:
-    """Draw a truth; return it by parameter, (1,) each, its record, and its model's displacement."""
+) -> tuple[dict[str, FloatArray], Simulated]:
+    """Draw a truth; return it by parameter, (1,) each, and its record."""
     source = experiment.truth
     theta = source.prior.theta(source.prior.draw(generator, 1))
     column = dict(zip(source.prior.names, theta.T, strict=True))
@@ -270,22 +281,10 @@ def _simulated(
         unrest=sd * generator.standard_normal(sd.shape),
     )[0][0]
     interval = source.actuator.interval
-    truth = model + _discrepancy(column, model.size, interval, generator)
+    truth = model + discrepancy(column, model.size, interval, generator)
     reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
     reading[np.isnan(experiment.posterior.displacement)] = np.nan
-    return column, Record(source.voltage, reading, interval, truth=truth), model
-
-
-def _discrepancy(
-    theta: Mapping[str, FloatArray], samples: int, interval: float, generator: np.random.Generator
-) -> FloatArray:
-    """Draw a stationary Ornstein-Uhlenbeck process (samples,) in um, if the noise has one."""
-    if "discrepancy_sd" not in theta:
-        return np.zeros(samples)
-    rate = interval / float(theta["discrepancy_time"][0])
-    shocks = float(theta["discrepancy_sd"][0]) * generator.standard_normal(samples)
-    shocks[1:] *= math.sqrt(-math.expm1(-2 * rate))
-    return np.asarray(lfilter([1.0], [1.0, -math.exp(-rate)], shocks), dtype=np.float64)
+    return column, Simulated(Record(source.voltage, reading, interval, truth=truth), model)
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
@@ -325,25 +324,38 @@ def _independent(
     return spacing, thinned(left, generator, RANKED)
 
 
-def _covered(
-    experiment: Experiment, every: list[Bands], record: Record, model: FloatArray
+def _held_out(
+    experiment: Experiment,
+    posterior: Posterior,
+    draws: FloatArray,
+    made: Simulated,
+    generator: np.random.Generator,
 ) -> dict[str, float]:
-    """Part of the held-out samples that lie inside each band, by "kind level".
+    """Part of the held-out samples, of all windows together, inside each band."""
+    windows = experiment.held_out
+    if not windows:
+        return {}
+    bands = predict_windows(posterior, draws, made.record, windows, generator)
+    parts = covered(list(zip(bands, windows.values(), strict=True)), made)
+    return {f"{kind} {level}": part for kind, level, part in parts}
 
-    The parameter band is for the model's displacement, the displacement band for the simulated
-    truth, which has the discrepancy, and the sensor band for the readings.
-    """
-    target: dict[Kind, FloatArray | None]
-    target = {"parameter": model, "displacement": record.truth, "sensor": record.displacement}
-    held_out = list(zip(experiment.held_out.values(), every, strict=True))
-    covered = {}
-    for kind, values in target.items():
-        assert values is not None
-        for level in LEVELS if held_out else ():
-            edges = [(bands.lower[kind, level], bands.upper[kind, level]) for _, bands in held_out]
-            inside = [
-                (low <= values[window]) & (values[window] <= high)
-                for (window, _), (low, high) in zip(held_out, edges, strict=True)
-            ]
-            covered[f"{kind} {level}"] = float(np.mean(np.concatenate(inside)))
-    return covered
+
+def _others(
+    experiment: Experiment,
+    posterior: Posterior,
+    draws: FloatArray,
+    theta: Mapping[str, FloatArray],
+    record: Record,
+    generator: np.random.Generator,
+) -> dict[str, float]:
+    """Make the other records with the same truth; part of their samples inside each band."""
+    assert record.displacement is not None
+    source = replace(experiment.truth, displacement=record.displacement)
+    true = np.stack([theta[name] for name in source.prior.names], axis=1)
+    inside = {}
+    for name, other in experiment.others.items():
+        made = other.simulated(source, true, generator)
+        predicted = other.predicted(posterior, draws, made.record, generator)
+        for kind, level, part in covered([predicted], made):
+            inside[f"{name} {kind} {level}"] = part
+    return inside

@@ -40,6 +40,12 @@ IMPROBABLE = 10.0
 # The grid is fine enough when neighbours within two nats of the best node differ by less than this.
 FINE = 1.5
 
+# Slow departures of a lead-in that are looked for, as polynomials of the time up to this degree, if
+# there are so many readings; and draws for which they are.
+SLOW = 3
+MANY = 20
+TESTED = 100
+
 # Points between two nodes that a state is chosen from.
 BETWEEN = 8
 
@@ -297,14 +303,30 @@ def _informed(
         left = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
         model[:, likelihood.actuator.parameters.index("offset")] += mean[:, 0] + shift
         sd = np.sqrt(np.maximum(left, 0.0))
-    readings = likelihood.readings.rows.size
     lead_in = LeadIn(
         float(record.time[window.start]),
         float(record.time[window.stop]),
-        readings,
-        float(np.mean(stats.chi2.sf(posterior.squares, readings))),
+        likelihood.readings.rows.size,
+        _p_value(likelihood, theta, posterior.squares),
     )
     return Started(likelihood.actuator, model, unrest, sd, lead_in, window.stop)
+
+
+def _p_value(likelihood: Likelihood, theta: FloatArray, squares: FloatArray) -> float:
+    """Test whether the lead-in fits the models θ at all.
+
+    Two tests, either of which may object: the sum of all squared innovations, which sees any large
+    departure, and a score test of slow ones (drift, a transient), which many readings would hide.
+    """
+    readings = likelihood.readings.rows
+    p = stats.chi2.sf(squares, readings.size)
+    if readings.size > MANY:
+        some = slice(None, None, -(-len(theta) // TESTED))
+        place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
+        shapes = np.polynomial.legendre.legvander(place, SLOW).T[1:]
+        slow = stats.chi2.sf(likelihood.taken(theta[some], shapes), SLOW)
+        p = np.minimum(2 * np.minimum(p[some], slow), 1.0)
+    return float(np.mean(p))
 
 
 def _normal(mean: FloatArray, covariance: FloatArray, generator: np.random.Generator) -> FloatArray:

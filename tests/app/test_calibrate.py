@@ -22,6 +22,7 @@ from bwbayes.app.config import parse
 from bwbayes.app.folder import CalibrationFolder, RunFolder
 from bwbayes.app.progress import ReplicateProgress
 from bwbayes.errors import InputError
+from bwbayes.results.bands import KINDS, LEVELS
 from tests.app import small
 
 # Three free parameters: a replicate takes a fraction of a second.
@@ -58,6 +59,10 @@ pilot_steps = 30
 
 [validation.end]
 window = [1.5, 2.0]
+
+[validation.other]
+signal = { amplitude = 60.0, frequency = 2.0, duration = 1.5 }
+lead_in = 0.5
 """
 
 FILES = ("calibration.json", "calibration.html", "config.toml")
@@ -135,6 +140,11 @@ def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     first, *lines = (whole / "replicates.jsonl").read_text().splitlines()
     assert 3 == json.loads(first)["replicates"]
     assert [0, 1, 2] == [json.loads(line)["number"] for line in lines]
+    own = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
+    bands = [*own, *(f"other {name}" for name in own)]
+    assert bands == list(found["bands"])
+    for line in lines:
+        assert bands == list(json.loads(line)["covered"])
 
 
 def test_prior_is_resolved_once(whole: Path) -> None:
@@ -153,7 +163,14 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     assert "so few replicates may well miss sds a fifth too small" in page
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 3 == page.count("data:image/png;base64,")
-    for text in ("12 tests", "1%", "20 % too small", "Binomial limits".lower(), "±"):
+    for text in (
+        '<td class="text">other</td>',
+        "12 tests",
+        "1%",
+        "20 % too small",
+        "Binomial limits".lower(),
+        "±",
+    ):
         assert text in page
 
 

@@ -408,7 +408,7 @@ def test_lead_in_longer_than_the_record_is_refused(
 ) -> None:
     (tmp_path / "new.csv").write_bytes(lines(HEADER, *ROWS))
     said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv")
-    assert_one_line(said, "lead-in of 1 s leaves nothing of 0.6 s")
+    assert_one_line(said, "lead-in of 1 s from 0 s on leaves nothing of the record from 0 to 0.6 s")
     assert not (tmp_path / "bands.csv").exists()
     said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv", "--lead-in", "0.2")
     assert 0 == said.status

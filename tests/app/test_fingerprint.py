@@ -96,7 +96,7 @@ def test_edited_block_is_refused(copy: RunFolder, use: Callable[[RunFolder], Non
     [
         ("[[0.0, 5.0]]", "[[0.0, 4.0]]", "record.train"),
         ('dynamics = "lag"', 'dynamics = "none"', "model.dynamics"),
-        ('hold = "zero"', 'hold = "first"', "model.hold"),
+        ('hold = "auto"', 'hold = "first"', "model.hold"),
         ("fixed = 0.0172", "fixed = 0.0173", "parameters.gamma.fixed"),
         ("seed = 3", "seed = 4", "seed"),
     ],

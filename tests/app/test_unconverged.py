@@ -70,7 +70,7 @@ def test_line_on_the_screen_says_what_to_do(
     assert "" == printed.out
     assert 1 == printed.err.count("\n")
     assert printed.err.startswith("NOT CONVERGED: budget of 25 steps used up: ")
-    assert f"`bwbayes resume {tmp_path / 'a'} --steps N`" in printed.err
+    assert f"`bwbayes resume {tmp_path / 'a'} --steps 50`" in printed.err
 
 
 def test_prediction_from_it_is_refused(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:

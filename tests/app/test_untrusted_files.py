@@ -255,7 +255,7 @@ PAYLOADS = (
     "</title><img src=x onerror=alert(1)>",
     "\"'><svg/onload=alert(1)>",
     "--></style></table><iframe src='javascript:alert(1)'>",
-    "{{ 7 * 7 }}{% include 'report.html.j2' %}",
+    "{{ 1234 * 5678 }}{% include 'report.html.j2' %}",
     "&lt;b&gt;&#60;i&#62;",
     "<x\N{NULL}y \N{RIGHT-TO-LEFT OVERRIDE}>",
     "$\\frac{1$ [/red] \\",
@@ -308,7 +308,7 @@ def test_texts_add_no_tag_to_the_page(text: str, converged: bool) -> None:
     expected, got = (Skeleton(page(words, converged)).tags for words in ("harmless", text))
     # A symbol that is no letter is shown by its name, which has no subscript either.
     assert expected == got
-    assert "49" not in page("{{ 7 * 7 }}", converged)
+    assert "7006652" not in page("{{ 1234 * 5678 }}", converged)
 
 
 @pytest.mark.parametrize("text", PAYLOADS)

@@ -114,6 +114,32 @@ def test_the_unknown_start_is_integrated_out(
         np.testing.assert_allclose(start.covariance[row], covariance, atol=1e-6 * sd.max() ** 2)
 
 
+@pytest.mark.parametrize(("dynamics", "fixed"), MODELS, ids=["none", "lag", "slow", "complex"])
+def test_a_shape_takes_what_an_unknown_of_that_shape_would(
+    dynamics: Dynamics, fixed: dict[str, float]
+) -> None:
+    """A constant is an offset of which nothing is known."""
+    posterior = moving("discrepancy", dynamics, fixed, missing=0.1)
+    without = posterior.likelihood
+    free = replace(without, offset_sd=1e6)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 6))
+    expected = without.start(theta).squares - free.start(theta).squares
+    constant = np.ones((1, without.readings.rows.size))
+    np.testing.assert_allclose(expected, without.taken(theta, constant), rtol=1e-4, atol=1e-4)
+
+
+def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
+    posterior = moving()
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 70))
+    place = np.linspace(-1, 1, posterior.readings.rows.size)
+    shapes = np.stack([place, place**2, place**3])
+    others = np.array([[2.0, 0.0, 1.0], [0.0, -1.0, 1.0], [1.0, 1.0, 1.0]]) @ shapes
+    likelihood = replace(posterior.likelihood, offset_sd=3.0)
+    np.testing.assert_allclose(
+        likelihood.taken(theta, shapes), likelihood.taken(theta, others), rtol=1e-6
+    )
+
+
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("missing", [0.0, 0.1, 0.7])
 @pytest.mark.parametrize("stride", [1, 2, 8])

@@ -30,6 +30,9 @@ RATE = 200.0
 DURATION = 8.0
 KNOCK = 20.0
 
+# Draws of the start: they are spread evenly, so that few will do.
+DRAWS = 64
+
 TRUE = {
     "d": 0.7,
     "alpha": 0.3575,
@@ -100,7 +103,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
 def predicted(case: Case, posterior: Posterior, record: Record, seed: int) -> Bands:
     """Predict a record with draws that are all the truth."""
     start = Start(case.from_rest, lead_in=case.lead_in)
-    draws = np.empty((200, 0))
+    draws = np.empty((DRAWS, 0))
     return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
 
 

@@ -11,16 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.distributions import Distribution
+from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
 from bwbayes.results import replicates as module
 from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.prediction import Start
 from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
+from bwbayes.results.simulated import OtherRecord, Simulated, covered, discrepancy
 from tests.app import example
-from tests.inference.problems import decaying_sine, posterior_of, short_posterior
+from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
 
 # Three free parameters, so that a replicate takes a fraction of a second.
 FIXED = {"initial": 0.0, "offset": 0.0, "beta": 0.0272, "gamma": 0.0172}
@@ -56,8 +60,8 @@ def test_entry_is_plain_and_complete() -> None:
     assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
     assert (3, True) == (entry["number"], entry["converged"])
     assert (RANKED, len(names)) == made.draws.shape
-    for name, truth, draws in zip(names, made.truth, made.draws.T, strict=True):
-        assert sum(draw < truth for draw in draws) == entry["ranks"][name]
+    for name, true, draws in zip(names, made.truth, made.draws.T, strict=True):
+        assert sum(draw < true for draw in draws) == entry["ranks"][name]
 
 
 @pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError])
@@ -91,8 +95,19 @@ def test_each_band_is_held_against_what_it_is_for() -> None:
         lower={key: np.full(20, middle - 1) for key, middle in around.items()},
         upper={key: np.full(20, middle + 1) for key, middle in around.items()},
     )
-    covered = module._covered(small(), [bands], record, model)
-    assert dict.fromkeys((f"{kind} {level}" for kind, level in around), 1.0) == covered
+    parts = list(covered([(bands, slice(60, 80))], Simulated(record, model)))
+    assert [(kind, level, 1.0) for kind, level in around] == parts
+
+
+def test_missing_readings_are_not_counted() -> None:
+    values = np.zeros(80)
+    reading = np.where(np.arange(80) % 2, 0.0, np.nan)
+    bands = example.bands(samples=20)
+    edges = dict.fromkeys(bands.lower, np.ones(20))
+    bands = replace(bands, lower={key: -edge for key, edge in edges.items()}, upper=edges)
+    record = Record(values, reading, 0.01, truth=values)
+    parts = covered([(bands, slice(60, 80))], Simulated(record, values))
+    assert {1.0} == {part for _, _, part in parts}
 
 
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
@@ -144,11 +159,83 @@ def test_short_or_stuck_chain_still_gives_enough_draws(time: float) -> None:
 # Simulated records
 
 
+def another(**changes: object) -> OtherRecord:
+    """Return a sine of another rate; the last reading is missing, and a tenth is the lead-in."""
+    voltage = 60 * np.sin(2 * np.pi * np.arange(200) / 100 + 1)
+    reading = np.where(np.arange(200) < 199, 0.0, np.nan)
+    other = OtherRecord(Record(voltage, reading, 0.005), Start(lead_in=0.1))
+    return replace(other, **changes)  # type: ignore[arg-type]
+
+
+def test_bands_of_other_records_are_held_against_them() -> None:
+    common = small(others={"one": another(), "part": another(window=(0.5, 1.0))})
+    entry = replicate(common, 1, 3).entry()
+    assert list(common.bands) == list(entry["covered"])
+    assert entry["covered"]["one sensor 50"] != entry["covered"]["part sensor 50"]
+    # It does not matter to the rest whether there are others.
+    alone = replicate(small(), 1, 3).entry()
+    assert alone["ranks"] == entry["ranks"]
+    assert alone["covered"] == {name: entry["covered"][name] for name in alone["covered"]}
+
+
+def moving_posterior() -> tuple[Posterior, FloatArray]:
+    posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
+    return posterior, truth(posterior)
+
+
+def test_another_record_starts_anywhere() -> None:
+    """Its h is even between the extremes, its unrest and its offset have the sds of their priors.
+
+    Without dynamics and hysteresis: the offset's alone.
+    """
+    posterior, theta = moving_posterior()
+    other = another()
+    drive = theta[0, posterior.prior.names.index("d")] * other.record.voltage[0]
+    many = [other.simulated(posterior, theta, np.random.default_rng(i)).model for i in range(400)]
+    late, first = np.array(many)[:, -1], np.array(many)[:, 0] - drive
+    offset_sd = np.ptp(posterior.readings.values)
+    assert np.std(late) == pytest.approx(offset_sd, rel=0.12)
+    unrest_sd = theta[0, 0] * np.ptp(posterior.voltage) / 2
+    assert np.std(first - late) == pytest.approx(unrest_sd, rel=0.12)
+
+
+def test_another_record_from_rest_with_the_same_offset_is_simulated_so() -> None:
+    posterior, theta = moving_posterior()
+    rested = Start(from_rest=True, own_offset=False)
+    other = another(start=rested)
+    made = other.simulated(posterior, theta, np.random.default_rng(1))
+    actuator = replace(posterior.actuator, interval=0.005)
+    model = theta[:, : len(actuator.parameters)]
+    model = actuator.at_rest(model, float(other.record.voltage[0]))
+    expected = actuator.displacement(model, other.record.voltage)[0]
+    np.testing.assert_allclose(expected, made.model)
+
+
+def test_other_readings_are_missing_where_they_are() -> None:
+    posterior, theta = moving_posterior()
+    made = another().simulated(posterior, theta, np.random.default_rng(1)).record
+    assert made.displacement is not None
+    assert [199] == np.flatnonzero(np.isnan(made.displacement)).tolist()
+
+
+def test_a_planned_voltage_is_predicted_without_its_readings() -> None:
+    """So no lead-in is taken from them, and all samples are judged."""
+    posterior, theta = moving_posterior()
+    other = another(record=replace(another().record, displacement=None))
+    generator = np.random.default_rng(1)
+    made = other.simulated(posterior, theta, generator)
+    draws = posterior.prior.draw(generator, 20)
+    free = posterior.prior.constrain(draws)[0]
+    bands, judged = other.predicted(posterior, free, made.record, generator)
+    assert bands.measured is None
+    assert slice(0, 200) == judged
+
+
 def test_discrepancy_is_the_process_that_the_likelihood_has() -> None:
     """Its covariance is σ² exp(−|t − t'|/τ); 4,000 draws know it to some 3 %."""
     theta = {"discrepancy_sd": np.array([1.5]), "discrepancy_time": np.array([0.05])}
     generator = np.random.default_rng(1)
-    drawn = np.stack([module._discrepancy(theta, 12, 0.01, generator) for _ in range(4_000)])
+    drawn = np.stack([discrepancy(theta, 12, 0.01, generator) for _ in range(4_000)])
     lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) * 0.01
     expected = 1.5**2 * np.exp(-lag / 0.05)
     # sd of a covariance of n draws: sqrt((c_ii c_jj + c_ij²) / n)
@@ -157,23 +244,28 @@ def test_discrepancy_is_the_process_that_the_likelihood_has() -> None:
 
 
 def test_white_noise_has_no_discrepancy() -> None:
-    drawn = module._discrepancy({}, 5, 0.01, np.random.default_rng(1))
+    drawn = discrepancy({}, 5, 0.01, np.random.default_rng(1))
     np.testing.assert_array_equal(np.zeros(5), drawn)
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:
-    """As the likelihood takes it: over 200 records, neighbours on a border are as correlated."""
+    """As the likelihood takes it: over 200 records, neighbours on a border are correlated too.
+
+    Less than those in a window only because correlation times that the prior draws differ.
+    """
     windows = (slice(0, 30), slice(30, 60))
-    posterior = short_posterior("discrepancy", 80, fixed=FIXED, training=windows)
+    fixed = FIXED | {"discrepancy_time": 0.2}
+    posterior = short_posterior("discrepancy", 80, fixed=fixed, training=windows)
     experiment = Experiment(posterior, PLAN)
     away = []
     for seed in range(200):
-        theta, record, model = module._simulated(experiment, np.random.default_rng(seed))
-        assert record.truth is not None
-        away.append((record.truth - model) / theta["discrepancy_sd"])
+        theta, made = module._simulated(experiment, np.random.default_rng(seed))
+        assert made.record.truth is not None
+        away.append((made.record.truth - made.model) / theta["discrepancy_sd"])
     last_but_one, last, first = np.array(away)[:, 28:31].T
-    assert np.corrcoef(last_but_one, last)[0, 1] > 0.9
-    assert np.corrcoef(last, first)[0, 1] > 0.9
+    within, across = (np.corrcoef(last, other)[0, 1] for other in (last_but_one, first))
+    assert across > 0.5
+    assert across == pytest.approx(within, abs=0.2)
 
 
 def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
@@ -183,7 +275,7 @@ def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
     names = posterior.actuator.parameters
     away = []
     for seed in range(300):
-        theta, _, model = module._simulated(moving, np.random.default_rng(seed))
+        theta, (_, model) = module._simulated(moving, np.random.default_rng(seed))
         rest = theta["d"][0] * posterior.voltage[0] - theta["initial"][0] + theta["offset"][0]
         away.append((model[0] - rest) / (theta["d"][0] * np.ptp(posterior.voltage) / 2))
     assert "lag" in names
@@ -191,7 +283,7 @@ def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
 
 
 def test_reading_is_truth_and_sensor_noise() -> None:
-    theta, record, _ = module._simulated(small(), np.random.default_rng(1))
+    theta, (record, _) = module._simulated(small(), np.random.default_rng(1))
     assert record.displacement is not None
     assert record.truth is not None
     noise = (record.displacement - record.truth) / theta["sensor_sd"]

@@ -91,12 +91,13 @@ def _draw_ecdf(calibration: Calibration, labels: Sequence[str]) -> Figure:
 
 def _draw_coverage(calibration: Calibration, labels: Sequence[str]) -> Figure:
     """Draw the coverage of the posteriors' intervals, and of the bands on held-out samples."""
-    width = 11 if calibration.bands else 7.5
+    others = calibration.predicted
+    width = 7.5 + 3.5 * len(others)
     figure = Figure(figsize=(width, 0.28 * len(labels) + 1.8), layout="constrained")
-    both = figure.subplots(1, 2 if calibration.bands else 1, squeeze=False)[0]
-    _draw_intervals(both[0], calibration, labels)
-    if calibration.bands:
-        _draw_bands(both[1], calibration)
+    first, *panels = figure.subplots(1, 1 + len(others), squeeze=False)[0]
+    _draw_intervals(first, calibration, labels)
+    for panel, other in zip(panels, others, strict=True):
+        _draw_bands(panel, calibration, other)
     return figure
 
 
@@ -116,14 +117,15 @@ def _draw_intervals(panel: Axes, calibration: Calibration, labels: Sequence[str]
     panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=len(LEVELS))
 
 
-def _draw_bands(panel: Axes, calibration: Calibration) -> None:
+def _draw_bands(panel: Axes, calibration: Calibration, other: str) -> None:
     """Draw how far each band's mean coverage is off, with three standard errors."""
     for i, kind in enumerate(KINDS):
         off, error = zip(
             *(
                 (100 * one.mean - level, 100 * LIMIT * one.error)
                 for level, one in (
-                    (level, calibration.bands[f"{kind} {level}"]) for level in LEVELS
+                    (level, calibration.bands[f"{other} {kind} {level}".strip()])
+                    for level in LEVELS
                 )
             ),
             strict=True,
@@ -136,7 +138,7 @@ def _draw_bands(panel: Axes, calibration: Calibration) -> None:
     panel.set_xticks(range(len(LEVELS)), [f"{level} %" for level in LEVELS])
     panel.set_xlabel("nominal coverage (%)")
     panel.set_ylabel("measured less nominal coverage (%)")
-    panel.set_title("bands on held-out samples (whiskers: 3 standard errors)")
+    panel.set_title(f"bands on {other or 'held-out samples'} (whiskers: 3 standard errors)")
     panel.legend(loc="best")
 
 

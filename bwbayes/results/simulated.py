@@ -1,0 +1,129 @@
+"""Records made by the model itself: what a replicate is fitted to, and others that it predicts.
+
+A record that is not fitted starts as :mod:`bwbayes.results.start` takes it to: from a hysteretic
+state anywhere between the lowest and the highest that an earlier drive could have left, with the
+dynamics as far from rest as their prior says, and with an offset of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record, Window
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.prediction import predict_record
+from bwbayes.results.start import Start, started
+
+__all__ = ["OtherRecord", "Simulated", "covered", "discrepancy"]
+
+
+class Simulated(NamedTuple):
+    """A record with its truth, and the displacement of its model (samples,), um."""
+
+    record: Record
+    model: FloatArray
+
+
+@dataclass(frozen=True)
+class OtherRecord:
+    """Another record to be simulated, and predicted from the posterior of the one that is fitted.
+
+    Parameters
+    ----------
+    record
+        Its voltage and times. Of its displacement only counts where there are readings; without
+        any it is a planned voltage, whose start nothing tells.
+    start
+        What is known of its start.
+    window
+        Part of it (start, stop) that is predicted, s; by default all.
+    """
+
+    record: Record
+    start: Start = field(default_factory=Start)
+    window: Window | None = None
+
+    def simulated(
+        self, posterior: Posterior, theta: FloatArray, generator: np.random.Generator
+    ) -> Simulated:
+        """Simulate it with the true parameters (1, parameters).
+
+        ``posterior`` is that of the record that was made with them, which tells the ranges of
+        voltage and offset.
+        """
+        planned = replace(self.record, displacement=None, truth=None)
+        begun = started(posterior, theta, planned, self.start, generator)
+        model = begun.actuator.advance(begun.model, planned.voltage, unrest=begun.unrest)[0][0]
+        if self.start.own_offset and self.record.displacement is not None:
+            model = model + np.ptp(posterior.readings.values) * generator.standard_normal()
+        column = dict(zip(posterior.prior.names, theta.T, strict=True))
+        truth = model + discrepancy(column, model.size, planned.interval, generator)
+        reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
+        if self.record.displacement is not None:
+            reading[np.isnan(self.record.displacement)] = np.nan
+        return Simulated(replace(planned, displacement=reading, truth=truth), model)
+
+    def predicted(
+        self,
+        posterior: Posterior,
+        draws: FloatArray,
+        record: Record,
+        generator: np.random.Generator,
+    ) -> tuple[Bands, slice]:
+        """Predict it, once it is simulated; return the bands, and the samples that are judged."""
+        if self.record.displacement is None:
+            record = replace(record, displacement=None)
+        bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
+        part = slice(0, record.samples)
+        if self.window is not None:
+            part = record.window_slice(*self.window)
+        return bands, slice(part.start + bands.scored_from, part.stop)
+
+
+def discrepancy(
+    theta: Mapping[str, FloatArray], samples: int, interval: float, generator: np.random.Generator
+) -> FloatArray:
+    """Draw a stationary Ornstein-Uhlenbeck process (samples,) in um, if the noise has one."""
+    if "discrepancy_sd" not in theta:
+        return np.zeros(samples)
+    rate = interval / float(theta["discrepancy_time"][0])
+    shocks = float(theta["discrepancy_sd"][0]) * generator.standard_normal(samples)
+    shocks[1:] *= math.sqrt(-math.expm1(-2 * rate))
+    return np.asarray(lfilter([1.0], [1.0, -math.exp(-rate)], shocks), dtype=np.float64)
+
+
+def covered(every: list[tuple[Bands, slice]], made: Simulated) -> Iterator[tuple[Kind, int, float]]:
+    """Yield the part of a simulated record's samples that lie inside each kind and level of band.
+
+    The last samples of the bands are those of the slice of the record that they come with. The
+    parameter band is for the model's displacement, the displacement band for the simulated truth,
+    which has the discrepancy, and the sensor band for the readings, where there are any.
+    """
+    target: dict[Kind, FloatArray | None]
+    target = {
+        "parameter": made.model,
+        "displacement": made.record.truth,
+        "sensor": made.record.displacement,
+    }
+    for kind in KINDS:
+        values = target[kind]
+        assert values is not None
+        for level in LEVELS:
+            inside = [_inside(bands, (kind, level), values[window]) for bands, window in every]
+            yield kind, level, float(np.mean(np.concatenate(inside)))
+
+
+def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
+    """Tell which of the values (samples,) that there are lie inside the end of a band."""
+    there = np.isfinite(values)
+    low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
+    inside: FloatArray = ((low <= values) & (values <= high))[there].astype(np.float64)
+    return inside

@@ -1,0 +1,210 @@
+"""What people run is calibrated: default priors, records that start in motion, other records.
+
+The default priors are resolved once, from a typical record of a ring bender that is cut out of a
+running drive, as the package does with a user's file; then they are fixed, and the replicates draw
+ten or eleven parameters from them, simulate the record and fit it as a run does. Nothing is known
+of its start: the hysteretic state is free, the dynamics may be moving. Each replicate then makes
+another record with the same truth, cut from another drive at another rate, with a state, an unrest
+and an offset of its own, and predicts it from the posterior after a lead-in of a second.
+
+Default priors are so wide that a few truths have next to no hysteresis; their posteriors are long
+and curved, and take some ten thousand steps. Here a replicate ends after 3,000 and is ranked as it
+is; at most one in ten may.
+
+The default suite makes 30 replicates with the lag. All parameters are tested together
+(:mod:`tests.together`), and each by the calibration's own tests; twins plant a wrong width and a
+bias on the draws. Coverages of the 18 bands are held to the spread between replicates: by chance
+one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` makes
+150 replicates each with the lag, the second order, a free exponent, and the lag with little noise.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bwbayes.app.calibrate import experiment
+from bwbayes.app.config import parse
+from bwbayes.app.problem import resolve
+from bwbayes.app.workers import one_thread
+from bwbayes.data.files import write_record
+from bwbayes.data.record import Record
+from bwbayes.model.actuator import Actuator
+from bwbayes.results.calibration import Calibration, judge
+from bwbayes.results.replicates import Experiment, Replicate, replicates
+from bwbayes.results.simulated import discrepancy
+from tests.found import keep
+from tests.together import LEVEL, Plant, narrowed, shifted, together_test
+
+SEED = 1
+QUICK = 30
+REPLICATES = 150
+
+# Part of the replicates that may end before they have converged.
+MOST_UNCONVERGED = 0.1
+
+# Probability that one of a sound calibration's bands is off by more than is allowed.
+FALSE_ALARM = 0.01
+
+CONFIG = """\
+[record]
+file = "typical.csv"
+train = [[0.0, 3.0]]
+
+[model]
+dynamics = "{dynamics}"
+
+[sampling]
+ess = 500
+steps = 3000
+walkers = 32
+block = 25
+
+[validation.held_out]
+window = [3.0, 4.0]
+
+[validation.other]
+file = "other.csv"
+
+[parameters]
+"""
+
+VARIANTS = {
+    "lag": ("lag", ""),
+    "second order": ("second-order", "mass = { fixed = 300.0 }\nstiffness = { fixed = 4.1e5 }\n"),
+    "free exponent": (
+        "lag",
+        'exponent = { prior = { distribution = "lognormal", median = 1.5, sigma = 0.3 } }\n',
+    ),
+    "little noise": (
+        "lag",
+        'sensor_sd = { prior = { distribution = "lognormal", median = 0.03, sigma = 0.5 } }\n'
+        'discrepancy_sd = { prior = { distribution = "lognormal", median = 0.3, sigma = 0.5 } }\n',
+    ),
+}
+
+TRUE = {
+    "d": 0.7,
+    "alpha": 0.3575,
+    "beta": 0.0272,
+    "gamma": 0.0172,
+    "exponent": 1.0,
+    "initial": 0.0,
+    "lag": 0.02,
+    "offset": 0.0,
+}
+
+
+def typical(
+    interval: float, duration: float, frequency: float, generator: np.random.Generator
+) -> Record:
+    """Cut a record out of a running drive of the ring bender with a lag."""
+    before = 2.3
+    time = interval * np.arange(round((before + duration) / interval))
+    voltage = 100 * np.exp(-0.1 * time) * np.sin(2 * np.pi * frequency * time)
+    actuator = Actuator("lag", "first", interval)
+    clean = actuator.displacement([[TRUE[name] for name in actuator.parameters]], voltage)[0]
+    noise = {"discrepancy_sd": np.array([1.0]), "discrepancy_time": np.array([0.3])}
+    slow = discrepancy(noise, time.size, interval, generator)
+    reading = clean + slow + generator.normal(0, 0.3, time.size)
+    cut = time.size - round(duration / interval)
+    return Record(voltage[cut:], reading[cut:], interval)
+
+
+def typical_experiment(variant: str, folder: Path) -> Experiment:
+    """Resolve the default priors once, from typical records."""
+    generator = np.random.default_rng(SEED)
+    write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
+    write_record(typical(0.025, 4.0, 0.7, generator), folder / "other.csv")
+    dynamics, parameters = VARIANTS[variant]
+    text = CONFIG.format(dynamics=dynamics) + parameters
+    return experiment(resolve(parse(text, "typical"), folder))
+
+
+def band_limit(bands: int, count: int) -> float:
+    """Return the t-value that one of so many bands exceeds in 100 calibrations (Bonferroni)."""
+    return float(stats.t.isf(FALSE_ALARM / 2 / bands, count - 1))
+
+
+def made(variant: str, folder: Path, count: int) -> tuple[Experiment, list[Replicate]]:
+    """Make the first replicates of a variant."""
+    common = typical_experiment(variant, folder)
+    with one_thread(), ThreadPoolExecutor(1) as pool:
+        return common, list(replicates(common, SEED, range(count), pool))
+
+
+def off(every: list[Replicate]) -> dict[str, float]:
+    """How far each band's mean coverage is off, in standard errors between replicates."""
+    ranked = [one for one in every if one.covered]
+    result = {}
+    for name in ranked[0].covered:
+        covered = np.array([one.covered[name] for one in ranked])
+        error = np.std(covered, ddof=1) / np.sqrt(covered.size)
+        result[name] = float((np.mean(covered) - int(name.split()[-1]) / 100) / error)
+    return result
+
+
+def remarks(found: Calibration) -> list[str]:
+    """Return a calibration's shortcomings but for replicates that have not converged."""
+    return [text for text in found.shortcomings if "did not converge" not in text]
+
+
+def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
+    """Return what is kept of a calibration."""
+    found = judge([one.entry() for one in every], np.random.default_rng(SEED))
+    ranked = [one for one in every if len(one.draws)]
+    return {
+        "replicates": len(every),
+        "unconverged": len(found.unconverged),
+        "shortcomings": remarks(found),
+        "smallest adjusted p": round(min(one.adjusted for one in found.statistics.values()), 4),
+        "all parameters together, p": round(together_test(ranked, common.posterior.prior), 4),
+        "bands, standard errors off": {name: round(t, 2) for name, t in off(every).items()},
+        "bands cover": {name: round(one.mean, 4) for name, one in found.bands.items()},
+    }
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Experiment, list[Replicate]]:
+    return made("lag", tmp_path_factory.mktemp("lag"), QUICK)
+
+
+Sound = tuple[Experiment, list[Replicate]]
+
+
+def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> None:
+    common, every = sound
+    found = judge([one.entry() for one in every], np.random.default_rng(SEED))
+    assert [] == remarks(found)
+    assert len(found.unconverged) <= MOST_UNCONVERGED * QUICK
+    assert together_test(every, common.posterior.prior) > LEVEL
+
+
+def test_bands_of_the_record_and_of_another_one_hold(sound: Sound) -> None:
+    found = off(sound[1])
+    assert 18 == len(found)
+    assert {} == {name: t for name, t in found.items() if not abs(t) < band_limit(18, QUICK)}
+
+
+@pytest.mark.parametrize("defect", [narrowed, shifted])
+def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
+    common, every = sound
+    assert together_test(every, common.posterior.prior, defect) < LEVEL
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_is_calibrated(variant: str, tmp_path: Path) -> None:
+    common, every = made(variant, tmp_path, REPLICATES)
+    found = figures(common, every)
+    keep(f"calibration, {variant}", found)
+    assert [] == found["shortcomings"]
+    assert found["unconverged"] <= MOST_UNCONVERGED * REPLICATES
+    assert together_test(every, common.posterior.prior) > LEVEL
+    limit = band_limit(18, REPLICATES)
+    assert {} == {name: t for name, t in off(every).items() if not abs(t) < limit}
