@@ -180,3 +180,14 @@ def test_a_sensor_that_is_noisier_than_the_drive_moves_is_no_misfit() -> None:
     verdict = assess(bands_of(record, training=True), Background(record.memory, 0.0, FITTED))
     assert verdict is not None
     assert verdict.holds is True
+
+
+def test_a_short_training_window_is_judged_by_the_range_of_all_of_them() -> None:
+    """What would be much for the window's own range is little for that of the whole fit."""
+    record = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
+    alone = Background(record.memory, 0.0, FITTED)
+    for extent, holds in ((0.0, False), (1000.0, True)):
+        background = replace(alone, extent=extent)
+        verdict = assess(bands_of(record, training=True), background)
+        assert verdict is not None
+        assert verdict.holds is holds
