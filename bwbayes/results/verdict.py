@@ -331,7 +331,7 @@ def _leaning(bands: Bands, judged: BoolArray, standard: _Standard) -> list[str]:
 def _missed(bands: Bands, judged: BoolArray, extent: float) -> list[str]:
     """Say whether a fit misses its own readings by more than a sensor's noise would.
 
-    Against the range ``extent`` of all that was fitted, um: a window may be short and its own small.
+    Against the range ``extent`` of all that was fitted, um: that of a short window may be small.
     """
     assert bands.measured is not None
     reading = bands.measured[judged]
