@@ -15,10 +15,10 @@ The default suite makes 30 replicates with the lag, and with priors of someone w
 actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are tested
 together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a wrong width
 and a bias on the draws (sds three tenths too small are seen nearly always, sds a fifth too small 87
-times in 100, a bias of 0.3 sd 96 times). Coverages of the 18 bands are held to the spread between replicates: by
-chance one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow``
-makes 150 replicates of this, and with default priors for all with the lag, the second order, a free
-exponent, and the lag with little noise.
+times in 100, a bias of 0.3 sd 96 times). Coverages of the 18 bands are held to the spread between
+replicates: by chance one in 100 sound calibrations has one that is off by more (Bonferroni's
+bound). ``-m slow`` makes 150 replicates of this, and with default priors for all with the lag, the
+second order, a free exponent, and the lag with little noise.
 """
 
 from __future__ import annotations
