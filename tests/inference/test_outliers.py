@@ -38,6 +38,16 @@ def test_spikes_are_found_and_nothing_else(noise: str, seed: int) -> None:
     assert [] == outliers(posterior, generator).tolist()
 
 
+def test_a_reading_is_set_aside_from_six_sds_on() -> None:
+    """One that is moved to nine sds from what the others predict is, one at four is not."""
+    good = short_posterior(samples=400)
+    place = pointfit.fit(good, np.random.default_rng(9)).mode
+    before, after = (surprise(p, place)[300] for p in (good, spoilt(good, [300], 1.0)))
+    for sds, aside in ((9.0, [300]), (4.0, [])):
+        moved = spoilt(good, [300], (sds - before) / (after - before))
+        assert aside == outliers(moved, np.random.default_rng(9)).tolist()
+
+
 def test_what_is_left_is_the_posterior_without_those_readings() -> None:
     """The same posterior as that of the good record with these readings missing, exactly."""
     good = short_posterior(samples=600)
