@@ -134,7 +134,30 @@ def hostile() -> str:
     return f"{used + refused:,} cases: {used:,} used, {refused:,} refused, nothing else"
 
 
-@pytest.mark.parametrize("finding", [coverage, calibration, kills, hostile])
+def steady() -> str:
+    one = found()["steady sine"]
+    covered = one["covered 95"].values()
+    return (
+        f"{one['converged']} of {one['records']}, after {one['most steps']:.0f} steps at most; "
+        f"95 % intervals of eight parameters cover {min(covered)} to {max(covered)} of "
+        f"{one['records']}"
+    )
+
+
+def verdicts() -> str:
+    good, spoilt = found()["good runs hold"], found()["spoilt runs do not hold"]
+    runs = {
+        sum(v for k, v in kind.items() if k in ("seen", "missed", "right"))
+        for kind in spoilt.values()
+    }
+    missed = sum(kind.get("missed", 0) for kind in spoilt.values())
+    return (
+        f"{len(good['said no'])} false alarms in {good['runs']} good runs; {missed} missed of "
+        f"{len(spoilt)} kinds of spoilt ones, {runs.pop()} each"
+    )
+
+
+@pytest.mark.parametrize("finding", [coverage, calibration, kills, hostile, steady, verdicts])
 def test_the_quoted_findings_are_those_of_the_last_full_run(finding: Callable[[], str]) -> None:
     assert f"| {finding()} |" in README
 

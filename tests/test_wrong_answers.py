@@ -32,24 +32,17 @@ import numpy as np
 import pytest
 
 from bwbayes.app.problem import Problem, generator
-from bwbayes.app.run import assemble, versions
-from bwbayes.app.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from bwbayes.inference import pointfit
-from bwbayes.inference.chainfile import ChainFile
-from bwbayes.inference.sampling import first_chain, sample
 from bwbayes.results.prediction import Start, predict_record, thinned
 from bwbayes.results.result import Result
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.results import moving
-from tests.results.runs import Judged, Stand, covered, judge, problem_of
+from tests.results.runs import CONVERGED, Judged, Stand, covered, judge, problem_of, run
 
 STAND = Stand(lag=0.03)
 SLOW = Stand(lag=0.05)
 LARGE = Stand(d=15.0, discrepancy=8.0, sensor=2.0)
-
-CONVERGED = "\n[sampling]\ness = 400\n"
 
 
 def sine(seconds: float, rate: float = 100.0, size: float = 100.0) -> FloatArray:
@@ -71,22 +64,6 @@ def transient(size: float, last: float, samples: int = 2000, rate: float = 100.0
     """Return what dies out exponentially (samples,), um and s."""
     faded: FloatArray = size * np.exp(-np.arange(samples) / rate / last)
     return faded
-
-
-def run(text: str, folder: Path) -> tuple[Problem, Result]:
-    """Do what a run does, but for its files."""
-    problem = problem_of(text + CONVERGED, folder)
-    posterior, seed = problem.posterior, problem.config.seed
-    with one_thread(), executor(1, posterior.engine) as pool:
-        point = pointfit.fit(posterior, generator(seed, "point fit"))
-        first = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
-        noted = {"versions": json.dumps(versions(posterior.engine))}
-        path = folder / "chain.h5"
-        with ChainFile.create(path, first, point, problem.plan.block, noted) as chain:
-            outcome = sample(posterior, problem.plan, chain, pool)
-            result = assemble(problem, chain, outcome)
-    assert outcome.converged, outcome.stop_reason
-    return problem, result
 
 
 def fitted(record: Record, folder: Path, *lines: str) -> Judged:

@@ -284,7 +284,13 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     found = innovations.innovations(posterior, best, problem.record.start)
     # By a second point fit, without the record's start.
     source = generator(problem.config.seed, "without start")
-    moved = without_start(posterior, thinned(flat, source), source, problem.record.start)
+    moved = without_start(
+        posterior,
+        thinned(flat, source),
+        source,
+        problem.record.start,
+        seen=any(one.kind == "switch-on transient" for one in problem.findings),
+    )
     verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
     return replace(
         result,

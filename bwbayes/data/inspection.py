@@ -171,7 +171,8 @@ def _spikes(record: Record, outliers: IntArray) -> Iterator[Finding]:
         return
     times = record.time[outliers]
     shown = ", ".join(f"{time:.6g}" for time in times[:5]) + (", ..." if times.size > 5 else "")
-    text = f"{times.size} isolated outliers of the displacement, at {shown} s"
+    plural = "" if times.size == 1 else "s"
+    text = f"{times.size} isolated outlier{plural} of the displacement, at {shown} s"
     remedy = "outliers = true under [model]"
     yield Finding("spikes", float(times[0]), float(times[-1]) + record.interval, text, remedy)
 

@@ -47,26 +47,41 @@ def outliers(posterior: Posterior, generator: np.random.Generator) -> IntArray:
     InputError
         More than one in twenty of the readings would be.
     """
-    aside = np.empty(0, dtype=np.int64)
-    everything = posterior.readings.rows.size
+    readings, everything = posterior, posterior.readings.rows.size
+    aside = doubtful = np.empty(0, dtype=np.int64)
     for _ in range(ROUNDS):
         point = pointfit.fit(posterior, generator.spawn(1)[0])
         rows = posterior.readings.rows
         away = np.abs(surprise(posterior, point.mode))
         # Many spikes make the fit's noise larger than that of most readings: theirs counts.
-        new = rows[away > LIMIT * min(1.0, float(np.median(away)) / MEDIAN)]
-        if not new.size:
+        far = away > LIMIT * min(1.0, float(np.median(away)) / MEDIAN)
+        if not far.any():
             break
-        aside = np.union1d(aside, new)
+        aside = np.union1d(aside, rows[far])
+        doubtful = np.union1d(doubtful, rows[far & (away <= LIMIT)])
         if aside.size > MOST * everything:
             raise InputError(
                 f"model.outliers: {aside.size} of {everything} readings would be set aside, too "
                 "many for isolated outliers; leave outliers out, and look at the residuals"
             )
-        displacement = posterior.displacement.copy()
-        displacement[aside] = np.nan
-        posterior = replace(posterior, displacement=displacement)
-    return aside
+        posterior = _without(readings, aside)
+    # The last fit tells which of those that most readings' noise made suspect are outliers.
+    good = [row for row in doubtful.tolist() if _is_good(readings, aside, row, point.mode)]
+    return np.setdiff1d(aside, good)
+
+
+def _without(posterior: Posterior, rows: IntArray) -> Posterior:
+    """Return the posterior without some readings."""
+    displacement = posterior.displacement.copy()
+    displacement[rows] = np.nan
+    return replace(posterior, displacement=displacement)
+
+
+def _is_good(posterior: Posterior, aside: IntArray, row: int, place: FloatArray) -> bool:
+    """Tell whether the reading of a sample goes with all others that are not set aside."""
+    with_it = _without(posterior, aside[aside != row])
+    at = int(np.searchsorted(with_it.readings.rows, row))
+    return bool(np.abs(surprise(with_it, place)[at]) <= LIMIT)
 
 
 def surprise(posterior: Posterior, place: FloatArray) -> FloatArray:

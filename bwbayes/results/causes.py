@@ -127,7 +127,8 @@ class Residuals:
         if not count:
             return []
         largest = float(np.max(np.abs(self.residual[self.spikes])))
-        return [f"{count} isolated readings lie up to {largest:.3g} um off"]
+        lie = "reading lies" if count == 1 else "readings lie up to"
+        return [f"{count} isolated {lie} {largest:.3g} um off"]
 
     @property
     def reversed(self) -> list[str]:

@@ -30,6 +30,10 @@ MOVED = 5.0
 WORSE = 8.0
 COMPARED = 100
 
+# Where the readings themselves show a switch-on transient, less evidence is enough: both would have
+# to be wrong.
+SEEN_MOVED, SEEN_WORSE = 1.5, 3.0
+
 # Draws of the Gaussian approximation.
 DRAWS = 400
 
@@ -56,7 +60,12 @@ class Moved:
 
 
 def without_start(
-    posterior: Posterior, draws: FloatArray, generator: np.random.Generator, begin: float = 0.0
+    posterior: Posterior,
+    draws: FloatArray,
+    generator: np.random.Generator,
+    begin: float = 0.0,
+    *,
+    seen: bool = False,
 ) -> Moved | None:
     """Fit again without the first readings; return the parameter that moves most, if one does.
 
@@ -70,6 +79,8 @@ def without_start(
         Starts the point fit and draws from its approximation.
     begin
         Time of the record's first sample, s.
+    seen
+        The readings show a switch-on transient.
     """
     rows = posterior.readings.rows
     if rows.size < FEWEST:
@@ -83,7 +94,7 @@ def without_start(
         return None
     # Only where the rest is told far worse by what was sampled: else it has two optima.
     sampled = rest.log_density(posterior.prior.unconstrain(draws[:COMPARED]))
-    if point.log_density - float(np.max(sampled)) <= WORSE:
+    if point.log_density - float(np.max(sampled)) <= (SEEN_WORSE if seen else WORSE):
         return None
     coordinates = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
     free, density = posterior.prior.constrain(coordinates)
@@ -98,7 +109,7 @@ def without_start(
     (mean, sd), (other, its_sd) = (_middle(some[:, physical]) for some in (draws, free))
     moved = np.abs(other - mean) / np.sqrt(sd**2 + its_sd**2 + np.finfo(float).tiny)
     worst = int(np.argmax(moved))
-    if moved[worst] <= MOVED:
+    if moved[worst] <= (SEEN_MOVED if seen else MOVED):
         return None
     parameter = posterior.prior.free[physical[worst]]
     until = begin + posterior.actuator.interval * first

@@ -74,11 +74,14 @@ class Background:
         Sd of the logarithm of the noise's sd over the draws: how well its size is known.
     fitted
         Lowest and highest voltage that was fitted, V.
+    extent
+        Range of all readings that were fitted, um, whatever their windows.
     """
 
     memory: float = 0.0
     unsure: float = 0.0
     fitted: tuple[float, float] = (-np.inf, np.inf)
+    extent: float = 0.0
 
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
@@ -92,7 +95,12 @@ class Background:
         sds = posterior.noise.marginal_sd(theta[:, len(actuator) :])
         sizes = np.log(np.sqrt(sum(sd**2 for sd in sds)))
         voltage = np.concatenate([posterior.voltage[window] for window in posterior.training])
-        return cls(memory, float(np.std(sizes)), (float(voltage.min()), float(voltage.max())))
+        return cls(
+            memory,
+            float(np.std(sizes)),
+            (float(voltage.min()), float(voltage.max())),
+            float(np.ptp(posterior.readings.values)),
+        )
 
 
 @dataclass(frozen=True)
@@ -195,7 +203,7 @@ def assess(
         *_size(standard),
         *_leaning(bands, judged, standard),
         *_locally(bands, judged, standard),
-        *(_missed(bands, judged) if bands.training else []),
+        *(_missed(bands, judged, background.extent) if bands.training else []),
         *residuals.isolated,
     ]
     wide = _too_wide(standard)
@@ -320,11 +328,14 @@ def _leaning(bands: Bands, judged: BoolArray, standard: _Standard) -> list[str]:
     return [f"the readings lie {residual:+.3g} um off the mean, {abs(mean):.2g} sds of {sd:.2g} um"]
 
 
-def _missed(bands: Bands, judged: BoolArray) -> list[str]:
-    """Say whether a fit misses its own readings by more than a sensor's noise would."""
+def _missed(bands: Bands, judged: BoolArray, extent: float) -> list[str]:
+    """Say whether a fit misses its own readings by more than a sensor's noise would.
+
+    Against the range ``extent`` of all that was fitted, um: that of a short window may be small.
+    """
     assert bands.measured is not None
     reading = bands.measured[judged]
-    extent = float(np.ptp(reading))
+    extent = max(extent, float(np.ptp(reading)))
     residual = (bands.measured - bands.mean)[judged]
     steps = np.diff(residual)
     fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0

@@ -14,6 +14,7 @@ from bwbayes.app.check import check
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.run import assemble, finished
 from bwbayes.app.screen import show_priors
+from bwbayes.data.inspection import Finding
 from bwbayes.inference.distributions import Distribution
 from tests.app import small
 
@@ -45,6 +46,24 @@ def test_run_says_it_too(tmp_path_factory: pytest.TempPathFactory) -> None:
     odd = replace(problem, defaults={**problem.defaults, "d": nanometres})
     (remark,) = assemble(odd, chain, outcome).remarks
     assert "is it in another unit?" in remark
+
+
+def test_a_transient_in_sight_counts(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second fit without the record's start needs less evidence where a transient is seen."""
+    problem, chain, outcome = finished(RunFolder(small.finished(tmp_path_factory)))
+    counted = []
+
+    def told(*_: object, seen: bool) -> None:
+        counted.append(seen)
+
+    monkeypatch.setattr("bwbayes.app.run.without_start", told)
+    transient = Finding("switch-on transient", 0.0, 1.0, "it starts off", "leave it out")
+    drift = replace(transient, kind="drift")
+    for findings in ((), (drift,), (drift, transient)):
+        assemble(replace(problem, findings=findings), chain, outcome)
+    assert [False, False, True] == counted
 
 
 def test_priors_are_shown_as_the_constraints_leave_them(

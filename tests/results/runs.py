@@ -6,6 +6,7 @@ posterior and chosen again by their weights: a run in two seconds. All else is t
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,20 +15,37 @@ import numpy as np
 from scipy.signal import lfilter
 
 from bwbayes.app.config import parse
-from bwbayes.app.problem import Problem, resolve
-from bwbayes.app.run import judged
+from bwbayes.app.problem import Problem, generator, resolve
+from bwbayes.app.run import assemble, judged, versions
+from bwbayes.app.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.inference import pointfit
+from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.sampling import first_chain, sample
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import innovations
 from bwbayes.results.prediction import predict_record, predict_windows
 from bwbayes.results.refit import without_start
+from bwbayes.results.result import Result
 from bwbayes.results.verdict import Background, Verdict
 
-__all__ = ["Judged", "Stand", "covered", "judge", "noise", "posterior_draws", "problem_of"]
+__all__ = [
+    "CONVERGED",
+    "Judged",
+    "Stand",
+    "covered",
+    "judge",
+    "noise",
+    "posterior_draws",
+    "problem_of",
+    "run",
+]
+
+# What is enough for a test.
+CONVERGED = "\n[sampling]\ness = 400\n"
 
 # Draws of the approximation, and those of them that stay.
 DRAWS, KEPT = 600, 250
@@ -94,43 +112,64 @@ def problem_of(text: str, folder: Path) -> Problem:
     return resolve(parse(text, "config"), folder)
 
 
-def posterior_draws(posterior: Posterior, generator: np.random.Generator) -> FloatArray:
+def posterior_draws(posterior: Posterior, source: np.random.Generator) -> FloatArray:
     """Fit, and draw (draws, free) in the parameters' own units."""
-    point = pointfit.fit(posterior, generator)
-    places = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    point = pointfit.fit(posterior, source)
+    places = source.multivariate_normal(point.mode, point.covariance, size=DRAWS)
     density = posterior.log_density(places)
     away = places - point.mode
     gaussian = -0.5 * np.einsum("ij,ij->i", away, np.linalg.solve(point.covariance, away.T).T)
     ratio = np.where(np.isfinite(density), density - gaussian, -np.inf)
+    if not np.isfinite(ratio).any():
+        # A fit at the edge of what is possible, as a reversed record's: the point itself.
+        free, _ = posterior.prior.constrain(np.tile(point.mode, (KEPT, 1)))
+        return free
     weight = np.exp(np.clip(ratio - np.max(ratio), -30, 0)) * np.isfinite(density)
     weight = np.minimum(weight, HEAVIEST * np.mean(weight))
-    chosen = generator.choice(DRAWS, KEPT, p=weight / np.sum(weight))
+    chosen = source.choice(DRAWS, KEPT, p=weight / np.sum(weight))
     free, _ = posterior.prior.constrain(places[chosen])
     return free
 
 
-def judge(problem: Problem, generator: np.random.Generator, *, again: bool = True) -> Judged:
+def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) -> Judged:
     """Fit, predict all that the config names, and judge it.
 
     Without a second fit (``again``) only the verdict on the training window is another one.
     """
     posterior, record = problem.posterior, problem.record
-    draws = posterior_draws(posterior, generator)
+    draws = posterior_draws(posterior, source)
     windows = {"training": posterior.training[0]}
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    bands = predict_windows(posterior, draws, record, windows, generator)
+    bands = predict_windows(posterior, draws, record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:
             bands.append(
                 predict_record(
-                    posterior, draws, other.record, other.start, generator, name, other.judged
+                    posterior, draws, other.record, other.start, source, name, other.judged
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     odd = innovations(posterior, best, record.start)
-    moved = without_start(posterior, draws, generator, record.start) if again else None
+    seen = any(one.kind == "switch-on transient" for one in problem.findings)
+    moved = without_start(posterior, draws, source, record.start, seen=seen) if again else None
     verdicts = judged(problem, bands, Background.of(posterior, draws), odd, moved)
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
+
+
+def run(text: str, folder: Path) -> tuple[Problem, Result]:
+    """Do what a run does, but for its files."""
+    problem = problem_of(text + CONVERGED, folder)
+    posterior, seed = problem.posterior, problem.config.seed
+    with one_thread(), executor(1, posterior.engine) as pool:
+        point = pointfit.fit(posterior, generator(seed, "point fit"))
+        first = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
+        noted = {"versions": json.dumps(versions(posterior.engine))}
+        path = folder / "chain.h5"
+        with ChainFile.create(path, first, point, problem.plan.block, noted) as chain:
+            outcome = sample(posterior, problem.plan, chain, pool)
+            result = assemble(problem, chain, outcome)
+    assert outcome.converged, outcome.stop_reason
+    return problem, result
 
 
 def covered(bands: Bands, level: int = 95) -> float:

@@ -218,6 +218,16 @@ def test_other_readings_are_missing_where_they_are() -> None:
     assert [199] == np.flatnonzero(np.isnan(made.displacement)).tolist()
 
 
+def test_another_record_is_judged_after_its_lead_in() -> None:
+    posterior, theta = moving_posterior()
+    generator = np.random.default_rng(1)
+    made = another().simulated(posterior, theta, generator).record
+    free = posterior.prior.constrain(posterior.prior.draw(generator, 20))[0]
+    for window, judged in ((None, slice(20, 200)), ((0.5, 0.9), slice(100, 180))):
+        other = another(window=window)
+        assert judged == other.predicted(posterior, free, made, generator)[1]
+
+
 def test_a_planned_voltage_is_predicted_without_its_readings() -> None:
     """So no lead-in is taken from them, and all samples are judged."""
     posterior, theta = moving_posterior()

@@ -112,6 +112,24 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
     assert causes.count(kind) >= 45  # type: ignore[arg-type]
 
 
+def test_readings_that_go_the_other_way_do_not_hold_even_if_a_strange_fit_follows() -> None:
+    """The mean is turned with the readings; the twins are driven too little, or one way alone."""
+    record = made(np.random.default_rng(3), length=20)
+    turned = replace(record, mean=-record.mean)
+    for one, fitted, holds in (
+        (record, FITTED, True),
+        (turned, FITTED, False),
+        (turned, (-1e5, 1e5), True),
+    ):
+        verdict = assess(bands_of(one, training=True), Background(record.memory, 0.0, fitted))
+        assert verdict is not None
+        assert verdict.holds is holds
+        if holds is False:
+            assert verdict.cause is not None
+            assert "sign" == verdict.cause.kind
+            assert "the readings fall where the voltage rises" in verdict.reasons[0]
+
+
 def test_a_lean_that_the_memory_does_not_excuse_is_a_reason() -> None:
     """Off by 0.7 sds: a minute of readings shows it, and a fifth of a memory cannot."""
     for memory, told in ((0.1, True), (300.0, False)):
@@ -190,3 +208,14 @@ def test_a_sensor_that_is_noisier_than_the_drive_moves_is_no_misfit() -> None:
     verdict = assess(bands_of(record, training=True), Background(record.memory, 0.0, FITTED))
     assert verdict is not None
     assert verdict.holds is True
+
+
+def test_a_short_training_window_is_judged_by_the_range_of_all_of_them() -> None:
+    """What would be much for the window's own range is little for that of the whole fit."""
+    record = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
+    alone = Background(record.memory, 0.0, FITTED)
+    for extent, holds in ((0.0, False), (1000.0, True)):
+        background = replace(alone, extent=extent)
+        verdict = assess(bands_of(record, training=True), background)
+        assert verdict is not None
+        assert verdict.holds is holds

@@ -90,7 +90,8 @@ def spoil(
     return record, other
 
 
-# Which verdict a spoilt record spoils, and the causes that are right.
+# Which verdict a spoilt record spoils, and the causes that are right. The other record's drive may
+# be the faster one: then that it is an extrapolation is as true as its other gain.
 SPOILT_KINDS = {
     "transient": ("training", {"start"}),
     "sign": ("training", {"sign"}),
@@ -99,7 +100,7 @@ SPOILT_KINDS = {
     "gain": ("held", {"gain"}),
     "offset": ("held", {"offset", "drift"}),
     "other sign": ("other", {"sign"}),
-    "other actuator": ("other", {"gain", "lead-in"}),
+    "other actuator": ("other", {"gain", "lead-in", "extrapolation"}),
     "other transient": ("other", {"lead-in", "offset", "start"}),
 }
 
@@ -180,12 +181,21 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
     return counts
 
 
-def test_a_good_run_holds_and_a_spoilt_one_does_not(tmp_path: Path) -> None:
-    """The study in small: two runs of each sort."""
-    _, lines = good_runs(1, 2, tmp_path)
-    assert not lines
-    for kind in ("sign", "other actuator"):
-        assert 2 == spoilt_runs(kind, 2, 2, tmp_path)["right cause"]
+@pytest.mark.parametrize(("seed", "kind"), [((2, 1), "sign"), ((20261122, 4), "transient")])
+def test_a_good_run_holds_and_a_spoilt_one_does_not(
+    tmp_path: Path, seed: tuple[int, int], kind: str
+) -> None:
+    """Two of the hardest: both were called good before.
+
+    A lag of four seconds and a gain beyond all reason follow this reversed record to 4 % of its
+    range. This transient makes d 0.87 +- 0.02, and a second fit by itself is not sure enough.
+    """
+    assert all(one.holds is not False for one in run(seed, tmp_path).verdicts.values())
+    where, causes = SPOILT_KINDS[kind]
+    verdict = run(seed, tmp_path, kind).verdicts[where]
+    assert verdict.holds is False
+    assert verdict.cause is not None
+    assert verdict.cause.kind in causes
 
 
 @pytest.mark.slow

@@ -1,0 +1,144 @@
+"""Readings that are missing or spoilt: the answer is that of the readings that are good.
+
+Missing readings are left out of the likelihood exactly, so the density of a posterior's draws is
+that of a dense Gaussian to rounding: nothing is left to Monte Carlo. Spikes are set aside, and the
+bands are as wide as without them; the twin leaves them in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.data import Record, write_record
+from bwbayes.results.bands import Bands
+from tests.found import keep
+from tests.inference.test_likelihood import dense
+from tests.results.runs import Judged, Stand, judge, problem_of, run
+
+RATE = 100.0
+STAND = Stand(lag=0.02, discrepancy=0.5, sensor=0.2)
+TRUTH = {"d": 0.7, "alpha": 0.357, "beta": 0.0272, "gamma": 0.0172, "lag": 0.02, "offset": 2.0}
+TRUTH |= {"sensor_sd": 0.2, "discrepancy_sd": 0.5, "discrepancy_time": 0.3}
+
+RECORDS = 30
+
+
+def measured(seed: int, seconds: float = 16.0) -> Record:
+    """Return a record of a decaying sine that was cut out in motion."""
+    time = np.arange(round((seconds + 1.1) * RATE)) / RATE
+    voltage = 100 * np.sin(2 * np.pi * time) * (1 - 0.5 * time / time[-1])
+    return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)
+
+
+@pytest.mark.parametrize("what", ["a tenth", "a second"])
+def test_missing_readings_leave_the_posterior_of_the_dense_gaussian(
+    tmp_path: Path, what: str
+) -> None:
+    """Draws of a whole run, from a file with empty cells; the dense density differs by 1e-6."""
+    record = measured(1, 12.0)
+    lost = np.zeros(record.samples, dtype=bool)
+    if what == "a tenth":
+        lost[np.random.default_rng(2).choice(record.samples, record.samples // 10, False)] = True
+    else:
+        lost[500:600] = True
+    write_record(record.without(lost), tmp_path / "record.csv")
+    problem, result = run('[record]\nfile = "record.csv"\n', tmp_path)
+    posterior, log_density = problem.posterior, result.log_density.ravel()
+    assert posterior.readings.rows.size == record.samples - np.sum(lost)
+    chosen = np.random.default_rng(3).choice(log_density.size, 25, replace=False)
+    theta = posterior.prior.theta(result.flat_draws[chosen])
+    z = posterior.prior.unconstrain(result.flat_draws[chosen])
+    likelihoods = np.array([dense(posterior.likelihood, one)[0] for one in theta])
+    expected = posterior.prior.constrain(z)[1] + likelihoods
+    np.testing.assert_allclose(expected, log_density[chosen], 0, 1e-6)
+    assert result.verdicts["training"].holds is not False
+    columns = dict(zip(posterior.names, result.flat_draws.T, strict=True))
+    for name in ("d", "gamma", "lag", "offset"):
+        assert abs(np.mean(columns[name]) - TRUTH[name]) < 4 * np.std(columns[name])
+
+
+def spiky(record: Record, seed: int, last: float = 12.0) -> tuple[Record, list[int]]:
+    """Add ten spikes of 20 um before the time ``last``; return their samples too."""
+    assert record.displacement is not None
+    source = np.random.default_rng([22, seed])
+    rows = np.sort(source.choice(round(last * RATE), 10, replace=False))
+    displacement = record.displacement.copy()
+    displacement[rows] += 20 * source.choice([-1, 1], 10)
+    return replace(record, displacement=displacement), rows.tolist()
+
+
+def told(record: Record, folder: Path, model: str = "") -> Judged:
+    """Fit the first 12 s and predict the rest."""
+    write_record(record, folder / "record.h5")
+    text = '[record]\nfile = "record.h5"\ntrain = [[0.0, 12.0]]\n[validation.rest]\n'
+    text += f"window = [12.0, 16.0]\n{model}"
+    return judge(problem_of(text, folder), np.random.default_rng(4), again=False)
+
+
+def width(bands: Bands) -> float:
+    return float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+
+
+ASIDE = "[model]\noutliers = true\n"
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: int) -> None:
+    record, rows = spiky(measured(seed), seed)
+    clean, aside, left_in = (
+        told(measured(seed), tmp_path),
+        told(record, tmp_path, ASIDE),
+        told(record, tmp_path),
+    )
+    assert rows == np.flatnonzero(np.isnan(aside.problem.posterior.displacement)).tolist()
+    (remark,) = (line for line in aside.problem.remarks if "set aside" in line)
+    assert remark.startswith("10 readings set aside as isolated outliers, at ")
+    assert width(aside.bands["rest"]) == pytest.approx(width(clean.bands["rest"]), rel=0.1)
+    assert aside.verdicts["training"].holds is not False
+    # The twin: left in, they widen the bands, and the verdict says why.
+    assert width(left_in.bands["rest"]) > 1.5 * width(clean.bands["rest"])
+    verdict = left_in.verdicts["training"]
+    assert verdict.holds is False
+    assert verdict.cause is not None
+    assert "outliers" == verdict.cause.kind
+
+
+@pytest.mark.slow
+def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
+    """Of 30 records; of intervals that cover 95 %, fewer than 25 do so once in 10,000.
+
+    All spikes are found, no good reading is set aside, widths are within a tenth.
+    """
+    inside = {level: dict.fromkeys(TRUTH, 0) for level in (50, 95)}
+    ratios, found, false = [], 0, 0
+    for seed in range(100, 100 + RECORDS):
+        record, rows = spiky(measured(seed), seed)
+        clean, aside = told(measured(seed), tmp_path), told(record, tmp_path, ASIDE)
+        gone = set(np.flatnonzero(np.isnan(aside.problem.posterior.displacement)).tolist())
+        found, false = found + len(gone & set(rows)), false + len(gone - set(rows))
+        ratios.append(width(aside.bands["rest"]) / width(clean.bands["rest"]))
+        for name, value in TRUTH.items():
+            below = np.mean(aside.column(name) < value)
+            for level, counts in inside.items():
+                counts[name] += bool(abs(below - 0.5) < level / 200)
+    keep(
+        "spikes set aside",
+        {
+            "records": RECORDS,
+            "spikes": 10 * RECORDS,
+            "found": found,
+            "good readings set aside": false,
+            "width over clean, least and most": [min(ratios), max(ratios)],
+            "covered 50": inside[50],
+            "covered 95": inside[95],
+        },
+    )
+    assert 10 * RECORDS == found
+    assert 0 == false
+    assert 0.9 < min(ratios)
+    assert max(ratios) < 1.1
+    assert min(inside[95].values()) >= 25, inside
