@@ -12,7 +12,7 @@ missing. Its log density is theirs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -183,7 +183,7 @@ class DiscrepancyNoise:
 
     def at(self, interval: float) -> DiscrepancyNoise:
         """Return the same noise for readings ``interval`` seconds apart."""
-        return DiscrepancyNoise(interval)
+        return replace(self, interval=interval)
 
     def steady_state(self, theta: FloatArray) -> SteadyState:
         """Return the filter without cancellation at either extreme."""

@@ -268,10 +268,10 @@ def test_check_says_what_is_wrong_and_what_to_do(bwbayes: Type, tmp_path: Path) 
     (tmp_path / "a.toml").write_text('[record]\nfile = "a.h5"\n')
     said = bwbayes("check", "a.toml", "--out", "page")
     assert 0 == said.status
-    assert "spikes: 1 isolated outliers" in said.out
+    assert "spikes: 1 isolated outlier" in said.out
     assert "what to do: outliers = true under [model]" in said.out
     page = (tmp_path / "page" / "check.html").read_text()
-    assert "<b>spikes</b>: 1 isolated outliers" in page
+    assert "<b>spikes</b>: 1 isolated outlier " in page
     assert page.count("data:image/png;base64,") == 3
     assert {"time.png", "loop.png", "drive.png"} == {
         path.name for path in (tmp_path / "page" / "figures").iterdir()
