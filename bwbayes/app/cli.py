@@ -372,7 +372,7 @@ def _one_line(message: Warning | str, *_: object, **__: object) -> str:
 
 
 def main() -> None:
-    """Run the command line; every mendable error becomes one line and exit status 2."""
+    """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, _terminate)
     warnings.formatwarning = _one_line
@@ -385,7 +385,7 @@ def main() -> None:
     except OSError as error:
         # A full disk, a folder that went away: what is on disk already stays whole.
         where = f"{error.filename}: " if error.filename else ""
-        click.echo(f"bwbayes: {where}{error.strerror or error}; mend it and resume", err=True)
+        click.echo(f"bwbayes: {where}{error.strerror or error}; fix it and resume", err=True)
         status = BAD_INPUT
     except BrokenExecutor:
         click.echo("bwbayes: a worker process was ended; mind the memory, and resume", err=True)
