@@ -158,8 +158,9 @@ def hysteresis(
 
 def _follow(path: FloatArray, flow: Flow, initial: FloatArray) -> FloatArray:
     """Chain the stretches of a voltage path (samples,) to h (models, samples)."""
-    h = np.empty((initial.size, path.size))
-    h[:, 0] = initial
+    h = np.repeat(initial[:, np.newaxis], path.size, axis=1)
+    if np.ptp(path) == 0:
+        return h  # no direction to go in, so not even the rounding of a start on the ceiling
     for first, last, direction in monotone_stretches(path, max(PIECE // initial.size, 1)):
         travel = direction * (path[first + 1 : last + 1] - path[first])
         g = flow.advance(direction * h[:, first], travel)

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -70,6 +70,7 @@ def refined(path: list[float], pieces: list[int]) -> tuple[FloatArray, list[int]
 
 @few
 @given(parameters=any_model, share=inside, path=corners)
+@example(parameters=of(1.0, -1.0, 1.0, 1.0), share=1.0, path=[0.0, 0.0])
 def test_the_mirrored_drive_and_start_give_mirrored_h(
     engine: Engine, parameters: Model, share: float, path: list[float]
 ) -> None:
