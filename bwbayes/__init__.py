@@ -82,7 +82,6 @@ if TYPE_CHECKING:
     from bwbayes.data.waveforms import Waveform, signal
     from bwbayes.errors import InputError, InputWarning
     from bwbayes.inference.chain import Chain
-    from bwbayes.inference.distributions import Distribution
     from bwbayes.inference.noise import noise_model
     from bwbayes.inference.parameters import JointPrior, Parameter
     from bwbayes.inference.pointfit import PointFit
@@ -91,6 +90,7 @@ if TYPE_CHECKING:
     from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
     from bwbayes.model.actuator import Actuator
     from bwbayes.model.boucwen import hysteresis
+    from bwbayes.model.distributions import Distribution
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
     from bwbayes.results.prediction import thinned
@@ -107,7 +107,7 @@ else:
         "Calibration": "results.calibration",
         "Chain": "inference.chain",
         "Config": "app.config",
-        "Distribution": "inference.distributions",
+        "Distribution": "model.distributions",
         "Experiment": "results.replicates",
         "Finding": "data.inspection",
         "InputError": "errors",

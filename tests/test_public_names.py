@@ -24,7 +24,7 @@ PUBLIC = {
     "bwbayes.data.waveforms": {"Waveform", "signal"},
     "bwbayes.errors": {"InputError", "InputWarning"},
     "bwbayes.inference.chain": {"Chain"},
-    "bwbayes.inference.distributions": {"Distribution"},
+    "bwbayes.model.distributions": {"Distribution"},
     "bwbayes.inference.noise": {"noise_model"},
     "bwbayes.inference.parameters": {"JointPrior", "Parameter"},
     "bwbayes.inference.pointfit": {"PointFit", "fit as point_fit"},

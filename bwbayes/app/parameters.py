@@ -15,8 +15,8 @@ from bwbayes.app.config import Config, ParameterConfig
 from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import Parameter
+from bwbayes.model.distributions import Distribution
 
 __all__ = ["as_config", "defaults_of", "parameters_of"]
 

@@ -28,7 +28,6 @@ from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
@@ -36,6 +35,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
 

@@ -17,9 +17,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import POSITIVE, JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
+from bwbayes.model.distributions import Distribution
 
 __all__ = ["around", "conflicts", "effective"]
 

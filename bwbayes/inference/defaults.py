@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.distributions import Distribution
-from bwbayes.inference.drive import time_between_turns
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.drive import time_between_turns
 
 __all__ = ["CATALOGUE", "Defaults", "Meaning", "Ranges", "default_prior"]
 

@@ -17,12 +17,11 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.diagnostics import pareto_k
-from bwbayes.inference.drive import turning_points
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import POSITIVE, JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.boucwen import monotone_stretches
+from bwbayes.model.drive import monotone_stretches, turning_points
 
 __all__ = ["Sway", "remarks", "spectrum", "sway", "undetermined"]
 

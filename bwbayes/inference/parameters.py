@@ -21,8 +21,8 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.distributions import Distribution
 from bwbayes.model.boucwen import ceiling
+from bwbayes.model.distributions import Distribution
 
 __all__ = ["COORDINATES", "FLOORS", "POSITIVE", "JointPrior", "Parameter", "passive_remark"]
 

@@ -12,16 +12,16 @@ models at once. The only loop runs over turning points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
+from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.exponent import ExponentFlow
 
-__all__ = ["Stretch", "ceiling", "hysteresis", "monotone_stretches"]
+__all__ = ["ceiling", "hysteresis"]
 
 # Elements (models x samples) that one array expression handles: small enough for the cache.
 PIECE = 65_536
@@ -37,45 +37,11 @@ INSIDE = 1 - 1e-14
 CEILING_SLACK = 1 + 1e-9
 
 
-class Stretch(NamedTuple):
-    """Samples ``first`` to ``last`` (both included), along which the voltage goes one way."""
-
-    first: int
-    last: int
-    direction: float
-
-
 class Flow(Protocol):
     """How g = s h evolves along a stretch with direction s."""
 
     def advance(self, start: FloatArray, travel: FloatArray) -> FloatArray:
         """Return g (models, points) after each ``travel`` (points,) from ``start`` (models,)."""
-
-
-def monotone_stretches(voltage: FloatArray, longest: int | None = None) -> Iterator[Stretch]:
-    """Cut a voltage (samples,) where it turns; each stretch starts at the last one's end.
-
-    A plateau belongs to the stretch that leads to it. ``longest`` also cuts stretches of more
-    samples than that, which changes nothing: the state at the cut carries over.
-    """
-    steps = np.sign(np.diff(voltage))
-    moving = np.flatnonzero(steps)
-    if moving.size == 0:
-        yield from _cut(Stretch(0, voltage.size - 1, 1.0), longest)
-        return
-    turns = moving[1:][steps[moving[1:]] != steps[moving[:-1]]]
-    first = 0
-    for turn in (*turns.tolist(), voltage.size - 1):
-        # The voltage turns at sample `turn`: the step from there on goes the other way.
-        direction = float(steps[moving[np.searchsorted(moving, first)]])
-        yield from _cut(Stretch(first, turn, direction), longest)
-        first = turn
-
-
-def _cut(stretch: Stretch, longest: int | None) -> Iterator[Stretch]:
-    size = longest or max(stretch.last - stretch.first, 1)
-    for first in range(stretch.first, stretch.last, size):
-        yield Stretch(first, min(first + size, stretch.last), stretch.direction)
 
 
 def ceiling(

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.drive import fastest, time_between_turns
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.drive import fastest, time_between_turns
 
 __all__ = ["beyond_training"]
 

@@ -7,9 +7,9 @@ from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.diagnostics import Check
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
+from bwbayes.model.distributions import Distribution
 from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores

@@ -15,7 +15,7 @@ from bwbayes.app.folder import RunFolder
 from bwbayes.app.run import assemble, finished
 from bwbayes.app.screen import show_priors
 from bwbayes.data.inspection import Finding
-from bwbayes.inference.distributions import Distribution
+from bwbayes.model.distributions import Distribution
 from tests.app import small
 
 

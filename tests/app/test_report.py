@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 
 from bwbayes.app.report import digits, render, symbol
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import Parameter
+from bwbayes.model.distributions import Distribution
 from bwbayes.results.result import Result, summary
 from tests.app import example
 

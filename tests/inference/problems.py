@@ -22,7 +22,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.ensemble import advance, start
 from bwbayes.inference.noise import NoiseKind, noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
@@ -30,6 +29,7 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentProposal
 from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
 
 __all__ = [

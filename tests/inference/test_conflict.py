@@ -14,10 +14,10 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.conflict import around, conflicts, effective
 from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import INTERVAL, joint_prior, short_posterior
 
 RANGES = Ranges(voltage=100.0, displacement=60.0, middle=0.0, time=0.5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bwbayes.inference.defaults import Ranges, default_prior
-from bwbayes.inference.distributions import Distribution
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import INTERVAL, decaying_sine
 
 # Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 
 NAMES = tuple(name for name in CATALOGUE if name not in ("mass", "stiffness", "exponent"))
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")

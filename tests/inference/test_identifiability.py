@@ -16,10 +16,10 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Sine, Waveform, identification_signal, verification_signal
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.identifiability import spectrum, undetermined
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import TRUE_NOISE, posterior_of_record, short_posterior, truth
 
 FIXED = {"mass": 0.00134, "stiffness": 4.1e5, "initial": 0.0}

@@ -13,9 +13,9 @@ from scipy.special import logsumexp
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.defaults import CATALOGUE, Ranges
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.parameters import JointPrior, Parameter, passive_remark
 from bwbayes.model.boucwen import ceiling
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")

@@ -10,11 +10,11 @@ from scipy.stats import chi2
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator, State
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import posterior_of, short_posterior, truth
 
 CASES = ("white", "discrepancy", "lag")

@@ -12,9 +12,9 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.conflict import around
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.pointfit import fit
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import decaying_sine, posterior_of, ring_bender
 
 INTERVAL = 2e-3

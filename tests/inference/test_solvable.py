@@ -29,11 +29,11 @@ from scipy import linalg, stats
 from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan, draws, first_chain, sample
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import (
     INTERVAL,
     TRUE_LAG,

@@ -14,11 +14,11 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.data.waveforms import identification_signal
 from bwbayes.inference.conflict import around
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.identifiability import remarks, sway
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.distributions import Distribution
 from tests.inference.problems import decaying_sine, posterior_of, ring_bender, short_posterior
 from tests.inference.test_identifiability import at_truth, measured, sine
 

@@ -14,7 +14,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.waveforms import identification_signal, verification_signal
 from bwbayes.errors import InputError
 from bwbayes.model import boucwen
-from bwbayes.model.boucwen import ceiling, hysteresis, monotone_stretches
+from bwbayes.model.boucwen import ceiling, hysteresis
+from bwbayes.model.drive import monotone_stretches
 from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
 
 ALPHA = 0.3575

@@ -11,13 +11,13 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from bwbayes.results import prediction
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned

@@ -14,10 +14,10 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
-from bwbayes.inference.distributions import Distribution
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from bwbayes.results import replicates as module
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import Start

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from bwbayes.errors import InputError
-from bwbayes.inference.distributions import Distribution
+from bwbayes.model.distributions import Distribution
 
 FAMILIAR: list[tuple[Distribution, Any]] = [
     (Distribution("normal", {"mean": 1.0, "sd": 2.0}), stats.norm(1, 2)),

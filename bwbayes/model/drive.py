@@ -1,4 +1,4 @@
-"""A drive's own times and speeds, whatever the sampling rate.
+"""A drive's own turns, times and speeds, whatever the sampling rate.
 
 The voltage alone decides: a record and its every k-th sample have the same turning points, and
 noise on a measured voltage makes none, because a turn counts only where the voltage comes back by a
@@ -7,18 +7,59 @@ part of its range.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.model.boucwen import monotone_stretches
 
-__all__ = ["fastest", "stretch_times", "time_between_turns", "turning_points"]
+__all__ = [
+    "Stretch",
+    "fastest",
+    "monotone_stretches",
+    "stretch_times",
+    "time_between_turns",
+    "turning_points",
+]
 
 # Part of the range by which the voltage must come back for a turn to count. A sensor's noise and a
 # DAC's steps are well below it; the smallest loops of a decaying drive do not matter for a scale.
 RETURN = 0.05
+
+
+class Stretch(NamedTuple):
+    """Samples ``first`` to ``last`` (both included), along which the voltage goes one way."""
+
+    first: int
+    last: int
+    direction: float
+
+
+def monotone_stretches(voltage: FloatArray, longest: int | None = None) -> Iterator[Stretch]:
+    """Cut a voltage (samples,) where it turns; each stretch starts at the last one's end.
+
+    A plateau belongs to the stretch that leads to it. ``longest`` also cuts stretches of more
+    samples than that, which changes nothing: the state at the cut carries over.
+    """
+    steps = np.sign(np.diff(voltage))
+    moving = np.flatnonzero(steps)
+    if moving.size == 0:
+        yield from _cut(Stretch(0, voltage.size - 1, 1.0), longest)
+        return
+    turns = moving[1:][steps[moving[1:]] != steps[moving[:-1]]]
+    first = 0
+    for turn in (*turns.tolist(), voltage.size - 1):
+        # The voltage turns at sample `turn`: the step from there on goes the other way.
+        direction = float(steps[moving[np.searchsorted(moving, first)]])
+        yield from _cut(Stretch(first, turn, direction), longest)
+        first = turn
+
+
+def _cut(stretch: Stretch, longest: int | None) -> Iterator[Stretch]:
+    size = longest or max(stretch.last - stretch.first, 1)
+    for first in range(stretch.first, stretch.last, size):
+        yield Stretch(first, min(first + size, stretch.last), stretch.direction)
 
 
 def turning_points(voltage: FloatArray, least: float | None = None) -> IntArray:

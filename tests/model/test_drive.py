@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.drive import fastest, stretch_times, time_between_turns, turning_points
+from bwbayes.model.drive import fastest, stretch_times, time_between_turns, turning_points
 
 INTERVAL = 1e-3
 

@@ -1,0 +1,154 @@
+"""How a part of a model declares its parameters: once, with all that anybody asks of them.
+
+A :class:`Declaration` is a parameter before anything is measured: what it is called, in which unit,
+where it may lie, what is known of it beforehand. A part (a hysteresis operator, a filter, a noise)
+lists its own; nobody else keeps names, units, bounds or default priors.
+
+A default prior may know what a :class:`Context` holds: the ranges of a record, and what the config
+states of other parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.model.distributions import Distribution
+
+__all__ = [
+    "Context",
+    "Declaration",
+    "Ranges",
+    "Scope",
+    "Values",
+    "lognormal",
+    "normal",
+    "rounded",
+]
+
+Values = Mapping[str, FloatArray]
+"""Columns (models,) of parameters by name."""
+
+Scope = Literal["actuator", "record"]
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """All that a default prior may know of a record.
+
+    ``voltage`` is U, half the range of the voltage, V; ``displacement`` is Y, um; ``middle`` the
+    middle of the displacement's range, um; ``time`` is T, the typical time between turning points
+    of the drive, s; ``bias`` the middle of the voltage's range, V; ``interval`` between samples and
+    ``duration`` of the record, s.
+    """
+
+    voltage: float
+    displacement: float
+    middle: float
+    time: float
+    bias: float = 0.0
+    interval: float = 0.0
+    duration: float = 0.0
+
+    @property
+    def gain(self) -> float:
+        """Y/U, um/V."""
+        return self.displacement / self.voltage
+
+    @property
+    def reach(self) -> float:
+        """What the voltage's distance from zero may add to offset and hysteresis, um."""
+        return self.displacement + self.gain * abs(self.bias)
+
+
+@dataclass(frozen=True)
+class Context:
+    """What default priors may know: ranges, and what is ``stated`` of parameters by name."""
+
+    ranges: Ranges
+    stated: Mapping[str, float | Distribution] = field(default_factory=dict)
+
+    def value(self, name: str) -> float | None:
+        """Return the value at which a parameter is fixed, or None."""
+        stated = self.stated.get(name)
+        return None if isinstance(stated, Distribution) else stated
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """A parameter as its part declares it.
+
+    Parameters
+    ----------
+    name, unit, label, description
+        What people call it; ``label`` is LaTeX without the dollar signs.
+    default
+        Its default prior, or the value at which it is fixed unless a config frees it; None if it
+        has no default.
+    floor
+        No parameter may be lower; it lies above unless ``reaches_floor``. A positive parameter has
+        a floor of zero.
+    bounds
+        Lower and upper bound (models,) given other parameters: those that come before it, and those
+        that are fixed (so a name may be missing). Infinite where there is none.
+    stated_bounds
+        The bounds in words, for messages: ``|gamma| <= beta``.
+    pressed
+        What to say where the posterior presses against the lower or upper of these bounds.
+    scope
+        Whether it belongs to the actuator, or to one record alone (its start, its offset).
+    loop
+        Whether it shapes the loop.
+    aliases
+        Other names that people give it.
+    unit_given
+        The unit, where it depends on what is stated of other parameters.
+    """
+
+    name: str
+    unit: str
+    label: str
+    description: str
+    default: Callable[[Context], Distribution | float | None]
+    floor: float = -math.inf
+    reaches_floor: bool = False
+    bounds: Callable[[Values], tuple[ArrayLike, ArrayLike]] | None = None
+    stated_bounds: str = ""
+    pressed: Mapping[Literal["lower", "upper"], str] = field(default_factory=dict)
+    scope: Scope = "actuator"
+    loop: bool = False
+    aliases: tuple[str, ...] = ()
+    unit_given: Callable[[Context], str] | None = None
+
+    @property
+    def positive(self) -> bool:
+        """Whether it lies above zero."""
+        return self.floor == 0 and not self.reaches_floor
+
+    def unit_in(self, context: Context) -> str:
+        """Return its unit, given what is stated of other parameters."""
+        return self.unit if self.unit_given is None else self.unit_given(context)
+
+
+def lognormal(median: float, sigma: float) -> Distribution:
+    """Return a lognormal prior with rounded arguments."""
+    return Distribution("lognormal", {"median": rounded(median), "sigma": rounded(sigma)})
+
+
+def normal(mean: float, sd: float) -> Distribution:
+    """Return a normal prior with rounded arguments; the mean need not be more exact than the sd."""
+    return Distribution("normal", {"mean": rounded(mean, sd), "sd": rounded(sd)})
+
+
+def rounded(value: float, scale: float | None = None) -> float:
+    """Keep three digits of the value, or of another ``scale`` that it need not be more exact than.
+
+    A default prior is not more exact than that, and people read it.
+    """
+    size = abs(value if scale is None else scale)
+    if not size > 0:
+        return value
+    return round(value, 2 - math.floor(math.log10(size)))

@@ -1,0 +1,66 @@
+"""What a hysteresis operator is: voltage in, displacement out, with a memory of the voltage's path.
+
+An operator is rate-independent: only the path of the voltage counts, not its pace. It works for a
+batch of models at once, whose parameters come as columns by name, and for a record in pieces, with
+its memory carried from one piece to the next. What was before a record is one number in each of
+them, ``initial``: a state that an earlier drive within a ``span`` of voltages could have left.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.model.declaration import Declaration, Values
+
+__all__ = ["Operator", "Span"]
+
+
+class Span(NamedTuple):
+    """The least and the largest voltage that earlier drives may have had, V."""
+
+    low: float
+    high: float
+
+
+class Operator(Protocol):
+    """A hysteresis operator: w = Γ[u], um, for a batch of models.
+
+    All columns are (models,), named and in the units of ``parameters``; voltages are in V,
+    displacements in um.
+    """
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Its parameters; the last is ``initial``, of scope ``record``."""
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError that names the parameter where a model is outside of the domain."""
+
+    def holds(self, column: Values) -> BoolArray:
+        """Tell which models (models,) meet what the bounds of single parameters do not say."""
+
+    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Any:
+        """Return the memory at a record's first voltage.
+
+        From rest the voltage came straight from zero volts, where the actuator was demagnetised
+        (or in the state ``initial``, where that is a displacement). Otherwise ``initial`` says
+        which of the reachable states it is.
+        """
+
+    def advance(self, column: Values, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
+        """Return w (models, samples) along the next samples, and the memory after them.
+
+        The memory that is given stays as it is.
+        """
+
+    def reachable(
+        self, column: Values, voltage: float, span: Span
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest ``initial`` (models,) that earlier drives could leave."""
+
+    def gain(self, column: Values, span: Span) -> FloatArray:
+        """Return a typical slope dw/du (models,), um/V: the scale of an unknown start."""
+
+    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
+        """Say what the draws (columns) of the ``free`` parameters tell that a user must know."""
