@@ -1,0 +1,237 @@
+"""What all operators given by a differential equation promise, and what none of them does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.backlash_like import BacklashLike
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.domain_wall import DomainWall
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.jiles_atherton import JilesAtherton
+from bwbayes.model.operators.one_state import OneState
+from bwbayes.model.operators.pinned import Pinned
+from tests.model.operators.differential import RANGES, SPAN, paths, prior_draws, w_of
+
+OPERATORS: dict[str, OneState] = {
+    "backlash-like": BacklashLike(),
+    "duhem": Duhem(),
+    "duhem with even terms": Duhem(odd=False),
+    "bouc-wen-asymmetric": BoucWenAsymmetric(),
+    "bouc-wen-asymmetric by the voltage": BoucWenAsymmetric(("b2", "b3")),
+    "jiles-atherton": JilesAtherton(),
+    "domain-wall": DomainWall(),
+}
+ODD = ("backlash-like", "duhem", "bouc-wen-asymmetric by the voltage", "jiles-atherton")
+NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
+
+every = pytest.mark.parametrize("name", OPERATORS)
+few = settings(deadline=None, max_examples=12)
+corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=6)
+
+
+def models(operator: OneState, size: int, seed: int) -> dict[str, FloatArray]:
+    """Draw models that hold from the default priors; fewer where there is an integrator to run."""
+    size = min(size, 2 if size < 20 else 50) if isinstance(operator, Pinned) else size
+    column = prior_draws(operator, 2 * size + 20, seed)
+    return rows(column, np.flatnonzero(operator.holds(column))[:size])
+
+
+def rows(column: Mapping[str, FloatArray], which: object) -> dict[str, FloatArray]:
+    return {name: np.atleast_1d(values[which]) for name, values in column.items()}  # type: ignore[call-overload]
+
+
+def tolerance(operator: OneState) -> float:
+    """Largest error that is promised, in units of the range of w."""
+    return 1e-6 if isinstance(operator, Pinned) else 1e-12
+
+
+def assert_near(operator: OneState, expected: FloatArray, got: FloatArray) -> None:
+    size = np.ptp(expected, axis=1, keepdims=True) + np.abs(expected[:, :1])
+    assert (np.abs(got - expected) <= tolerance(operator) * size).all()
+
+
+@every
+def test_declares_its_parameters(name: str) -> None:
+    declared = OPERATORS[name].parameters
+    assert declared[-1].name == "initial"
+    assert [one.scope for one in declared] == ["actuator"] * (len(declared) - 1) + ["record"]
+    assert all(one.unit and one.label and one.description for one in declared)
+    assert all(one.loop for one in declared[:-1])
+    assert len({one.name for one in declared}) == len(declared)
+
+
+@every
+def test_draws_of_the_default_priors_have_displacements_of_the_right_size(name: str) -> None:
+    """The median range of w is within a factor of three of the record's, as is d's of a tenth."""
+    operator = OPERATORS[name]
+    column = models(operator, 300, 1)
+    voltage = RANGES.bias + RANGES.voltage * np.sin(np.linspace(0, 12, 60))
+    size = np.ptp(w_of(operator, column, voltage)[:, 20:], axis=1)
+    assert 1 / 3 < np.median(size) / (2 * RANGES.displacement) < 3
+    low, high = np.quantile(size, [0.05, 0.95]) / (2 * RANGES.displacement)
+    assert low < 0.7
+    assert 1.4 < high < 60
+
+
+@every
+def test_draws_of_the_default_priors_are_finite(name: str) -> None:
+    operator = OPERATORS[name]
+    finite(operator, models(operator, 100_000, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["jiles-atherton", "domain-wall"])
+def test_many_more_draws_of_the_default_priors_are_finite(name: str) -> None:
+    operator = OPERATORS[name]
+    column = prior_draws(operator, 100_000, 2)
+    for part in np.split(np.arange(100_000), 10):
+        finite(operator, rows(column, part))
+
+
+def finite(operator: OneState, column: dict[str, FloatArray]) -> None:
+    operator.check(column)
+    voltage = np.array([-40.0, 60.0, 60.0, -39.99, 60.0, 1e-3, 0.0])
+    assert np.isfinite(w_of(operator, column, voltage)).all()
+    assert np.isfinite(operator.gain(column, SPAN)).all()
+
+
+@every
+@few
+@given(path=corners, seed=st.integers(0, 9), cuts=st.lists(st.integers(0, 8), max_size=4))
+def test_pieces_of_any_length_are_the_whole(
+    name: str, path: list[float], seed: int, cuts: list[int]
+) -> None:
+    operator = OPERATORS[name]
+    column, voltage = models(operator, 3, seed), np.array(path)
+    pieces = sorted({1 + cut for cut in cuts if 1 + cut < voltage.size})
+    whole = w_of(operator, column, voltage)
+    assert_near(operator, whole, w_of(operator, column, voltage, pieces))
+
+
+@every
+@few
+@given(path=corners, seed=st.integers(0, 9), holds=st.lists(st.integers(1, 3), min_size=8))
+def test_the_pace_does_not_matter(
+    name: str, path: list[float], seed: int, holds: list[int]
+) -> None:
+    operator = OPERATORS[name]
+    column, repeats = models(operator, 3, seed), np.array(holds[: len(path)])
+    expected = np.repeat(w_of(operator, column, np.array(path)), repeats, axis=1)
+    got = w_of(operator, column, np.repeat(path, repeats))
+    assert_near(operator, expected, got)
+
+
+@every
+@few
+@given(path=corners, seed=st.integers(0, 9))
+def test_a_row_does_not_depend_on_its_batch(name: str, path: list[float], seed: int) -> None:
+    operator = OPERATORS[name]
+    column, voltage = models(operator, 7, seed), np.array(path)
+    together = w_of(operator, column, voltage)
+    for row in range(0, column["d"].size, 3):
+        alone = w_of(operator, rows(column, row), voltage)
+        np.testing.assert_allclose(alone[0], together[row], rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ODD)
+@few
+@given(path=corners, seed=st.integers(0, 9))
+def test_the_mirrored_drive_and_start_give_the_mirrored_displacement(
+    name: str, path: list[float], seed: int
+) -> None:
+    operator, voltage = OPERATORS[name], np.array(path)
+    column = models(operator, 3, seed)
+    mirrored = {**column, "initial": -column["initial"]}
+    expected = -w_of(operator, column, voltage)
+    np.testing.assert_array_equal(w_of(operator, mirrored, -voltage), expected)
+
+
+@pytest.mark.parametrize("name", NOT_ODD)
+def test_others_are_not_symmetric(name: str) -> None:
+    operator, voltage = OPERATORS[name], paths()["walk"]
+    column = {**models(operator, 50, 1), "initial": np.zeros(50)}
+    sum_ = w_of(operator, column, voltage) + w_of(operator, column, -voltage)
+    assert np.median(np.abs(sum_).max(axis=1)) > 0.1
+
+
+@pytest.mark.parametrize("name", ["backlash-like", "bouc-wen-asymmetric", *ODD[-1:], "domain-wall"])
+def test_the_initial_curve_rises(name: str) -> None:
+    """From zero volts either way, and from no hysteresis; Duhem's is in its own tests."""
+    operator = OPERATORS[name]
+    column = models(operator, 300, 3)
+    column["initial"] = np.zeros_like(column["initial"])
+    for sign in (1.0, -1.0):
+        w = w_of(operator, column, sign * np.linspace(0, 60, 200))
+        assert (np.diff(sign * w, axis=1) >= -1e-9 * np.abs(w[:, -1:])).all()
+
+
+@every
+@few
+@given(
+    ends=st.tuples(st.integers(-100, 100), st.integers(-100, 100)),
+    seed=st.integers(0, 9),
+)
+def test_a_settled_loop_loses_energy(name: str, ends: tuple[int, int], seed: int) -> None:
+    """∮ u dw ≥ 0, by the trapezium rule on a loop that is gone through again and again."""
+    operator = OPERATORS[name]
+    column = models(operator, 10, seed)
+    back_and_forth = np.interp(np.linspace(0, 8, 1601), np.arange(9), [*ends] * 4 + [ends[0]])
+    w = w_of(operator, column, back_and_forth.astype(float))
+    # Whole periods, which differ by what has not settled.
+    u, last = back_and_forth[-401:], w[:, -401:]
+    lost = np.sum((u[1:] + u[:-1]) / 2 * np.diff(last, axis=1), axis=1)
+    unsettled = np.abs(last[:, 0] - last[:, -1]) * np.abs(u).max()
+    size = np.ptp(u) * np.ptp(last, axis=1)
+    assert (lost >= -1e-4 * size - unsettled - 1e-9).all()
+
+
+@every
+def test_a_minor_loop_is_not_forgotten_and_not_congruent(name: str) -> None:
+    """What a Preisach model would do, none of these does: neither wiping out nor congruency."""
+    operator = OPERATORS[name]
+    column = models(operator, 100, 5)
+    column["initial"] = np.zeros_like(column["initial"])
+    straight = w_of(operator, column, np.array([0.0, 40.0, 60.0]))
+    detour = w_of(operator, column, np.array([0.0, 40.0, 0.0, 40.0, 60.0]))
+    missed = np.abs(detour[:, -1] - straight[:, -1]) / np.ptp(straight, axis=1)
+    assert np.median(missed) > 1e-4
+    after_less = w_of(operator, column, np.array([0.0, 40.0, 0.0, 40.0]))
+    after_more = w_of(operator, column, np.array([0.0, 60.0, 0.0, 40.0, 0.0, 40.0]))
+    heights = [np.diff(w[:, -2:], axis=1)[:, 0] for w in (after_less, after_more)]
+    assert np.median(np.abs(heights[0] - heights[1]) / np.abs(heights[0])) > 1e-4
+
+
+@every
+def test_from_rest_the_voltage_came_straight_from_zero(name: str) -> None:
+    operator = OPERATORS[name]
+    column = models(operator, 5, 6)
+    memory = operator.begin(column, 35.0, SPAN, from_rest=True)
+    w, _ = operator.advance(column, np.array([35.0, 20.0]), memory)
+    expected = w_of(operator, column, np.array([0.0, 35.0, 20.0]))[:, 1:]
+    assert_near(operator, expected, w)
+
+
+@every
+def test_sweeps_reach_what_they_say_and_the_memory_stays_as_it_is(name: str) -> None:
+    operator = OPERATORS[name]
+    column = models(operator, 200, 7)
+    low, high = operator.reachable(column, 20.0, Span(-30.0, 70.0))
+    assert (low < high).all()
+    memory = operator.begin(column, 0.0, SPAN, from_rest=False)
+    before = memory.state.copy()
+    column["initial"] = np.zeros_like(column["initial"])
+    operator.advance(column, np.array([10.0, -5.0]), memory)
+    np.testing.assert_array_equal(memory.state, before)
+    start = operator.begin(column, 0.0, SPAN, from_rest=True)
+    _, end = operator.advance(column, np.array([70.0, -30.0, 70.0, -30.0, 20.0]), start)
+    size = np.maximum(np.abs(low), np.abs(high))
+    assert (end.state >= low - 1e-6 * size).all()
+    assert (end.state <= high + 1e-6 * size).all()
