@@ -1,0 +1,1 @@
+"""Hysteresis operators, each in a file of its own."""
