@@ -134,10 +134,10 @@ def test_gamma_on_beta_is_said_with_the_switch() -> None:
     prior = joint_prior(NAMES, RANGES, {})
     beta = np.random.default_rng(3).normal(0.02, 1e-3, 2000)
     (remark,) = said(prior, beta=beta, gamma=beta - piled_up(0, 2e-4))
-    assert remark.startswith("gamma: lies on its bound beta")
+    assert remark.startswith("gamma: lies on its upper bound of |gamma| <= beta")
     assert "passive = false" in remark
     (remark,) = said(prior, beta=beta, gamma=-beta + piled_up(0, 2e-4))
-    assert remark.startswith("gamma: lies on its bound -beta")
+    assert remark.startswith("gamma: lies on its lower bound of |gamma| <= beta")
 
 
 def test_gamma_anywhere_between_its_bounds_is_not_said() -> None:
@@ -152,7 +152,7 @@ def test_alpha_on_d_is_said() -> None:
     prior = joint_prior(NAMES, RANGES, {})
     d = np.full(2000, 0.7)
     (remark,) = said(prior, d=d, alpha=d - piled_up(0, 1e-3))
-    assert remark.startswith("alpha: lies on its bound d")
+    assert remark.startswith("alpha: lies on its upper bound of 0 < alpha < d")
 
 
 def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:

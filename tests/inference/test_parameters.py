@@ -12,12 +12,12 @@ from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.boucwen import ceiling
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
-from tests.declared import joint, parameter
+from tests.declared import declared, joint, parameter
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
@@ -295,17 +295,17 @@ def test_theta_puts_fixed_parameters_in_their_columns() -> None:
 )
 def test_a_parameter_that_cannot_be_is_refused(name: str, what: Any, says: str) -> None:
     with pytest.raises(InputError, match=says) as refused:
-        parameter(name, **what)
+        Parameter(name, "um", name, "", **what, declared=declared(name))
     assert str(refused.value).startswith(f"{name}: ")
 
 
 @pytest.mark.parametrize(
     ("fixed", "says"),
     [
-        ({"d": 0.5, "alpha": 0.5}, "^alpha: fixed at or above d"),
-        ({"d": 0.5, "alpha": 0.6}, "^alpha: fixed at or above d"),
-        ({"beta": 0.01, "gamma": 0.02}, "^gamma: fixed beyond beta"),
-        ({"beta": 0.01, "gamma": -0.02}, "^gamma: fixed beyond beta"),
+        ({"d": 0.5, "alpha": 0.5}, "^priors: what is fixed must have 0 < alpha < d"),
+        ({"d": 0.5, "alpha": 0.6}, "^alpha: fixed at 0.6; must hold: 0 < alpha < d"),
+        ({"beta": 0.01, "gamma": 0.02}, r"^gamma: fixed at 0.02; must hold: \|gamma\| <= beta"),
+        ({"beta": 0.01, "gamma": -0.02}, r"^gamma: fixed at -0.02; must hold: \|gamma\| <= beta"),
     ],
 )
 def test_fixed_values_that_contradict_each_other_are_refused(
