@@ -164,6 +164,9 @@ class ModelConfig(_Table):
     """
 
     hysteresis: str = "bouc-wen"
+    gain: list[str] = Field(default_factory=list)
+    creep: bool | list[float] = False
+    creep_growth: bool = False
     dynamics: str = "lag"
     hold: Literal["auto", "first", "zero"] = "auto"
     noise: str = "discrepancy"

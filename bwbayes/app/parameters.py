@@ -18,8 +18,10 @@ from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.noise import NOISES
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.actuator import OFFSET
+from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 
 __all__ = ["as_config", "context_of", "every_declaration", "parameters_of"]
@@ -77,7 +79,9 @@ def every_declaration() -> list[Declaration]:
     operators = (make().parameters for make in HYSTERESIS.values())
     filters = (make().parameters for make in DYNAMICS.values())
     noises = (make(interval=1.0).declarations for make in NOISES.values())
-    return [d for part in (*operators, *filters, (OFFSET,), *noises) for d in part]
+    crept = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
+    others = PolynomialGain().parameters, crept.parameters, (OFFSET,)
+    return [d for part in (*operators, *filters, *others, *noises) for d in part]
 
 
 def _require_known(

@@ -37,7 +37,10 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
@@ -124,7 +127,16 @@ def resolve(config: Config, folder: Path) -> Problem:
     if hold == "auto":
         hold = "zero" if record.voltage_is == "command" else "first"
     hysteresis = made("model.hysteresis", config.model.hysteresis, HYSTERESIS, _options(config))
-    actuator = Actuator(config.model.dynamics, hold, record.interval, hysteresis)
+    span = Span(float(np.min(record.voltage)), float(np.max(record.voltage)))
+    actuator = Actuator(
+        config.model.dynamics,
+        hold,
+        record.interval,
+        hysteresis,
+        PolynomialGain(tuple(config.model.gain), span) if config.model.gain else None,
+        _creep(config, record, span),
+        span,
+    )
     noise = noise_model(config.model.noise, record.interval)
     table, context = Table(actuator, noise), context_of(config, record, split.training)
     parameters = parameters_of(config, table.declarations, context)
@@ -179,6 +191,17 @@ def resolve(config: Config, folder: Path) -> Problem:
         default_priors(table.declarations, context),
         findings,
     )
+
+
+def _creep(config: Config, record: Record, span: Span) -> Creep | None:
+    """Return the creep that a config asks for, if any; ``true`` takes its times from the record."""
+    model = config.model
+    if model.creep is False or model.creep == []:
+        if model.creep_growth:
+            raise InputError("model.creep_growth: there is no creep; give creep = true with it")
+        return None
+    times = creep_times(record.interval, record.duration) if model.creep is True else model.creep
+    return Creep(tuple(times), model.creep_growth, span)
 
 
 def _options(config: Config) -> dict[str, object]:
@@ -362,6 +385,9 @@ def _explicit(
                 hold=config.model.hold,
                 noise=config.model.noise,
                 hysteresis=config.model.hysteresis,
+                gain=config.model.gain,
+                creep=list(creep.times) if (creep := posterior.actuator.creep) else False,
+                creep_growth=config.model.creep_growth,
                 passive=getattr(posterior.actuator.hysteresis, "passive", None),
                 outliers=config.model.outliers,
             ),

@@ -187,7 +187,7 @@ class Likelihood:
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
         unknowns = 0 if self.from_rest else self.actuator.unknowns
-        gain = self.actuator.gain(self.table.actuator(theta), self.voltage)
+        gain = self.actuator.typical_slope(self.table.actuator(theta), self.voltage)
         sd = np.repeat((gain * self.half_range)[:, np.newaxis], unknowns, axis=1)
         if self.offset_sd:
             sd = np.concatenate([np.full((len(sd), 1), self.offset_sd), sd], axis=1)
@@ -256,13 +256,13 @@ class Likelihood:
         (``log_decay`` per reading) forgets it.
         """
         rows = self.readings.rows
-        recursion = self.actuator.recursion(self.actuator.columns(model))
-        unknowns = 0 if self.from_rest else recursion.unknowns
+        sections = self.actuator.sections(self.actuator.columns(model))
+        unknowns = 0 if self.from_rest else sections.unknowns
         if self.offset_sd:
             heard = rows.size
         elif unknowns:
             with np.errstate(divide="ignore"):
-                slowest = max(float(np.max(np.log(recursion.remembered))), -FORGOTTEN)
+                slowest = max(float(np.max(np.log(sections.remembered))), -FORGOTTEN)
             far = FORGOTTEN + rows * slowest < 0
             # White noise decays at once: its rate is infinite.
             decay = max(float(np.max(log_decay)), -FORGOTTEN)
@@ -270,7 +270,7 @@ class Likelihood:
             heard = int(np.argmax(far)) if far[-1] else rows.size
         else:
             heard = 0
-        free = recursion.free_responses(int(rows[heard - 1]) + 1 if heard and unknowns else 0)
+        free = sections.free_responses(int(rows[heard - 1]) + 1 if heard and unknowns else 0)
         parts = [free[:, :unknowns, rows[:heard]] if unknowns else np.empty((len(model), 0, heard))]
         if self.offset_sd:
             parts.insert(0, np.ones((len(model), 1, heard)))

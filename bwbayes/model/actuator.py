@@ -1,7 +1,8 @@
 """The actuator: voltage in, displacement out, for a batch of parameter vectors at once.
 
-It is put together from parts. A hysteresis operator makes the drive w of the voltage's path, linear
-dynamics follow the drive, and the sensor adds its offset (equations (6) to (8) of the paper). An
+It is put together from parts. A hysteresis operator makes the drive w of the voltage's path, to
+which a polynomial gain may add; linear dynamics follow the drive (equations (6) to (8) of the
+paper), creep may add to what they do, and the sensor adds its offset. An
 :class:`Actuator` says which parts there are, what the voltage does between samples, and how long
 those are apart; the parameters come as the columns of a matrix θ, in the order in which the parts
 declare them. A long record can be walked through in pieces: the :class:`State` at the end of one
@@ -20,10 +21,12 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Context, Declaration, normal
+from bwbayes.model.creep import Creep
+from bwbayes.model.declaration import Context, Declaration, Values, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.filters import Filter
-from bwbayes.model.linear import Hold, Recursion
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
@@ -44,14 +47,14 @@ OFFSET = Declaration(
 class State:
     """All that a batch of models remembers after a piece of a record.
 
-    ``hysteresis`` is the operator's memory; ``rest`` is the drive at the record's first sample, at
-    which the dynamics were at rest, (models,), um; ``filter`` is the state of the recursion,
-    (models, taps - 1).
+    ``hysteresis`` is the operator's memory; ``rest`` are the drives at the record's first sample,
+    at which dynamics and creep were at rest, (models,) each, um; ``filter`` are the states of their
+    recursions, (models, taps - 1) each.
     """
 
     hysteresis: Any
-    rest: FloatArray
-    filter: FloatArray
+    rest: tuple[FloatArray, ...]
+    filter: tuple[FloatArray, ...]
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,10 @@ class Actuator:
         Sampling interval, s, above zero.
     hysteresis
         The operator that makes the drive.
+    gain
+        What is added to the drive without a memory.
+    creep
+        What is added to the displacement with a long one.
     span
         The voltages that drives before a record may have had, V; by default those of the voltage
         that is simulated.
@@ -84,6 +91,8 @@ class Actuator:
     hold: Hold = "first"
     interval: float = 1e-3
     hysteresis: Operator = field(default_factory=BoucWen)
+    gain: PolynomialGain | None = None
+    creep: Creep | None = None
     span: Span | None = None
 
     def __post_init__(self) -> None:
@@ -102,7 +111,9 @@ class Actuator:
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
-        return (*self.hysteresis.parameters, *self.filter.parameters, OFFSET)
+        added = self.gain.parameters if self.gain else ()
+        crept = self.creep.parameters if self.creep else ()
+        return (*self.hysteresis.parameters, *added, *self.filter.parameters, *crept, OFFSET)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -111,8 +122,8 @@ class Actuator:
 
     @property
     def unknowns(self) -> int:
-        """How many numbers say in which state the dynamics are at a record's first sample."""
-        return self.filter.unknowns(self.hold)
+        """How many numbers say how dynamics and creep are at a record's first sample."""
+        return self.filter.unknowns(self.hold) + (len(self.creep.times) if self.creep else 0)
 
     def displacement(
         self, theta: ArrayLike, voltage: ArrayLike, *, from_rest: bool = False
@@ -153,9 +164,9 @@ class Actuator:
         """Displacement along the next piece of a record, and the state at its end.
 
         Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here: the
-        hysteresis is in the state that θ's initial one says, and the dynamics are at rest at the
+        hysteresis is in the state that θ's initial one says; dynamics and creep are at rest at the
         first drive, or ``unrest`` (models, unknowns) away from there, um, as in
-        :class:`~bwbayes.model.linear.Recursion`; (models, 0) stands for rest.
+        :class:`~bwbayes.model.linear.Sections`; (models, 0) stands for rest.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):
@@ -167,29 +178,42 @@ class Actuator:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
         column = self.columns(models)
         self._check_domain(column)
-        recursion = self.recursion(column)
+        sections = self.sections(column)
         if state is None:
             memory = self.begin(column, path, from_rest=from_rest)
-            drive, hysteresis = self.hysteresis.advance(column, path, memory)
-            rest, filtered = drive[:, 0].copy(), recursion.at_rest()
-            if unrest is not None and unrest.size:
-                filtered += np.einsum("mu,mut->mt", unrest, recursion.free)
+            drives, hysteresis = self._drives(column, path, memory)
+            rest = tuple(drive[:, 0].copy() for drive in drives)
+            filtered = sections.begin(unrest)
         else:
-            drive, hysteresis = self.hysteresis.advance(column, path, state.hysteresis)
-            rest, filtered = state.rest, state.filter.copy()
-        # The recursion sees the drive's distance from rest, so that it starts at zero exactly.
-        drive -= rest[:, np.newaxis]
-        result = recursion.run(drive, filtered)
-        result += (rest + column["offset"])[:, np.newaxis]
+            drives, hysteresis = self._drives(column, path, state.hysteresis)
+            rest, filtered = state.rest, tuple(one.copy() for one in state.filter)
+        # The recursions see the drives' distance from rest, so that they start at zero exactly.
+        for drive, before in zip(drives, rest, strict=True):
+            np.subtract(drive, before[:, np.newaxis], out=drive)
+        result = sections.run(drives, filtered)
+        level = sum(gain * before for gain, before in zip(sections.gains, rest, strict=True))
+        result += (level + column["offset"])[:, np.newaxis]
         return result, State(hysteresis, rest, filtered)
 
-    def drive(self, theta: FloatArray, voltage: FloatArray, *, from_rest: bool) -> FloatArray:
-        """Return what the hysteresis makes of a record's voltage, w (models, samples), um."""
+    def hysteretic(self, theta: FloatArray, voltage: FloatArray, *, from_rest: bool) -> FloatArray:
+        """Return what the operator makes of a record's voltage, (models, samples), um."""
         column = self.columns(theta)
         memory = self.begin(column, voltage, from_rest=from_rest)
         return self.hysteresis.advance(column, voltage, memory)[0]
 
-    def gain(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:
+    def _drives(
+        self, column: Values, path: FloatArray, memory: Any
+    ) -> tuple[list[FloatArray], Any]:
+        """Return the drives along a path, and the operator's memory after it."""
+        drive, after = self.hysteresis.advance(column, path, memory)
+        if self.gain is not None:
+            drive += self.gain.displacement(column, path)
+        if self.creep is None:
+            return [drive], after
+        crept = self.creep.drive(column, drive, path)
+        return [drive, *(crept.copy() for _ in self.creep.times)], after
+
+    def typical_slope(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return a typical slope (models,) of the drive within a voltage's range, um/V."""
         return self.hysteresis.gain(self.columns(theta), self._span(voltage))
 
@@ -213,11 +237,21 @@ class Actuator:
         """Refuse what the recursion or a sum does not see."""
         self.hysteresis.check(column)
         self.filter.check(column)
+        if self.gain is not None:
+            self.gain.check(column)
+        if self.creep is not None:
+            self.creep.check(column)
         if not np.isfinite(column["offset"]).all():
             row = int(np.argmin(np.isfinite(column["offset"])))
             value = column["offset"][row]
             raise InputError(f"offset: {value:.6g} in model {row}; must be finite")
 
-    def recursion(self, column: Mapping[str, FloatArray]) -> Recursion:
-        """Return the dynamics' recursion of models given by the columns (models,) of θ."""
-        return self.filter.recursion(column, column["offset"].size, self.interval, self.hold)
+    def sections(self, column: Values) -> Sections:
+        """Return dynamics and creep of models given by the columns (models,) of θ."""
+        models = column["offset"].size
+        dynamics = self.filter.recursion(column, models, self.interval, self.hold)
+        if self.creep is None:
+            return Sections((dynamics,), (np.ones(models),))
+        lags = self.creep.recursions(models, self.interval, self.hold)
+        strengths = (column[name] for name in self.creep.names)
+        return Sections((dynamics, *lags), (np.ones(models), *strengths))

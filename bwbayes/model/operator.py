@@ -16,7 +16,7 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 
-__all__ = ["Operator", "Span"]
+__all__ = ["UNIT", "Operator", "Span"]
 
 
 class Span(NamedTuple):
@@ -24,6 +24,19 @@ class Span(NamedTuple):
 
     low: float
     high: float
+
+    @property
+    def middle(self) -> float:
+        """Its middle, V."""
+        return (self.low + self.high) / 2
+
+    @property
+    def half(self) -> float:
+        """Half of its width, V."""
+        return (self.high - self.low) / 2
+
+
+UNIT = Span(-1.0, 1.0)
 
 
 class Operator(ABC):

@@ -11,7 +11,7 @@ known only 14 % well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -24,16 +24,16 @@ from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.ensemble import advance, start
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentProposal
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Ranges
+from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
-from tests.declared import NAMES, default_prior, joint, parameter
+from tests.declared import NAMES, context, declared, joint, parameter
 
 __all__ = [
     "ALARM",
@@ -103,17 +103,23 @@ def joint_prior(
     priors: Mapping[str, Distribution] | None = None,
 ) -> JointPrior:
     """Return the default joint prior, but for ``fixed`` values and other ``priors``."""
-    parameters = []
-    for name in names:
-        known: Distribution | float
-        if name in fixed:
-            known = fixed[name]
-        elif priors and name in priors:
-            known = priors[name]
-        else:
-            known = default_prior(name, ranges, fixed.get("exponent", 1.0), 4.1e5)
-        parameters.append(parameter(name, known))
-    return joint(parameters)
+    stated = fixed.get("exponent", 1.0)
+    known = context(ranges, stated, 4.1e5)
+    return joint(list(parameters_of((declared(name) for name in names), known, fixed, priors)))
+
+
+def parameters_of(
+    declarations: Iterable[Declaration],
+    known: Context,
+    fixed: Mapping[str, float],
+    priors: Mapping[str, Distribution] | None = None,
+) -> Iterator[Parameter]:
+    """Yield parameters: fixed, with other priors, or as their parts declare them."""
+    for one in declarations:
+        given = fixed.get(one.name, (priors or {}).get(one.name))
+        default = one.default(known) if given is None else given
+        assert default is not None
+        yield Parameter.of(one, default)
 
 
 def posterior_of(
@@ -129,9 +135,11 @@ def posterior_of(
 ) -> Posterior:
     """Return the posterior with default priors, of a record that starts from rest."""
     model = noise_model(noise, actuator.interval)
-    names = Table(actuator, model).names
+    fixed = {"initial": 0.0} if fixed is None else fixed
     ranges = ranges_of(voltage, displacement, actuator.interval)
-    prior = joint_prior(names, ranges, {"initial": 0.0} if fixed is None else fixed, priors)
+    known = context(ranges, fixed.get("exponent", 1.0), 4.1e5)
+    parameters = parameters_of(Table(actuator, model).declarations, known, fixed, priors)
+    prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
     return Posterior(voltage, displacement, windows, actuator, model, prior, from_rest=from_rest)
 

@@ -89,7 +89,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
     displacement = actuator.displacement(theta, voltage)[0][cut:]
     if case.cut == "knocked":
         column = dict(zip(actuator.parameters, theta.T, strict=True))
-        free = actuator.recursion(column).free_responses(displacement.size)[0]
+        free = actuator.sections(column).free_responses(displacement.size)[0]
         displacement = displacement + KNOCK * free[0]
     kept = np.exp(-1 / RATE / TRUE["discrepancy_time"])
     shocks = generator.standard_normal(displacement.size)

@@ -7,9 +7,11 @@ a step and nothing larger than a cache is written. A few dozen samples at a time
     drive        the hysteresis (:mod:`bwbayes.inference.compiled.stages`)
     innovations  linear dynamics, the noise's filter, and the sums its density needs
 
-The second stage has two forms. Most of a record passes :func:`_settled`: each sample has a reading,
-and the filter is in its steady state. Where readings are missing, or the filter is not settled, or
-still hears of the unknown start, the samples pass :func:`_exact`.
+The second stage has three forms. Most of a record passes :func:`_settled`: each sample has a
+reading, and the filter is in its steady state. Where readings are missing, or the filter is not
+settled, or still hears of the start of the dynamics, the samples pass :func:`_exact`. An offset of
+the record's own and the start of the creep are heard all along; once their innovations only follow
+them, :func:`_tracked` adds what they need to the settled form.
 
 The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lanes`). This module
 needs numba; it knows arrays and nothing else.
@@ -22,17 +24,18 @@ import math
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
     A1, A2, B0, B1, B2, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT,
     LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO, SQUARES,
-    STATE, SUMS, SURPLUS, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
+    STATE, STRENGTH, SUM, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
+from bwbayes.inference.compiled.parts import creep, polynomial
 from bwbayes.inference.compiled.stages import drive_of
 
 __all__ = ["sums"]
@@ -42,6 +45,9 @@ PIECE = 64
 
 # What is below this part of its size at the start adds nothing.
 FORGOTTEN = 1e-20
+
+# An innovation that follows its response to this part of it does not do so better.
+ROUNDING = 1e-13
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -76,15 +82,18 @@ def _exact(
     first: int,
     last: int,
     drive: FloatArray,
+    lags: FloatArray,
     offset: int,
     free: int,
+    slow: int,
 ) -> None:
     """Do the same for any samples, any state of the filter, and the responses of the start.
 
-    ``skipped`` is negative where there is no reading. ``offset`` and ``free`` count the responses
-    that are followed.
+    ``skipped`` is negative where there is no reading. ``offset``, ``free`` and ``slow`` count the
+    responses that are followed.
     """
-    series = 1 + offset + free
+    first_slow = 1 + offset + free
+    series = first_slow + slow
     for t in range(first, last):
         row = (t - first) * LANES
         for i in range(LANES):
@@ -93,17 +102,22 @@ def _exact(
             state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
             state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
             state[VALUE + i] = displacement[t] - state[LEVEL + i] - x
-        for k in range(1 + offset, series):
+        for k in range(1 + offset, first_slow):
             at = k * LANES
             for i in range(LANES):
                 x = state[KEEP_1 + at + i]
-                state[KEEP_1 + at + i] = state[KEEP_2 + at + i] - state[A1 + i] * x
-                state[KEEP_2 + at + i] = -state[A2 + i] * x
+                state[KEEP_1 + at + i] = state[KEEP_2 + at + i] - state[TRUE_A1 + i] * x
+                state[KEEP_2 + at + i] = -state[TRUE_A2 + i] * x
                 state[VALUE + at + i] = x
+        for k in range(slow):
+            at = (first_slow + k) * LANES
+            left = lags[k, 2]
+            for i in range(LANES):
+                state[VALUE + at + i] = state[KEEP_1 + at + i]
+                state[KEEP_1 + at + i] *= left
         if skipped[t] < 0.0:
             continue
-        if skipped[t] > 0.0:
-            _skip(state, skipped[t], series)
+        _skip(state, skipped[t], series)
         for i in range(LANES):
             ratio = state[UNSURE + i] / state[VARIANCE + i]
             inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
@@ -129,9 +143,98 @@ def _exact(
     _take_logs(state)
 
 
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _tracked(
+    state: FloatArray,
+    displacement: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
+    left: FloatArray,
+    series: IntArray,
+) -> None:
+    """Do the settled form, with responses whose innovations follow them.
+
+    A response r that keeps the part ρ of itself from reading to reading has an innovation κ r, with
+    κ = (ρ − φ)/(ρ − a), so only Σ ρᵗ η of the residual's innovations η has to be added up; products
+    of two responses are geometric sums. ``left`` is ρ of each, ``series`` says which they are.
+    """
+    count = series.size
+    for k in range(count):
+        for i in range(LANES):
+            state[INNOVATION + series[k] * LANES + i] = 0.0
+    weight = np.ones(count)
+    for t in range(first, last):
+        y = displacement[t]
+        row = (t - first) * LANES
+        for i in range(LANES):
+            w = drive[row + i]
+            x = state[B0 + i] * w + state[X1 + i]
+            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
+            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
+            residual = y - state[LEVEL + i] - x
+            estimate = state[ESTIMATE + i]
+            innovation = residual - estimate
+            state[ESTIMATE + i] = state[DECAY + i] * estimate + state[GAIN + i] * residual
+            state[SQUARES + i] += innovation * innovation
+            state[SUM + i] = innovation
+        for k in range(count):
+            part, at = weight[k], INNOVATION + series[k] * LANES
+            for i in range(LANES):
+                state[at + i] += part * state[SUM + i]
+            weight[k] *= left[k]
+    for k in range(count):
+        at, rho = series[k] * LANES, left[k]
+        for j in range(k + 1):
+            other, sigma = series[j] * LANES, left[j]
+            both = rho * sigma
+            total = float(last - first)
+            if both < 1.0:
+                total = (1.0 - weight[k] * weight[j]) / (1.0 - both)
+            pair = PRODUCTS + (series[k] * (series[k] + 1) // 2 + series[j]) * LANES
+            for i in range(LANES):
+                own = state[KEEP_1 + at + i] * _follows(state, i, rho)
+                its = state[KEEP_1 + other + i] * _follows(state, i, sigma)
+                state[pair + i] += own * its * total / state[VARIANCE + i]
+        pair = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
+        for i in range(LANES):
+            kappa = _follows(state, i, rho)
+            pull = kappa * state[KEEP_1 + at + i] * state[INNOVATION + at + i]
+            state[pair + i] += pull / state[VARIANCE + i]
+    for k in range(count):
+        at = series[k] * LANES
+        for i in range(LANES):
+            state[KEEP_1 + at + i] *= weight[k]
+            follows = _follows(state, i, left[k])
+            state[ESTIMATE + at + i] = state[KEEP_1 + at + i] * (1.0 - follows)
+
+
+@njit(nogil=True, cache=True)
+def _follows(state: FloatArray, i: int, rho: float) -> float:
+    """Return κ, the innovation of a response that keeps ρ of itself, over the response."""
+    return float((rho - state[KEPT + i]) / (rho - state[DECAY + i]))
+
+
+@njit(nogil=True, cache=True)
+def _is_tracked(state: FloatArray, left: FloatArray, series: IntArray) -> bool:
+    """Tell whether the innovations of all those responses only follow them, to their rounding."""
+    for k in range(series.size):
+        at = series[k] * LANES
+        for i in range(LANES):
+            if left[k] <= state[DECAY + i]:
+                return False
+            keep = state[KEEP_1 + at + i]
+            apart = state[ESTIMATE + at + i] - keep * (1.0 - _follows(state, i, left[k]))
+            if not abs(apart) <= ROUNDING * abs(keep):
+                return False
+    return True
+
+
 @njit(nogil=True, cache=True)
 def _skip(state: FloatArray, readings: float, series: int) -> None:
     """Let the filter pass over missing readings; before one, the product of variances is logged."""
+    if readings == 0.0:
+        return
     _take_logs(state)
     for i in range(LANES):
         kept = math.exp(-readings * state[RATE + i])
@@ -158,10 +261,8 @@ def _is_settled(state: FloatArray) -> bool:
 
 @njit(nogil=True, cache=True)
 def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
-    """Tell whether any model's filter still hears of the unknown start."""
-    if offset > 0:
-        return True
-    for i in range(LANES, (1 + free) * LANES):
+    """Tell whether any model's filter still hears of the unknown start of the dynamics."""
+    for i in range((1 + offset) * LANES, (1 + offset + free) * LANES):
         left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
         if left > FORGOTTEN:
             return True
@@ -169,7 +270,7 @@ def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
 
 
 @njit(nogil=True, cache=True)
-def _begin(state: FloatArray, offset: int, free: int) -> None:
+def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
     """Put all that a model remembers to the record's first sample."""
     for i in range(len(PARAMETERS) * LANES, STATE):
         state[i] = 0.0
@@ -178,10 +279,14 @@ def _begin(state: FloatArray, offset: int, free: int) -> None:
         state[UNSURE + i] = state[SURPLUS + i]
         if offset > 0:
             state[VALUE + LANES + i] = 1.0
+            state[KEEP_1 + LANES + i] = 1.0
         for k in range(free):
             at = (1 + offset + k) * LANES + i
             state[KEEP_1 + at] = state[FREE + 2 * k * LANES + i]
             state[KEEP_2 + at] = state[FREE + (2 * k + 1) * LANES + i]
+        for k in range(slow):
+            at = (1 + offset + free + k) * LANES + i
+            state[KEEP_1 + at] = state[STRENGTH + k * LANES + i]
 
 
 @njit(nogil=True, cache=True)
@@ -189,21 +294,29 @@ def _group(
     kind: int,
     own: FloatArray,
     plan: FloatArray,
+    curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
     state: FloatArray,
     voltage: FloatArray,
     displacement: FloatArray,
     skipped: FloatArray,
     offset: int,
     free: int,
+    slow: int,
     result: FloatArray,
 ) -> None:
     """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
-    _begin(state, offset, free)
+    _begin(state, offset, free, slow)
     drive = _aligned(PIECE * LANES)
-    now, settled, heard = 0, False, True
+    # Responses that stay: the offset, and those of the creep.
+    left, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
+    for k in range(slow):
+        left[offset + k], series[offset + k] = lags[k, 2], 1 + offset + free + k
+    now, settled, heard, tracked = 0, False, True, False
     while now < voltage.size:
         last = min(now + PIECE, voltage.size)
-        plain = settled and not heard and skipped[now] == 0.0
+        plain = settled and tracked and not heard and skipped[now] == 0.0
         if plain:
             # As far as every sample has a reading.
             end = now
@@ -211,13 +324,19 @@ def _group(
                 end += 1
             last = end
         drive_of(kind, own, plan, voltage, now, last, drive)
-        if plain:
+        if curve.size > 0:
+            polynomial(state, curve, now, last, drive)
+        if lags.size > 0:
+            creep(state, lags, growth, now, last, drive)
+        if plain and series.size == 0:
             _settled(state, displacement, now, last, drive)
+        elif plain:
+            _tracked(state, displacement, now, last, drive, left, series)
         else:
-            followed = free if heard else 0
-            _exact(state, displacement, skipped, now, last, drive, offset, followed)
+            _exact(state, displacement, skipped, now, last, drive, lags, offset, free, slow)
             settled = _is_settled(state)
             heard = heard and _is_heard(state, offset, free)
+            tracked = settled and not heard and _is_tracked(state, left, series)
         now = last
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]
@@ -243,14 +362,18 @@ def sums(
     kind: int,
     own: FloatArray,
     plan: FloatArray,
+    curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
     offset: int,
     free: int,
+    slow: int,
 ) -> FloatArray:
     """Return what the noise's density needs, (SUMS, models).
 
     First Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of series:
-    the residual (um), the offset's response if ``offset`` is one, and ``free`` free responses. Then
-    Σ log S less that of the steady state.
+    the residual (um), the offset's response if ``offset`` is one, ``free`` free responses of the
+    dynamics and ``slow`` ones of the creep. Then Σ log S less that of the steady state.
 
     Parameters
     ----------
@@ -263,6 +386,8 @@ def sums(
     kind, own, plan
         The stage that makes the drive, what each model is in it (models, rows), and what it knows
         of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
+    curve, lags, growth
+        What gain and creep know, as in :mod:`bwbayes.inference.compiled.parts`.
     """
     count = models.shape[0]
     result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
@@ -275,7 +400,10 @@ def sums(
                 state[row * LANES + i] = models[model, row]
             for row in range(own.shape[1]):
                 mine[row * LANES + i] = own[model, row]
-        _group(kind, mine, plan, state, voltage, displacement, skipped, offset, free, part)
+        _group(
+            kind, mine, plan, curve, lags, growth, state, voltage, displacement, skipped,
+            offset, free, slow, part,
+        )  # fmt: skip
         last = min(first + LANES, count)
         result[:, first:last] = part[:, : last - first]
     return result
