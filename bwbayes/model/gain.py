@@ -16,7 +16,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal
-from bwbayes.model.operator import Span
+from bwbayes.model.operator import UNIT, Span
 
 __all__ = ["PolynomialGain"]
 
@@ -43,6 +43,8 @@ class PolynomialGain:
     ----------
     terms
         ``"quadratic"``, ``"cubic"``, or both.
+    reference
+        The range of the voltage that the coefficients are for: that of the record that is fitted.
 
     Raises
     ------
@@ -51,6 +53,7 @@ class PolynomialGain:
     """
 
     terms: Sequence[str] = tuple(TERMS)
+    reference: Span = UNIT
 
     def __post_init__(self) -> None:
         for term in self.terms:
@@ -83,13 +86,17 @@ class PolynomialGain:
                 value = column[declared.name][row]
                 raise InputError(f"{declared.name}: {value:.6g} in model {row}; must be finite")
 
-    def displacement(self, column: Values, voltage: FloatArray, span: Span) -> FloatArray:
+    def scaled(self, voltage: FloatArray) -> FloatArray:
+        """Return x (samples,) of voltages (samples,), V."""
+        half = self.reference.half
+        return (voltage - self.reference.middle) / half if half > 0 else np.zeros_like(voltage)
+
+    def displacement(self, column: Values, voltage: FloatArray) -> FloatArray:
         """Return q₂ x² + q₃ x³ (models, samples), um, along voltages (samples,), V.
 
-        A span without any width has none.
+        A reference without any width has none.
         """
-        middle, half = (span.low + span.high) / 2, (span.high - span.low) / 2
-        x = (voltage - middle) / half if half > 0 else np.zeros_like(voltage)
+        x = self.scaled(voltage)
         columns = [(column[name], TERMS[name].power) for name in TERMS if name in self.terms]
         return sum(
             (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.size))

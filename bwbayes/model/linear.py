@@ -11,6 +11,7 @@ with z = pole x interval: written so, equal and nearly equal poles are not speci
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["Hold", "Recursion", "first_order_lag", "no_dynamics", "second_order"]
+__all__ = ["Hold", "Recursion", "Sections", "first_order_lag", "no_dynamics", "second_order"]
 
 Hold = Literal["first", "zero"]
 
@@ -80,6 +81,57 @@ class Recursion:
         for unknown in range(unknowns):
             self.run(responses[:, unknown], self.free[:, unknown].copy())
         return responses
+
+
+@dataclass(frozen=True)
+class Sections:
+    """Recursions side by side: x = Σ gainᵢ Fᵢ[wᵢ], for a batch of models.
+
+    ``gains`` (models,) belong to the ``recursions``, of which each has a drive wᵢ of its own.
+    Unknown of the start is what is unknown of each recursion, in their order.
+    """
+
+    recursions: tuple[Recursion, ...]
+    gains: tuple[FloatArray, ...]
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers say in which state the sections are."""
+        return sum(one.unknowns for one in self.recursions)
+
+    @property
+    def remembered(self) -> FloatArray:
+        """Largest part (models,) of a free response that is left after a sample, below one."""
+        return np.asarray(np.max([one.remembered for one in self.recursions], axis=0))
+
+    def begin(self, unrest: FloatArray | None) -> tuple[FloatArray, ...]:
+        """Return the states of sections that are ``unrest`` (models, unknowns) away from rest."""
+        if unrest is None or not unrest.size:
+            return tuple(one.at_rest() for one in self.recursions)
+        ends = np.cumsum([one.unknowns for one in self.recursions])[:-1]
+        parts = np.split(unrest, ends, axis=1)
+        return tuple(
+            np.einsum("mu,mut->mt", part, one.free)
+            for part, one in zip(parts, self.recursions, strict=True)
+        )
+
+    def run(self, drives: Sequence[FloatArray], states: Sequence[FloatArray]) -> FloatArray:
+        """Filter ``drives`` (models, samples) in place from states, which move on; return x."""
+        parts = zip(self.recursions, self.gains, drives, states, strict=True)
+        result: FloatArray | None = None
+        for one, gain, drive, state in parts:
+            moved = one.run(drive, state)
+            if np.any(gain != 1.0):
+                moved *= gain[:, np.newaxis]
+            result = moved if result is None else np.add(result, moved, out=result)
+        assert result is not None
+        return result
+
+    def free_responses(self, samples: int) -> FloatArray:
+        """Displacement (models, unknowns, samples) after a unit of each, without a drive."""
+        parts = zip(self.recursions, self.gains, strict=True)
+        responses = [gain[:, None, None] * one.free_responses(samples) for one, gain in parts]
+        return np.concatenate(responses, axis=1)
 
 
 def no_dynamics(models: int, hold: Hold) -> Recursion:

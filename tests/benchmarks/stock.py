@@ -48,7 +48,7 @@ class StockPosterior(Posterior):
         shape = (column[name] for name in ("alpha", "beta", "gamma", "initial"))
         drive = column["d"][:, np.newaxis] * self.voltage - hysteresis_loop(self.voltage, *shape)
         rest = drive[:, :1].copy()
-        recursion = self.actuator.recursion(column)
+        (recursion,) = self.actuator.sections(column).recursions
         moved = recursion.run(drive - rest, recursion.at_rest())
         residual = self.displacement - moved - rest - column["offset"][:, np.newaxis]
         noise = theta[:, len(self.actuator.parameters) :]

@@ -16,16 +16,16 @@ RANGES = Ranges(voltage=60.0, displacement=20.0, middle=0.0, time=1.0, bias=40.0
 
 def test_coefficients_are_displacements_at_the_edge_of_the_range() -> None:
     column = {"quadratic": np.array([1.0, -2.0]), "cubic": np.array([0.5, 0.0])}
-    w = PolynomialGain().displacement(column, np.array([-20.0, 40.0, 70.0, 100.0]), SPAN)
+    w = PolynomialGain(reference=SPAN).displacement(column, np.array([-20.0, 40.0, 70.0, 100.0]))
     np.testing.assert_allclose(w, [[0.5, 0.0, 0.3125, 1.5], [-2.0, 0.0, -0.5, -2.0]], rtol=1e-15)
 
 
 @pytest.mark.parametrize("term", ["quadratic", "cubic"])
 def test_a_single_term_needs_no_other_column(term: str) -> None:
-    gain, column = PolynomialGain((term,)), {term: np.array([3.0])}
+    gain, column = PolynomialGain((term,), SPAN), {term: np.array([3.0])}
     gain.check(column)
     assert [declared.name for declared in gain.parameters] == [term]
-    np.testing.assert_allclose(gain.displacement(column, np.array([100.0]), SPAN), [[3.0]])
+    np.testing.assert_allclose(gain.displacement(column, np.array([100.0])), [[3.0]])
 
 
 def test_the_default_priors_are_parts_of_the_displacement_range() -> None:
@@ -35,7 +35,7 @@ def test_the_default_priors_are_parts_of_the_displacement_range() -> None:
 
 def test_a_span_without_width_gives_nothing() -> None:
     column = {"quadratic": np.array([1.0]), "cubic": np.array([1.0])}
-    w = PolynomialGain().displacement(column, np.full(3, 5.0), Span(5.0, 5.0))
+    w = PolynomialGain(reference=Span(5.0, 5.0)).displacement(column, np.full(3, 5.0))
     np.testing.assert_array_equal(w, np.zeros((1, 3)))
 
 

@@ -4,14 +4,16 @@ What :mod:`bwbayes.model` and :mod:`bwbayes.inference.noise` do with arrays is d
 sample, for ``LANES`` models at once, so that a processor's vector instructions take several models
 a step and nothing larger than a cache is written. A few dozen samples at a time pass two stages:
 
-    drive        hysteresis, and the drive w = d u − h it leaves
+    drive        the hysteresis (:mod:`bwbayes.inference.compiled.stages`)
     innovations  linear dynamics, the noise's filter, and the sums its density needs
 
-The second stage has two forms. Most of a record passes :func:`_settled`: each sample has a reading,
-and the filter is in its steady state. Where readings are missing, or the filter is not settled, or
-still hears of the unknown start, the samples pass :func:`_exact`.
+The second stage has three forms. Most of a record passes :func:`_settled`: each sample has a
+reading, and the filter is in its steady state. Where readings are missing, or the filter is not
+settled, or still hears of the start of the dynamics, the samples pass :func:`_exact`. An offset of
+the record's own and the start of the creep are heard all along; once their innovations only follow
+them, :func:`_tracked` adds what they need to the settled form.
 
-The state of all models is one flat array, laid out in :mod:`bwbayes.inference.lanes`. This module
+The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lanes`). This module
 needs numba; it knows arrays and nothing else.
 """
 
@@ -22,145 +24,30 @@ import math
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 
 # isort: off
 # fmt: off
-from bwbayes.inference.lanes import (
-    A1, A2, AGAINST, AHEAD, ALPHA, B0, B1, B2, BEFORE, D, DECAY, ESTIMATE, FREE, GAIN, H,
-    INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS,
-    PHI, PREDICTED, PRODUCTS, RATE, RATIO, REST, SQUARES, STATE, SUMS, SURPLUS, TRUST, UNSURE,
-    VALUE, VARIANCE, X1, X2, Z,
+from bwbayes.inference.compiled.lanes import (
+    A1, A2, B0, B1, B2, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT,
+    LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO, SQUARES,
+    STATE, STRENGTH, SUM, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
+from bwbayes.inference.compiled.parts import creep, polynomial
+from bwbayes.inference.compiled.stages import drive_of
 
 __all__ = ["sums"]
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
 
-# φ(z) = (1 − exp(−z)) / z by its series, to 3e-14 of itself up to this z; doubled beyond.
-SHORT = 0.1
-C1, C2, C3, C4, C5, C6, C7 = -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040, -1 / 40320
-
 # What is below this part of its size at the start adds nothing.
 FORGOTTEN = 1e-20
 
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _drive(
-    state: FloatArray, voltage: FloatArray, first: int, last: int, steepest: float, out: FloatArray
-) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move h on.
-
-    Along a step of v = |Δu| in direction s, g = s h follows dg/dv = α − c g exactly by
-    g + (α − c g) v φ(c v), which has no difference of nearly equal numbers at small steps.
-    """
-    for t in range(first, last):
-        u = voltage[t]
-        step = u - voltage[t - 1] if t > 0 else 0.0
-        row = (t - first) * LANES
-        s = 1.0 if step > 0.0 else -1.0
-        v = abs(step)
-        crossings = 0
-        if step == 0.0:
-            for i in range(LANES):
-                out[row + i] = state[D + i] * u - state[H + i] - state[REST + i]
-        elif v * steepest <= SHORT:
-            crossings = _short_step(state, s, u, v, row, out)
-        else:
-            crossings = _long_step(state, s, u, v, steepest, row, out)
-        if crossings > 0:
-            _cross(state, s, u, v, row, out)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _short_step(state: FloatArray, s: float, u: float, v: float, row: int, out: FloatArray) -> int:
-    """Move h along a step whose z is small; return how many models passed zero."""
-    crossings = 0
-    for i in range(LANES):
-        g = s * state[H + i]
-        # Both are read first: a compiler does not make vectors of what is read on a condition.
-        ahead = state[AHEAD + i]
-        against = state[AGAINST + i]
-        c = against if g < 0.0 else ahead
-        z = c * v
-        end = C4 + z * (C5 + z * (C6 + z * C7))
-        phi = 1.0 + z * (C1 + z * (C2 + z * (C3 + z * end)))
-        new = g + (state[ALPHA + i] - c * g) * (v * phi)
-        crossings += (g < 0.0) & (new > 0.0)
-        h = s * new
-        state[BEFORE + i] = g
-        state[H + i] = h
-        out[row + i] = state[D + i] * u - h - state[REST + i]
-    return crossings
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _long_step(
-    state: FloatArray, s: float, u: float, v: float, steepest: float, row: int, out: FloatArray
-) -> int:
-    """Move h along a step of any size: φ(2z) = φ(z) (1 − z φ(z) / 2) from a small z on."""
-    part, doublings = v, 0
-    while part * steepest > SHORT:
-        part *= 0.5
-        doublings += 1
-    for i in range(LANES):
-        g = s * state[H + i]
-        ahead = state[AHEAD + i]
-        against = state[AGAINST + i]
-        z = (against if g < 0.0 else ahead) * part
-        end = C4 + z * (C5 + z * (C6 + z * C7))
-        state[PHI + i] = 1.0 + z * (C1 + z * (C2 + z * (C3 + z * end)))
-        state[Z + i] = z
-        state[BEFORE + i] = g
-    for _ in range(doublings):
-        for i in range(LANES):
-            z = state[Z + i]
-            phi = state[PHI + i]
-            state[PHI + i] = phi * (1.0 - 0.5 * z * phi)
-            state[Z + i] = 2.0 * z
-    crossings = 0
-    for i in range(LANES):
-        g = state[BEFORE + i]
-        new = g + (state[ALPHA + i] * v - state[Z + i] * g) * state[PHI + i]
-        crossings += (g < 0.0) & (new > 0.0)
-        h = s * new
-        state[H + i] = h
-        out[row + i] = state[D + i] * u - h - state[REST + i]
-    return crossings
-
-
-@njit(nogil=True, cache=True)
-def _cross(state: FloatArray, s: float, u: float, v: float, row: int, out: FloatArray) -> None:
-    """Redo the models whose g passed zero within the step, where its rate changes."""
-    for i in range(LANES):
-        g, alpha = state[BEFORE + i], state[ALPHA + i]
-        if g < 0.0 < s * state[H + i]:
-            against, ahead = state[AGAINST + i], state[AHEAD + i]
-            ratio = -g * against / alpha
-            # What is left of v after zero, and how far g gets in it: with limits at a rate of zero.
-            left = max(v - (-g / alpha if ratio == 0.0 else math.log1p(ratio) / against), 0.0)
-            gone = ahead * left
-            h = s * alpha * (left if gone == 0.0 else -math.expm1(-gone) / ahead)
-            state[H + i] = h
-            out[row + i] = state[D + i] * u - h - state[REST + i]
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _given(
-    state: FloatArray,
-    voltage: FloatArray,
-    first: int,
-    last: int,
-    known: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write w − w₀ for h (lanes, samples) that is known already."""
-    for t in range(first, last):
-        for i in range(LANES):
-            out[(t - first) * LANES + i] = state[D + i] * voltage[t] - known[i, t] - state[REST + i]
+# An innovation that follows its response to this part of it does not do so better.
+ROUNDING = 1e-13
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -195,15 +82,18 @@ def _exact(
     first: int,
     last: int,
     drive: FloatArray,
+    lags: FloatArray,
     offset: int,
     free: int,
+    slow: int,
 ) -> None:
     """Do the same for any samples, any state of the filter, and the responses of the start.
 
-    ``skipped`` is negative where there is no reading. ``offset`` and ``free`` count the responses
-    that are followed.
+    ``skipped`` is negative where there is no reading. ``offset``, ``free`` and ``slow`` count the
+    responses that are followed.
     """
-    series = 1 + offset + free
+    first_slow = 1 + offset + free
+    series = first_slow + slow
     for t in range(first, last):
         row = (t - first) * LANES
         for i in range(LANES):
@@ -212,17 +102,22 @@ def _exact(
             state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
             state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
             state[VALUE + i] = displacement[t] - state[LEVEL + i] - x
-        for k in range(1 + offset, series):
+        for k in range(1 + offset, first_slow):
             at = k * LANES
             for i in range(LANES):
                 x = state[KEEP_1 + at + i]
-                state[KEEP_1 + at + i] = state[KEEP_2 + at + i] - state[A1 + i] * x
-                state[KEEP_2 + at + i] = -state[A2 + i] * x
+                state[KEEP_1 + at + i] = state[KEEP_2 + at + i] - state[TRUE_A1 + i] * x
+                state[KEEP_2 + at + i] = -state[TRUE_A2 + i] * x
                 state[VALUE + at + i] = x
+        for k in range(slow):
+            at = (first_slow + k) * LANES
+            left = lags[k, 2]
+            for i in range(LANES):
+                state[VALUE + at + i] = state[KEEP_1 + at + i]
+                state[KEEP_1 + at + i] *= left
         if skipped[t] < 0.0:
             continue
-        if skipped[t] > 0.0:
-            _skip(state, skipped[t], series)
+        _skip(state, skipped[t], series)
         for i in range(LANES):
             ratio = state[UNSURE + i] / state[VARIANCE + i]
             inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
@@ -248,9 +143,98 @@ def _exact(
     _take_logs(state)
 
 
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _tracked(
+    state: FloatArray,
+    displacement: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
+    left: FloatArray,
+    series: IntArray,
+) -> None:
+    """Do the settled form, with responses whose innovations follow them.
+
+    A response r that keeps the part ρ of itself from reading to reading has an innovation κ r, with
+    κ = (ρ − φ)/(ρ − a), so only Σ ρᵗ η of the residual's innovations η has to be added up; products
+    of two responses are geometric sums. ``left`` is ρ of each, ``series`` says which they are.
+    """
+    count = series.size
+    for k in range(count):
+        for i in range(LANES):
+            state[INNOVATION + series[k] * LANES + i] = 0.0
+    weight = np.ones(count)
+    for t in range(first, last):
+        y = displacement[t]
+        row = (t - first) * LANES
+        for i in range(LANES):
+            w = drive[row + i]
+            x = state[B0 + i] * w + state[X1 + i]
+            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
+            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
+            residual = y - state[LEVEL + i] - x
+            estimate = state[ESTIMATE + i]
+            innovation = residual - estimate
+            state[ESTIMATE + i] = state[DECAY + i] * estimate + state[GAIN + i] * residual
+            state[SQUARES + i] += innovation * innovation
+            state[SUM + i] = innovation
+        for k in range(count):
+            part, at = weight[k], INNOVATION + series[k] * LANES
+            for i in range(LANES):
+                state[at + i] += part * state[SUM + i]
+            weight[k] *= left[k]
+    for k in range(count):
+        at, rho = series[k] * LANES, left[k]
+        for j in range(k + 1):
+            other, sigma = series[j] * LANES, left[j]
+            both = rho * sigma
+            total = float(last - first)
+            if both < 1.0:
+                total = (1.0 - weight[k] * weight[j]) / (1.0 - both)
+            pair = PRODUCTS + (series[k] * (series[k] + 1) // 2 + series[j]) * LANES
+            for i in range(LANES):
+                own = state[KEEP_1 + at + i] * _follows(state, i, rho)
+                its = state[KEEP_1 + other + i] * _follows(state, i, sigma)
+                state[pair + i] += own * its * total / state[VARIANCE + i]
+        pair = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
+        for i in range(LANES):
+            kappa = _follows(state, i, rho)
+            pull = kappa * state[KEEP_1 + at + i] * state[INNOVATION + at + i]
+            state[pair + i] += pull / state[VARIANCE + i]
+    for k in range(count):
+        at = series[k] * LANES
+        for i in range(LANES):
+            state[KEEP_1 + at + i] *= weight[k]
+            follows = _follows(state, i, left[k])
+            state[ESTIMATE + at + i] = state[KEEP_1 + at + i] * (1.0 - follows)
+
+
+@njit(nogil=True, cache=True)
+def _follows(state: FloatArray, i: int, rho: float) -> float:
+    """Return κ, the innovation of a response that keeps ρ of itself, over the response."""
+    return float((rho - state[KEPT + i]) / (rho - state[DECAY + i]))
+
+
+@njit(nogil=True, cache=True)
+def _is_tracked(state: FloatArray, left: FloatArray, series: IntArray) -> bool:
+    """Tell whether the innovations of all those responses only follow them, to their rounding."""
+    for k in range(series.size):
+        at = series[k] * LANES
+        for i in range(LANES):
+            if left[k] <= state[DECAY + i]:
+                return False
+            keep = state[KEEP_1 + at + i]
+            apart = state[ESTIMATE + at + i] - keep * (1.0 - _follows(state, i, left[k]))
+            if not abs(apart) <= ROUNDING * abs(keep):
+                return False
+    return True
+
+
 @njit(nogil=True, cache=True)
 def _skip(state: FloatArray, readings: float, series: int) -> None:
     """Let the filter pass over missing readings; before one, the product of variances is logged."""
+    if readings == 0.0:
+        return
     _take_logs(state)
     for i in range(LANES):
         kept = math.exp(-readings * state[RATE + i])
@@ -277,10 +261,8 @@ def _is_settled(state: FloatArray) -> bool:
 
 @njit(nogil=True, cache=True)
 def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
-    """Tell whether any model's filter still hears of the unknown start."""
-    if offset > 0:
-        return True
-    for i in range(LANES, (1 + free) * LANES):
+    """Tell whether any model's filter still hears of the unknown start of the dynamics."""
+    for i in range((1 + offset) * LANES, (1 + offset + free) * LANES):
         left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
         if left > FORGOTTEN:
             return True
@@ -288,7 +270,7 @@ def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
 
 
 @njit(nogil=True, cache=True)
-def _begin(state: FloatArray, offset: int, free: int) -> None:
+def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
     """Put all that a model remembers to the record's first sample."""
     for i in range(len(PARAMETERS) * LANES, STATE):
         state[i] = 0.0
@@ -297,50 +279,64 @@ def _begin(state: FloatArray, offset: int, free: int) -> None:
         state[UNSURE + i] = state[SURPLUS + i]
         if offset > 0:
             state[VALUE + LANES + i] = 1.0
+            state[KEEP_1 + LANES + i] = 1.0
         for k in range(free):
             at = (1 + offset + k) * LANES + i
             state[KEEP_1 + at] = state[FREE + 2 * k * LANES + i]
             state[KEEP_2 + at] = state[FREE + (2 * k + 1) * LANES + i]
+        for k in range(slow):
+            at = (1 + offset + free + k) * LANES + i
+            state[KEEP_1 + at] = state[STRENGTH + k * LANES + i]
 
 
 @njit(nogil=True, cache=True)
 def _group(
+    kind: int,
+    own: FloatArray,
+    plan: FloatArray,
+    curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
     state: FloatArray,
     voltage: FloatArray,
     displacement: FloatArray,
     skipped: FloatArray,
-    hysteretic: FloatArray,
     offset: int,
     free: int,
+    slow: int,
     result: FloatArray,
 ) -> None:
     """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
-    steepest = 0.0
-    for i in range(LANES):
-        steepest = max(steepest, state[AHEAD + i], state[AGAINST + i])
-    _begin(state, offset, free)
+    _begin(state, offset, free, slow)
     drive = _aligned(PIECE * LANES)
-    now, settled, heard = 0, False, True
+    # Responses that stay: the offset, and those of the creep.
+    left, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
+    for k in range(slow):
+        left[offset + k], series[offset + k] = lags[k, 2], 1 + offset + free + k
+    now, settled, heard, tracked = 0, False, True, False
     while now < voltage.size:
         last = min(now + PIECE, voltage.size)
-        plain = settled and not heard and skipped[now] == 0.0
+        plain = settled and tracked and not heard and skipped[now] == 0.0
         if plain:
             # As far as every sample has a reading.
             end = now
             while end < last and skipped[end] == 0.0:
                 end += 1
             last = end
-        if hysteretic.shape[1] > 0:
-            _given(state, voltage, now, last, hysteretic, drive)
-        else:
-            _drive(state, voltage, now, last, steepest, drive)
-        if plain:
+        drive_of(kind, own, plan, voltage, now, last, drive)
+        if curve.size > 0:
+            polynomial(state, curve, now, last, drive)
+        if lags.size > 0:
+            creep(state, lags, growth, now, last, drive)
+        if plain and series.size == 0:
             _settled(state, displacement, now, last, drive)
+        elif plain:
+            _tracked(state, displacement, now, last, drive, left, series)
         else:
-            followed = free if heard else 0
-            _exact(state, displacement, skipped, now, last, drive, offset, followed)
+            _exact(state, displacement, skipped, now, last, drive, lags, offset, free, slow)
             settled = _is_settled(state)
             heard = heard and _is_heard(state, offset, free)
+            tracked = settled and not heard and _is_tracked(state, left, series)
         now = last
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]
@@ -363,15 +359,21 @@ def sums(
     displacement: FloatArray,
     skipped: FloatArray,
     models: FloatArray,
-    hysteretic: FloatArray,
+    kind: int,
+    own: FloatArray,
+    plan: FloatArray,
+    curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
     offset: int,
     free: int,
+    slow: int,
 ) -> FloatArray:
     """Return what the noise's density needs, (SUMS, models).
 
     First Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of series:
-    the residual (um), the offset's response if ``offset`` is one, and ``free`` free responses. Then
-    Σ log S less that of the steady state.
+    the residual (um), the offset's response if ``offset`` is one, ``free`` free responses of the
+    dynamics and ``slow`` ones of the creep. Then Σ log S less that of the steady state.
 
     Parameters
     ----------
@@ -381,20 +383,27 @@ def sums(
         (samples,) how many readings are missing just before one, −1 where there is none.
     models
         (models, parameters), the columns as in ``PARAMETERS``.
-    hysteretic
-        h, (models, samples), um, if it is known; (models, 0) to be worked out for n = 1.
+    kind, own, plan
+        The stage that makes the drive, what each model is in it (models, rows), and what it knows
+        of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
+    curve, lags, growth
+        What gain and creep know, as in :mod:`bwbayes.inference.compiled.parts`.
     """
     count = models.shape[0]
     result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
-    state, known = _aligned(STATE), np.empty((LANES, hysteretic.shape[1]))
+    state, mine = _aligned(STATE), _aligned(own.shape[1] * LANES)
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            known[i] = hysteretic[model]
-        _group(state, voltage, displacement, skipped, known, offset, free, part)
+            for row in range(own.shape[1]):
+                mine[row * LANES + i] = own[model, row]
+        _group(
+            kind, mine, plan, curve, lags, growth, state, voltage, displacement, skipped,
+            offset, free, slow, part,
+        )  # fmt: skip
         last = min(first + LANES, count)
         result[:, first:last] = part[:, : last - first]
     return result

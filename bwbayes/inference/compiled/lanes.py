@@ -7,28 +7,40 @@ these numbers into what it compiles, so whoever changes them deletes what it has
 
 from __future__ import annotations
 
+from bwbayes.model.creep import MOST_TIMES
+
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.
 LANES = 32
 
 # Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
+# The coefficients of the dynamics come twice: with creep, the filter of the noise sees dynamics
+# that follow at once, because the creep's stage has been through the true ones already.
 PARAMETERS = (
-    "initial", "alpha", "against", "ahead", "d", "rest", "level",
+    "level",
     "b0", "b1", "b2", "a1", "a2",
     "kept", "decay", "gain", "predicted", "variance", "surplus", "rate",
     "free_11", "free_12", "free_21", "free_22",
+    "true_b0", "true_b1", "true_b2", "true_a1", "true_a2",
+    "quadratic", "cubic", "rest", "growth",
+    *(f"strength_{number}" for number in range(1, MOST_TIMES + 1)),
 )  # fmt: skip
 (
-    H, ALPHA, AGAINST, AHEAD, D, REST, LEVEL, B0, B1, B2, A1, A2,
-    KEPT, DECAY, GAIN, PREDICTED, VARIANCE, SURPLUS, RATE, FREE,
-) = (LANES * row for row in range(20))  # fmt: skip
-MEMORY = 11
+    LEVEL, B0, B1, B2, A1, A2,
+    KEPT, DECAY, GAIN, PREDICTED, VARIANCE, SURPLUS, RATE,
+    FREE, FREE_12, FREE_21, FREE_22,
+    TRUE_B0, TRUE_B1, TRUE_B2, TRUE_A1, TRUE_A2,
+    QUADRATIC, CUBIC, REST, GROWTH,
+    STRENGTH,
+) = (LANES * row for row in range(len(PARAMETERS) - MOST_TIMES + 1))  # fmt: skip
+MEMORY = 12 + MOST_TIMES
 (
-    X1, X2, UNSURE, SQUARES, RATIO, INVERSE, TRUST, BEFORE, Z, PHI, LOG,
-) = (LANES * (len(PARAMETERS) + row) for row in range(MEMORY))  # fmt: skip
+    X1, X2, UNSURE, SQUARES, RATIO, INVERSE, TRUST, LOG, TRUE_X1, TRUE_X2, CREEPS, SUM, LAG,
+) = (LANES * (len(PARAMETERS) + row) for row in range(MEMORY - MOST_TIMES + 1))  # fmt: skip
 
-# The series that are filtered: the residual, the record's own offset, two free responses. Each has
-# a value, an estimate, an innovation; the free responses two numbers that their recursion keeps.
-SERIES = 4
+# The series that are filtered: the residual, the record's own offset, two free responses of the
+# dynamics, those of the creep. Each has a value, an estimate, an innovation; the free responses two
+# numbers that their recursion keeps.
+SERIES = 4 + MOST_TIMES
 VALUE, ESTIMATE, INNOVATION, KEEP_1, KEEP_2 = (
     LANES * (len(PARAMETERS) + MEMORY + SERIES * row) for row in range(5)
 )

@@ -1,0 +1,149 @@
+"""Creep: the displacement goes on growing for long after a step of the voltage.
+
+A piezo actuator's creep is nearly linear in the drive and in the logarithm of the time: after a
+step it grows by about a percent of it per decade. A sum of first-order lags with log-spaced times
+does just that, one lag per decade here, each with a strength of its own:
+
+    x_creep = Σ cᵢ Lᵢ[w (1 + κ |u| / U)],   Tᵢ Lᵢ′ + Lᵢ = w (1 + κ |u| / U).
+
+Equal strengths c give c log₁₀(t) between the shortest and the longest of the times. κ lets the
+creep grow with the voltage. The lags stand beside the dynamics, not behind them: their times are so
+much longer that the order does not show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.declaration import Context, Declaration, Values
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.linear import Hold, Recursion, first_order_lag
+from bwbayes.model.operator import UNIT, Span
+
+__all__ = ["MOST_TIMES", "Creep", "creep_times"]
+
+# Prior scale of the creep per decade of time, as a part of the displacement.
+PER_DECADE = 0.02
+
+# Prior scale of how much more the creep is at the largest voltage, as a part of it.
+GROWTH = 1.0
+
+# Times that a model may have, and of the record's: samples to the shortest, records to the longest.
+MOST_TIMES = 8
+SHORTEST, LONGEST = 10.0, 3.0
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Creep with lags of given times.
+
+    Parameters
+    ----------
+    times
+        Tᵢ, s, rising.
+    growing
+        Whether the creep grows with the voltage by κ.
+    reference
+        The range of the voltage that κ is for: that of the record that is fitted.
+
+    Raises
+    ------
+    InputError
+        Times that are not positive and rising, none or too many.
+    """
+
+    times: tuple[float, ...]
+    growing: bool = False
+    reference: Span = UNIT
+
+    def __post_init__(self) -> None:
+        rising = all(one < other for one, other in pairwise((0.0, *self.times)))
+        if not rising or not 0 < len(self.times) <= MOST_TIMES or not math.isfinite(self.times[-1]):
+            raise InputError(
+                f"creep: {list(self.times)} are no times; give up to {MOST_TIMES} positive ones "
+                "in s that rise, or true"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the strengths."""
+        return tuple(f"creep_{number}" for number in range(1, len(self.times) + 1))
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """The strengths cᵢ, and κ if the creep grows with the voltage."""
+        strengths = tuple(
+            Declaration(
+                name,
+                "-",
+                rf"c_{number}",
+                f"creep with a time of {time:g} s, as a part of the drive",
+                self._strength,
+                floor=0.0,
+            )
+            for number, (name, time) in enumerate(zip(self.names, self.times, strict=True), 1)
+        )
+        if not self.growing:
+            return strengths
+        growth = Declaration(
+            "creep_growth",
+            "-",
+            r"\kappa",
+            "growth of the creep from no voltage to the largest, as a part of it",
+            lambda _: Distribution("halfnormal", {"scale": GROWTH}),
+            floor=0.0,
+        )
+        return (*strengths, growth)
+
+    def _strength(self, known: Context) -> Distribution:
+        del known
+        decades = 1.0
+        if len(self.times) > 1:
+            decades = math.log10(self.times[-1] / self.times[0]) / (len(self.times) - 1)
+        return Distribution("halfnormal", {"scale": round(PER_DECADE * decades, 4)})
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where a parameter is negative or not finite."""
+        for declared in self.parameters:
+            values = column[declared.name]
+            allowed = np.isfinite(values) & (values >= 0)
+            if not allowed.all():
+                row = int(np.argmin(allowed))
+                raise InputError(
+                    f"{declared.name}: {values[row]:.6g} in model {row}; must be finite and not "
+                    "negative"
+                )
+
+    def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
+        """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""
+        if not self.growing:
+            return drive.copy()
+        size = self.size(voltage)
+        crept: FloatArray = drive * (1 + column["creep_growth"][:, np.newaxis] * size)
+        return crept
+
+    def size(self, voltage: FloatArray) -> FloatArray:
+        """Return |u| / U (samples,), with U the largest voltage of the reference."""
+        largest = max(abs(self.reference.low), abs(self.reference.high))
+        return np.abs(voltage) / largest if largest > 0 else np.zeros_like(voltage)
+
+    def recursions(self, models: int, interval: float, hold: Hold) -> tuple[Recursion, ...]:
+        """Return the lags Lᵢ, the same for all of a number of models."""
+        return tuple(first_order_lag(np.full(models, time), interval, hold) for time in self.times)
+
+
+def creep_times(interval: float, duration: float) -> Sequence[float]:
+    """Return powers of ten in s, from some samples to some lengths of a record.
+
+    At least one: that next to the record's length.
+    """
+    first = math.ceil(math.log10(SHORTEST * interval))
+    last = max(math.floor(math.log10(LONGEST * duration)), first)
+    return [10.0**power for power in range(max(first, last - MOST_TIMES + 1), last + 1)]

@@ -1,0 +1,135 @@
+"""Gain and creep in the likelihood: a dense Gaussian, both engines, slow starts, old equations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from bwbayes.inference.engine import Engine
+from bwbayes.model.creep import Creep, creep_times
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from tests.inference.test_likelihood import assert_dense, moving
+
+REFERENCE = Span(-90.0, 80.0)
+GAIN = PolynomialGain(reference=REFERENCE)
+CREEP = Creep((0.1, 1.0, 10.0), reference=REFERENCE)
+GROWING = replace(CREEP, growing=True)
+
+PARTS: dict[str, dict[str, Any]] = {
+    "gain": {"gain": GAIN},
+    "creep": {"creep": CREEP},
+    "growing": {"creep": GROWING},
+    "both": {"gain": GAIN, "creep": GROWING},
+}
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_the_unknown_start_is_integrated_out(
+    engine: str, parts: str, dynamics: str, hold: Hold
+) -> None:
+    fixed = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
+    posterior = moving("discrepancy", dynamics, fixed, hold=hold, missing=0.1, parts=PARTS[parts])
+    for offset in (0.0, 3.0):
+        likelihood = replace(posterior.likelihood, engine=cast(Engine, engine), offset_sd=offset)
+        theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 3))
+        assert_dense(likelihood, theta)
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+@pytest.mark.parametrize("noise", ["white", "discrepancy"])
+@pytest.mark.parametrize("missing", [0.0, 0.01])
+def test_engines_agree_along_records_that_are_long_for_the_filter(
+    parts: str, offset: float, noise: str, missing: float
+) -> None:
+    """Most of the record passes the short form, in which slow responses are only followed."""
+    posterior = moving(noise, "lag", missing=missing, parts=PARTS[parts])
+    repeated = 12
+    posterior = replace(
+        posterior,
+        voltage=np.tile(posterior.voltage, repeated),
+        displacement=np.tile(posterior.displacement, repeated),
+        training=(slice(0, 200 * repeated),),
+    )
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
+    likelihood = replace(posterior.likelihood, offset_sd=offset)
+    one, other = (
+        replace(likelihood, engine="numpy").start(theta),
+        replace(likelihood, engine="numba").start(theta),
+    )
+    size = 200 * repeated + np.abs(one.log_density)
+    assert np.max(np.abs(one.log_density - other.log_density) / size) < 1e-10
+    sd = posterior.likelihood.start_sd(theta)
+    if sd.size and not offset:
+        assert np.max(np.abs(one.mean - other.mean) / np.max(sd, axis=1)[:, np.newaxis]) < 1e-6
+
+
+def test_creep_after_a_step_is_that_of_its_lags() -> None:
+    """Σ cᵢ (1 − exp(−t/Tᵢ)) of the step, without hysteresis, dynamics or growth."""
+    posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": CREEP})
+    actuator, names = posterior.actuator, posterior.actuator.parameters
+    value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0}
+    strength = {"creep_1": 0.01, "creep_2": 0.02, "creep_3": 0.03}
+    theta = [[(value | strength).get(name, 0.0) for name in names]]
+    voltage = np.full(500, 50.0)
+    voltage[:100] = 0.0
+    time = actuator.interval * np.arange(400)
+    # The drive goes straight from sample to sample, so the step is a ramp of one interval.
+    ramp = actuator.interval
+    expected = 50.0 + sum(
+        50.0 * c * (1 - np.exp(-time / T) * T / ramp * np.expm1(ramp / T) * np.exp(-ramp / T))
+        for c, T in zip(strength.values(), CREEP.times, strict=True)
+    )
+    x = actuator.displacement(theta, voltage)[0]
+    np.testing.assert_allclose(x[:100], 0.0, atol=1e-9)
+    np.testing.assert_allclose(x[100:], expected, rtol=1e-9)
+
+
+def test_creep_that_grows_is_as_strong_as_stated_at_the_largest_voltage() -> None:
+    posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": GROWING})
+    names = posterior.actuator.parameters
+    value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0, "creep_1": 0.05}
+    voltage = np.concatenate([[0.0], np.full(3000, 90.0)])
+    for growth in (0.0, 0.5):
+        theta = [[(value | {"creep_growth": growth}).get(name, 0.0) for name in names]]
+        x = posterior.actuator.displacement(theta, voltage)[0]
+        assert x[-1] == pytest.approx(90 * (1 + 0.05 * (1 + growth)), rel=1e-9)
+
+
+def test_pieces_equal_the_whole_with_gain_and_creep() -> None:
+    posterior = moving("white", "second-order", {"mass": 300.0, "stiffness": 4.1e5},
+                       parts=PARTS["both"])  # fmt: skip
+    actuator = posterior.likelihood.actuator
+    theta = posterior.table.actuator(
+        posterior.prior.theta(posterior.prior.draw(np.random.default_rng(6), 4))
+    )
+    unrest = np.random.default_rng(7).normal(size=(4, actuator.unknowns))
+    whole = actuator.advance(theta, posterior.voltage, unrest=unrest)[0]
+    state, parts = None, []
+    for first, last in ((0, 1), (1, 70), (70, 200)):
+        part, state = actuator.advance(theta, posterior.voltage[first:last], state, unrest)
+        parts.append(part)
+    np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, rtol=1e-11, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("interval", "duration", "times"),
+    [
+        (1e-3, 10.0, [0.01, 0.1, 1.0, 10.0]),
+        (0.02, 30.0, [1.0, 10.0]),
+        (1.0, 2.0, [10.0]),
+        (1e-6, 3600.0, [0.001, 0.01, 0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0]),
+    ],
+)
+def test_times_are_powers_of_ten_from_samples_to_records(
+    interval: float, duration: float, times: list[float]
+) -> None:
+    assert times == pytest.approx(creep_times(interval, duration))
