@@ -97,7 +97,7 @@ class BoucWenAsymmetric(OneState):
             loop=True,
         )
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        return d(), alpha(), beta(0.15), gamma, *self._asymmetry(), initial()
+        return d(), alpha(), beta(0.15, _beta_bounds), gamma, *self._asymmetry(), initial()
 
     def _asymmetry(self) -> list[Declaration]:
         return [
@@ -150,6 +150,10 @@ class BoucWenAsymmetric(OneState):
         """Return d."""
         return column["d"]
 
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return β U."""
+        return column["beta"] * half_range
+
 
 def _follow(
     flows: dict[tuple[float, float], _LinearFlow], s: float, start: FloatArray, along: FloatArray
@@ -187,6 +191,10 @@ def _passive(column: Values) -> BoolArray:
         gamma = np.abs(column["gamma"] + column["beta"] * fast)
         inside &= gamma <= column["beta"] * (slow + SLACK)
     return inside
+
+
+def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    return np.abs(earlier.get("gamma", np.zeros(1))), np.inf
 
 
 def _within(top: ArrayLike) -> tuple[ArrayLike, ArrayLike]:

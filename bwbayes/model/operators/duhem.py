@@ -88,7 +88,7 @@ class Duhem(OneState):
             loop=True,
         )
         # The bounds of α₂ and α₁ cut the joint prior, which takes small β away.
-        first, last = (d(), gains, alpha(), beta(0.3), strengths), initial_anywhere()
+        first, last = (d(), gains, alpha(), beta(0.3, _beta_bounds), strengths), initial_anywhere()
         if self.odd:
             return *first, last
         even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient", 0.1)
@@ -175,6 +175,10 @@ class Duhem(OneState):
         mean = column["d"] + even * (low + high)
         return np.asarray(mean + column["d3"] * (low**2 + low * high + high**2))
 
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return β U."""
+        return column["beta"] * half_range
+
 
 def phi_functions(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0 of any shape, to rounding.
@@ -227,6 +231,12 @@ def _farthest(known: Context) -> float:
 def _growth(known: Context) -> Distribution:
     scale = 0.3 * known.ranges.gain / _farthest(known) ** 2
     return Distribution("halfnormal", {"scale": rounded(scale)})
+
+
+def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    if "alpha" not in earlier or "alpha2" not in earlier:
+        return 0.0, np.inf
+    return np.sqrt(np.maximum(earlier["alpha2"], 0.0) / (4 * earlier["alpha"])), np.inf
 
 
 def _alpha2_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -9,6 +9,7 @@ drives may have left then follow.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,9 @@ __all__ = [
 
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
+
+
+Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 
 
 class Memory(NamedTuple):
@@ -87,10 +91,6 @@ class OneState(Operator):
         """Return the state (models,) without hysteresis at a voltage."""
         return np.zeros_like(column["initial"])
 
-    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:  # noqa: ARG002
-        """Return nothing: there is nothing to say."""
-        return []
-
 
 def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:
     """Raise an InputError that names the parameter and the first model that is wrong."""
@@ -144,7 +144,7 @@ def below_d(column: Values) -> BoolArray:
     return inside
 
 
-def beta(part: float = 1.0) -> Declaration:
+def beta(part: float = 1.0, bounds: Bounds | None = None) -> Declaration:
     """Declare β, near 1/U or a ``part`` of it, where other parameters' bounds favour a large β."""
     return Declaration(
         "beta",
@@ -153,6 +153,7 @@ def beta(part: float = 1.0) -> Declaration:
         "hysteresis loop shape",
         lambda known: lognormal(part / known.ranges.voltage, 2.3),
         floor=0.0,
+        bounds=bounds,
         loop=True,
     )
 
