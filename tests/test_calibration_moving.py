@@ -38,10 +38,10 @@ from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data.files import write_record
 from bwbayes.data.record import Record
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.calibration import Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
-from bwbayes.results.simulated import discrepancy
 from tests.found import keep
 from tests.together import LEVEL, Plant, shifted, together_test
 
@@ -121,9 +121,10 @@ def typical(
     voltage = 100 * np.exp(-0.1 * time) * np.sin(2 * np.pi * frequency * time)
     actuator = Actuator("lag", "first", interval)
     clean = actuator.displacement([[TRUE[name] for name in actuator.parameters]], voltage)[0]
-    noise = {"discrepancy_sd": np.array([1.0]), "discrepancy_time": np.array([0.3])}
-    slow = discrepancy(noise, time.size, interval, generator)
-    reading = clean + slow + generator.normal(0, 0.3, time.size)
+    slow, sensor = DiscrepancyNoise(interval).draw(
+        np.array([[0.3, 1.0, 0.3]]), time.size, generator
+    )
+    reading = clean + slow + sensor
     cut = time.size - round(duration / interval)
     return Record(voltage[cut:], reading[cut:], interval)
 

@@ -163,10 +163,11 @@ class ModelConfig(_Table):
     of what their neighbours predict are set aside.
     """
 
-    dynamics: Literal["none", "lag", "second-order"] = "lag"
+    hysteresis: str = "bouc-wen"
+    dynamics: str = "lag"
     hold: Literal["auto", "first", "zero"] = "auto"
-    noise: Literal["discrepancy", "white"] = "discrepancy"
-    passive: bool = True
+    noise: str = "discrepancy"
+    passive: bool | None = None
     outliers: bool = False
 
 

@@ -7,58 +7,47 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from bwbayes.app.config import Config, ParameterConfig
 from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
+from bwbayes.inference.defaults import ranges_of
+from bwbayes.inference.noise import NOISES
 from bwbayes.inference.parameters import Parameter
+from bwbayes.model.actuator import OFFSET
+from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 
-__all__ = ["as_config", "defaults_of", "parameters_of"]
-
-# What people call a parameter, and its name here.
-MEANINGS = {
-    "n": "exponent",
-    "h0": "initial",
-    "k": "stiffness",
-    "m": "mass",
-    "b": "damping",
-    "a": "alpha",
-    "tau": "lag",
-    "time_constant": "lag",
-    "y0": "offset",
-    "gain": "d",
-    "d33": "d",
-    "noise": "sensor_sd",
-    "sigma": "discrepancy_sd",
-}
+__all__ = ["as_config", "context_of", "every_declaration", "parameters_of"]
 
 # No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
 LARGEST = 1e60
 
 
-def parameters_of(config: Config, names: tuple[str, ...], defaults: Defaults) -> list[Parameter]:
-    """Return the parameters of those names.
+def parameters_of(
+    config: Config, declarations: Sequence[Declaration], context: Context
+) -> list[Parameter]:
+    """Return the parameters that a model's parts declare.
 
     Raises
     ------
     InputError
         The config says something of a parameter that the model does not have, or cannot have.
     """
-    _require_known("parameters", config.parameters, names)
-    _require_known("truth", config.truth, CATALOGUE)
-    given = {name: config.parameters.get(name, ParameterConfig()) for name in names}
+    _require_known("parameters", config.parameters, declarations)
+    _require_known("truth", config.truth, every_declaration())
+    given = {d.name: config.parameters.get(d.name, ParameterConfig()) for d in declarations}
     if config.record.from_rest:
         given |= {"initial": config.parameters.get("initial", ParameterConfig(fixed=0.0))}
-    return [_parameter(name, given[name], defaults) for name in names]
+    return [_parameter(d, given[d.name], context) for d in declarations]
 
 
-def defaults_of(config: Config, record: Record, training: tuple[slice, ...]) -> Defaults:
-    """Return what gives default priors, from the training windows (slices) of the record.
+def context_of(config: Config, record: Record, training: tuple[slice, ...]) -> Context:
+    """Return what default priors may know, from the training windows (slices) of the record.
 
     Raises
     ------
@@ -70,60 +59,59 @@ def defaults_of(config: Config, record: Record, training: tuple[slice, ...]) -> 
     voltage, displacement = record.voltage[rows], record.displacement[rows]
     if np.ptp(voltage) == 0 or np.nanmax(displacement) == np.nanmin(displacement):
         raise InputError("record.train: voltage or displacement is constant there; widen it")
-    return Defaults(
-        Ranges.of(record.voltage, record.displacement, record.interval, training),
-        _exponent(config),
-        _fixed(config, "stiffness", None),
-        _fixed(config, "gamma", None) is None,
-    )
+    ranges = ranges_of(record.voltage, record.displacement, record.interval, training)
+    return Context(ranges, dict(_stated(config)))
 
 
-def _require_known(table: str, given: Collection[str], known: Collection[str]) -> None:
+def _stated(config: Config) -> Iterator[tuple[str, float | Distribution]]:
+    """Yield what the config states of parameters: values, and priors."""
+    for name, given in config.parameters.items():
+        if given.prior is not None:
+            yield name, _distribution(name, given.prior)
+        elif given.fixed is not None:
+            yield name, given.fixed
+
+
+def every_declaration() -> list[Declaration]:
+    """Return what all parts of the package declare, whatever the model."""
+    operators = (make().parameters for make in HYSTERESIS.values())
+    filters = (make().parameters for make in DYNAMICS.values())
+    noises = (make(interval=1.0).declarations for make in NOISES.values())
+    return [d for part in (*operators, *filters, (OFFSET,), *noises) for d in part]
+
+
+def _require_known(
+    table: str, given: Collection[str], declarations: Collection[Declaration]
+) -> None:
+    known = {d.name for d in declarations}
     for name in given:
         if name not in known:
-            if name in CATALOGUE:
+            if name in {d.name for d in every_declaration()}:
                 raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
+            aliases = {alias: d.name for d in declarations for alias in d.aliases}
+            names = list(dict.fromkeys(d.name for d in declarations))
             raise InputError(
-                f"{table}.{name}: no such parameter here; {suggestion(name, known, MEANINGS)}"
+                f"{table}.{name}: no such parameter here; {suggestion(name, names, aliases)}"
             )
 
 
-def _fixed(config: Config, name: str, default: float | None) -> float | None:
-    given = config.parameters.get(name)
-    return default if given is None or given.fixed is None else given.fixed
-
-
-def _exponent(config: Config) -> float | Distribution:
-    """Return the exponent's value, or its prior if the config frees it."""
-    given = config.parameters.get("exponent")
-    if given is not None and given.prior is not None:
-        return _distribution("exponent", given.prior)
-    value = _fixed(config, "exponent", 1.0)
-    return 1.0 if value is None else value
-
-
-def _parameter(name: str, given: ParameterConfig, defaults: Defaults) -> Parameter:
-    """Put what the config says of a parameter before what the defaults say."""
-    meaning = CATALOGUE[name]
+def _parameter(declared: Declaration, given: ParameterConfig, context: Context) -> Parameter:
+    """Put what the config says of a parameter before what its part declares."""
+    name = declared.name
     prior, fixed = None, given.fixed
     if given.prior is not None:
         prior = _distribution(name, given.prior)
     elif fixed is None:
-        try:
-            default = defaults.of(name)
-        except KeyError:
-            raise InputError(
-                f"parameters.{name}: has no default prior; give prior or fixed (a record shows "
-                "mass and stiffness only through the damping)"
-            ) from None
+        default = declared.default(context)
+        if default is None:
+            why = f" ({declared.without_default})" if declared.without_default else ""
+            raise InputError(f"parameters.{name}: has no default prior; give prior or fixed{why}")
         if isinstance(default, Distribution):
             prior = default
         else:
             fixed = default
     _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
-    unit = meaning.unit
-    if name in ("beta", "gamma") and defaults.exponent != 1.0:
-        unit = "um^(1-n)/V"
+    unit = declared.unit_in(context)
     if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
         raise InputError(
             f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
@@ -131,12 +119,13 @@ def _parameter(name: str, given: ParameterConfig, defaults: Defaults) -> Paramet
     return Parameter(
         name,
         given.unit or unit,
-        given.label or meaning.label,
-        given.description or meaning.description,
+        given.label or declared.label,
+        given.description or declared.description,
         prior,
         fixed,
         -np.inf if given.lower is None else given.lower,
         np.inf if given.upper is None else given.upper,
+        declared,
     )
 
 

@@ -21,21 +21,24 @@ from bwbayes.app.config import (
     RecordConfig,
     SignalConfig,
 )
-from bwbayes.app.parameters import as_config, defaults_of, parameters_of
+from bwbayes.app.parameters import as_config, context_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
+from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
 
@@ -120,12 +123,12 @@ def resolve(config: Config, folder: Path) -> Problem:
     hold = config.model.hold
     if hold == "auto":
         hold = "zero" if record.voltage_is == "command" else "first"
-    actuator = Actuator(config.model.dynamics, hold, record.interval)
+    hysteresis = made("model.hysteresis", config.model.hysteresis, HYSTERESIS, _options(config))
+    actuator = Actuator(config.model.dynamics, hold, record.interval, hysteresis)
     noise = noise_model(config.model.noise, record.interval)
-    names = (*actuator.parameters, *noise.parameters)
-    defaults = defaults_of(config, record, split.training)
-    parameters = parameters_of(config, names, defaults)
-    prior = JointPrior(parameters, passive=config.model.passive)
+    table, context = Table(actuator, noise), context_of(config, record, split.training)
+    parameters = parameters_of(config, table.declarations, context)
+    prior = JointPrior(parameters, hysteresis.holds)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -173,9 +176,14 @@ def resolve(config: Config, folder: Path) -> Problem:
         plan,
         validations,
         tuple(remarks),
-        defaults.priors(names),
+        default_priors(table.declarations, context),
         findings,
     )
+
+
+def _options(config: Config) -> dict[str, object]:
+    """Return what the config says of the hysteresis operator beside its name."""
+    return {"passive": config.model.passive}
 
 
 def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
@@ -353,7 +361,8 @@ def _explicit(
                 dynamics=config.model.dynamics,
                 hold=config.model.hold,
                 noise=config.model.noise,
-                passive=prior.passive,
+                hysteresis=config.model.hysteresis,
+                passive=getattr(posterior.actuator.hysteresis, "passive", None),
                 outliers=config.model.outliers,
             ),
             "parameters": {p.name: as_config(p) for p in prior.parameters},

@@ -35,7 +35,6 @@ from bwbayes.inference import conflict, identifiability, pointfit
 from bwbayes.inference.chain import PHASES
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.parameters import passive_remark
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.results import innovations
@@ -264,8 +263,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *conflict.conflicts(posterior.prior, flat, problem.defaults),
         *identifiability.remarks(posterior, chain.point, flat),
     ]
-    if remark := passive_remark(posterior.prior, sampled):
-        remarks.append(remark)
+    columns = posterior.table.columns(posterior.prior.theta(flat))
+    remarks += posterior.actuator.hysteresis.remarks(columns, posterior.names)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,

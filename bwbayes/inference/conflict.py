@@ -17,8 +17,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.parameters import POSITIVE, JointPrior, Parameter
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
+from bwbayes.model.declaration import Values
 from bwbayes.model.distributions import Distribution
 
 __all__ = ["around", "conflicts", "effective"]
@@ -90,7 +91,7 @@ def conflicts(
 
 def _another_unit(parameter: Parameter, default: Distribution) -> str | None:
     """Say that a positive parameter's scale is far from what the record's ranges suggest."""
-    if parameter.name not in POSITIVE or parameter.prior == default:
+    if not parameter.positive or parameter.prior == default:
         return None
     expected, sd = float(default.frozen.median()), _log_sd(default)
     what, value = "fixed value", parameter.fixed
@@ -137,28 +138,31 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[s
     values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
     for parameter in prior.free:
         name, (low, high) = parameter.name, parameter.support
-        if name == "exponent" and low == 1:
-            if _near(values[name] - 1):
-                yield "exponent: lies on its bound 1: give exponent = { fixed = 1.0 }"
+        if parameter.declared and parameter.declared.reaches_floor and low == parameter.floor:
+            if _near(values[name] - low):
+                yield f"{name}: lies on its bound {low:g}: give {name} = {{ fixed = {low:.1f} }}"
         elif np.isfinite(low) and low != 0 and _near(values[name] - low):
             yield _given_bound(parameter, "lower", low)
         if np.isfinite(high) and _near(high - values[name]):
             yield _given_bound(parameter, "upper", high)
-    if "gamma" in columns or "beta" in columns:
-        ratio = values["gamma"] / values["beta"]
-        for side, gap in (("beta", 1 - ratio), ("-beta", 1 + ratio)):
-            # Without the constraint gamma may be larger, and nothing ends there.
-            if float(np.min(gap)) >= 0 and np.std(gap) < TOLD and _near(gap):
-                yield (
-                    f"gamma: lies on its bound {side}: this actuator may need a gamma beyond it: "
-                    "give passive = false under [model]"
-                )
-    gap = 1 - values["alpha"] / values["d"]
-    if ("alpha" in columns or "d" in columns) and np.std(gap) < TOLD and _near(gap):
-        yield (
-            "alpha: lies on its bound d: the model's slope is zero there; check the displacement's "
-            "sign and unit, or fix alpha"
-        )
+    for parameter in prior.parameters:
+        yield from _pressed_by_others(parameter, values)
+
+
+def _pressed_by_others(parameter: Parameter, values: Values) -> Iterator[str]:
+    """Yield remarks on bounds that other parameters set, relative to their size."""
+    if parameter.declared is None:
+        return
+    x = values[parameter.name]
+    for side, bound in zip(("lower", "upper"), parameter.limits(values), strict=True):
+        advice = parameter.declared.pressed.get(side)
+        if advice is None or not np.isfinite(bound).all():
+            continue
+        gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
+        # Beyond a bound that does not hold here nothing ends.
+        if float(np.min(gap)) >= 0 and np.std(gap) < TOLD and _near(gap):
+            stated = parameter.declared.stated_bounds
+            yield f"{parameter.name}: lies on its {side} bound of {stated}: {advice}"
 
 
 def _near(gap: FloatArray) -> bool:

@@ -18,15 +18,12 @@ from scipy import linalg
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.diagnostics import pareto_k
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.parameters import POSITIVE, JointPrior, Parameter
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 
 __all__ = ["Sway", "remarks", "spectrum", "sway", "undetermined"]
-
-# Parameters that together make the loop. The others only have to be found beside them.
-LOOP = ("d", "alpha", "beta", "gamma", "exponent")
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -50,7 +47,10 @@ DRAWS, BELIEVED_K, BELIEVED_DRAWS = 20_000, 0.7, 100
 # Swings of a drive differ where the smallest of them is smaller by more than this part.
 ALIKE = 0.2
 
-# A loop closes where β times half the voltage's range is about one; below this it hardly opens.
+# A part of its bounds' distance that is a parameter's sd where little but the bounds holds it.
+ANYWHERE = 0.225
+
+# A loop closes where its opening is about one; below this it hardly opens.
 SMALL = 0.3
 
 
@@ -80,7 +80,7 @@ def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
     ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
     while the other falls.
     """
-    names = [posterior.names[i] for i in _columns(posterior, LOOP)]
+    names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
@@ -98,7 +98,7 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
         (draws, free), of the posterior or of its Gaussian approximation
         (:func:`bwbayes.inference.conflict.around`).
     """
-    names = [posterior.names[i] for i in _columns(posterior, LOOP)]
+    names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
@@ -153,12 +153,16 @@ def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
 
 def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
     """Say whether the prior decides about some parameters."""
-    if "gamma" in names and "beta" in prior.free_names:
-        ratio = draws[:, prior.free_names.index("gamma")]
-        ratio = ratio / draws[:, prior.free_names.index("beta")]
-        # A ratio that may be anything between -1 and 1 has a sd of 0.58.
-        if np.max(np.abs(ratio)) <= 1 and np.std(ratio) > 0.45:
-            return "only |gamma| <= beta bounds gamma"
+    columns = dict(zip(prior.names, prior.theta(draws).T, strict=True))
+    for parameter in prior.free:
+        low, high = parameter.limits(columns)
+        if parameter.name not in names or not (np.isfinite(low) & np.isfinite(high)).all():
+            continue
+        place = (columns[parameter.name] - low) / (high - low)
+        # What may be anything between its bounds has a sd of 0.29 of their distance.
+        if np.std(place) > ANYWHERE:
+            assert parameter.declared is not None
+            return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
     found = sway(prior, draws, names)
     if found.part > WIDE:
         return f"the prior decides there: the posterior has {found.part:.0%} of its sd"
@@ -182,29 +186,39 @@ def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> st
         voltage = posterior.voltage[window]
         half = max(half, float(np.ptp(voltage)) / 2)
         swings += np.abs(np.diff(voltage[turning_points(voltage)])).tolist()
-    if "beta" in posterior.names:
-        beta = draws[:, posterior.names.index("beta")]
-        if "exponent" not in posterior.names and float(np.median(beta)) * half < SMALL:
-            return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+    columns = posterior.table.columns(posterior.prior.theta(draws))
+    opening = posterior.actuator.hysteresis.opening(columns, half)
+    if opening is not None and float(np.median(opening)) < SMALL:
+        return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
     if len(swings) < 2:
         return "drive the actuator up and down several times, with decreasing amplitude"
     if min(swings) > (1 - ALIKE) * max(swings):
         return "vary the amplitude: let it decay to a tenth over ten periods"
-    if "gamma" in names:
+    if any(_bounded(posterior, name) for name in names):
         return "turn at more voltages within the range, or come closer to zero amplitude"
     return "add larger and smaller amplitudes"
+
+
+def _bounded(posterior: Posterior, name: str) -> bool:
+    """Tell whether other parameters bound this one on both sides."""
+    theta = posterior.prior.theta(posterior.prior.constrain(np.zeros((1, len(posterior.names))))[0])
+    parameter = posterior.prior.free[posterior.names.index(name)]
+    low, high = parameter.limits(posterior.table.columns(theta))
+    return bool(np.isfinite(low).all() and np.isfinite(high).all())
 
 
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
     """Return the part of the prior sd that is left along each principal direction of the loop.
 
     The parts (loop parameters,), the largest first, and the directions as columns, in units of
-    each parameter's prior sd: relative to its value for a positive one, to β for γ.
+    each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
     """
     columns = _columns(posterior, posterior.actuator.parameters)
     slopes = _slopes(posterior, point.mode, columns)
     left = linalg.inv(np.eye(len(columns)) + _information(posterior, point, slopes))
-    loop = [i for i, column in enumerate(columns) if posterior.names[column] in LOOP]
+    loop = [
+        i for i, column in enumerate(columns) if posterior.names[column] in posterior.table.loop
+    ]
     variance, directions = linalg.eigh(left[np.ix_(loop, loop)])
     return np.sqrt(variance[::-1]), directions[:, ::-1]
 
@@ -232,12 +246,14 @@ def _slopes(posterior: Posterior, mode: FloatArray, columns: list[int]) -> Float
 def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
     """Return a parameter's prior sd around its value in ``values``."""
     assert parameter.prior is not None
-    if parameter.name == "gamma":
-        # What |γ| ≤ β leaves to a parameter of which nothing else is known.
-        return values["beta"] / float(np.sqrt(3))
+    others = {name: np.array([value]) for name, value in values.items()}
+    least, most = parameter.limits(others)
+    if np.isfinite(least).all() and np.isfinite(most).all():
+        # What the bounds leave to a parameter of which nothing else is known.
+        return float(np.ptp([least, most])) / float(np.sqrt(12))
     # Half of the central 68 % stands for the sd: some distributions have none.
     low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
-    if parameter.name in POSITIVE:
+    if parameter.positive:
         return float(values[parameter.name] * np.log(high / low) / 2)
     return (high - low) / 2
 
@@ -247,7 +263,7 @@ def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> F
     windows = posterior.training
     rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
-    sds = posterior.noise.marginal_sd(theta[:, len(posterior.actuator.parameters) :])
+    sds = posterior.noise.marginal_sd(posterior.table.noise(theta))
     floor = DISCREPANCY * float(np.ptp(posterior.readings.values))
     weights, duration = _stretches(posterior.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.

@@ -20,6 +20,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import LOG_TWO_PI, Noise
 from bwbayes.inference.readings import Readings
+from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 
 __all__ = ["Likelihood", "LinearStart", "Moments", "batches"]
@@ -70,8 +71,8 @@ class Likelihood:
     """The likelihood of one record.
 
     The readings are r = x(θ) + Σ ξᵢ fᵢ + noise, with independent ξᵢ ~ N(0, σᵢ²): fᵢ are the free
-    responses of the dynamics, σᵢ = d times half the voltage's range; the record's own offset, if it
-    has one, comes first, with f = 1.
+    responses of the dynamics, σᵢ = gain times half the voltage's range; the record's own offset, if
+    it has one, comes first, with f = 1.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ class Likelihood:
         What computes it; see :mod:`bwbayes.inference.engine`.
     from_rest
         The actuator is demagnetised and at rest when the record starts: nothing is unknown, and
-        the initial h of θ is the one at zero volts before.
+        the initial state of θ is the one at zero volts before.
     half_range
         Half the range of the voltages that the actuator may have seen, V.
     offset_sd
@@ -101,6 +102,11 @@ class Likelihood:
     from_rest: bool
     half_range: float
     offset_sd: float = 0.0
+
+    @cached_property
+    def table(self) -> Table:
+        """The parameters in the order of θ's columns."""
+        return Table(self.actuator, self.noise)
 
     @cached_property
     def values(self) -> FloatArray:
@@ -150,7 +156,6 @@ class Likelihood:
 
         has a χ² distribution with a degree of freedom for each shape, if the model is right.
         """
-        theta = self.started(theta)
         parts = []
         for piece in batches(len(theta), self.readings.rows.size, CACHED):
             series = self._whitened(theta[piece], shapes)
@@ -168,9 +173,9 @@ class Likelihood:
 
     def _whitened(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
         """Whiten residual, unknowns' responses and shapes: (models, series, readings)."""
-        size, readings, spaced = len(self.actuator.parameters), self.readings, self.spaced
-        model, noise = theta[:, :size], theta[:, size:]
-        simulated = self.actuator.displacement(model, self.voltage[: readings.samples])
+        readings, spaced = self.readings, self.spaced
+        model, noise = self.table.actuator(theta), self.table.noise(theta)
+        simulated = self._simulated(model)
         responses = self._responses(model, spaced.steady_state(noise).log_decay)
         heard = responses.shape[2]
         series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
@@ -182,7 +187,7 @@ class Likelihood:
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
         unknowns = 0 if self.from_rest else self.actuator.unknowns
-        gain = theta[:, self.actuator.parameters.index("d")]
+        gain = self.actuator.gain(self.table.actuator(theta), self.voltage)
         sd = np.repeat((gain * self.half_range)[:, np.newaxis], unknowns, axis=1)
         if self.offset_sd:
             sd = np.concatenate([np.full((len(sd), 1), self.offset_sd), sd], axis=1)
@@ -198,15 +203,13 @@ class Likelihood:
         """Tell whether anything is unknown of the start."""
         return bool(self.offset_sd) or not (self.from_rest or self.actuator.unknowns == 0)
 
-    def started(self, theta: FloatArray) -> FloatArray:
-        """Return θ (models, parameters) with the h at the record's first sample as initial one."""
-        if self.from_rest and self.voltage[0] != 0:
-            return self.actuator.at_rest(theta, float(self.voltage[0]))
-        return theta
+    def _simulated(self, model: FloatArray) -> FloatArray:
+        """Displacement (models, samples), um, up to the last reading, the dynamics at rest."""
+        voltage = self.voltage[: self.readings.samples]
+        return self.actuator.displacement(model, voltage, from_rest=self.from_rest)
 
     def moments(self, theta: FloatArray) -> Moments:
         """Whiten the residual and the unknowns' responses at θ (models, parameters)."""
-        theta = self.started(theta)
         if self.engine == "numba":
             # Here, because numba may not be installed, and takes half a second to load.
             from bwbayes.inference import compiled  # noqa: PLC0415
@@ -221,6 +224,7 @@ class Likelihood:
                     self.spaced,
                     int(self.offset_sd > 0),
                     0 if self.from_rest else self.actuator.unknowns,
+                    from_rest=self.from_rest,
                 )
             )
         pieces = batches(len(theta), self.readings.samples)
@@ -229,9 +233,9 @@ class Likelihood:
 
     def _moments(self, theta: FloatArray) -> Moments:
         """Do it with NumPy for one batch of models."""
-        size, readings = len(self.actuator.parameters), self.readings
-        model, noise = theta[:, :size], theta[:, size:]
-        simulated = self.actuator.displacement(model, self.voltage[: readings.samples])
+        readings = self.readings
+        model, noise = self.table.actuator(theta), self.table.noise(theta)
+        simulated = self._simulated(model)
         residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
         spaced = self.spaced
         responses = self._responses(model, spaced.steady_state(noise).log_decay)
@@ -252,8 +256,7 @@ class Likelihood:
         (``log_decay`` per reading) forgets it.
         """
         rows = self.readings.rows
-        column = dict(zip(self.actuator.parameters, model.T, strict=True))
-        recursion = self.actuator.recursion(column)
+        recursion = self.actuator.recursion(self.actuator.columns(model))
         unknowns = 0 if self.from_rest else recursion.unknowns
         if self.offset_sd:
             heard = rows.size

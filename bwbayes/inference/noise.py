@@ -12,17 +12,18 @@ missing. Its log density is theirs.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, lognormal
+from bwbayes.model.registry import made
 
-__all__ = ["DiscrepancyNoise", "Noise", "NoiseKind", "SteadyState", "WhiteNoise", "noise_model"]
-
-NoiseKind = Literal["white", "discrepancy"]
+__all__ = ["NOISES", "DiscrepancyNoise", "Noise", "SteadyState", "WhiteNoise", "noise_model"]
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
@@ -50,8 +51,8 @@ class Noise(Protocol):
     """A Gaussian model of the residual between a reading and the forward model."""
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of θ's columns."""
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Its parameters, in the order of θ's columns."""
 
     def whiten(
         self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
@@ -74,13 +75,57 @@ class Noise(Protocol):
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
 
+    def memory(self, theta: FloatArray) -> FloatArray:
+        """Correlation time of the discrepancy (models,), s; zero without one."""
+
+    def draw(
+        self, theta: FloatArray, samples: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw the discrepancy and the sensor's noise, (samples,), um, at one θ (1, parameters)."""
+
     def at(self, interval: float) -> Noise:
         """Return the same noise for readings ``interval`` seconds apart."""
 
 
-def noise_model(kind: NoiseKind, interval: float) -> Noise:
-    """Return the noise model of that name for readings ``interval`` seconds apart."""
-    return WhiteNoise() if kind == "white" else DiscrepancyNoise(interval)
+def noise_model(kind: str, interval: float) -> Noise:
+    """Return the noise of that name (or import path) for readings ``interval`` seconds apart.
+
+    Raises
+    ------
+    InputError
+        No noise goes by that name.
+    """
+    return made("noise", kind, NOISES, {"interval": interval})
+
+
+SENSOR_SD = Declaration(
+    "sensor_sd",
+    "um",
+    r"s",
+    "sd of the sensor noise",
+    lambda known: lognormal(0.006 * known.ranges.displacement, 2.0),
+    floor=0.0,
+    aliases=("noise",),
+)
+DISCREPANCY_SD = Declaration(
+    "discrepancy_sd",
+    "um",
+    r"\sigma",
+    "sd of the model discrepancy",
+    # Not even its order of magnitude is known. A prior that is level down to zero would claim
+    # some discrepancy where there is none, and make a right model's bands too wide.
+    lambda known: lognormal(1e-5 * known.ranges.displacement, 4.0),
+    floor=0.0,
+    aliases=("sigma",),
+)
+DISCREPANCY_TIME = Declaration(
+    "discrepancy_time",
+    "s",
+    r"\tau",
+    "correlation time of the model discrepancy",
+    lambda known: lognormal(0.5 * known.ranges.time, 0.8),
+    floor=0.0,
+)
 
 
 def _log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
@@ -95,7 +140,12 @@ def _log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
 class WhiteNoise:
     """Sensor noise alone: independent normal errors. Right only if the model is."""
 
-    parameters: tuple[str, ...] = ("sensor_sd",)
+    interval: float = 1.0
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """The sensor's sd."""
+        return (SENSOR_SD,)
 
     def whiten(
         self,
@@ -121,9 +171,19 @@ class WhiteNoise:
         """No discrepancy; sd of the sensor."""
         return np.zeros(theta.shape[0]), theta[:, 0]
 
-    def at(self, interval: float) -> WhiteNoise:  # noqa: ARG002  # it has no memory
-        """Return the same noise."""
-        return self
+    def memory(self, theta: FloatArray) -> FloatArray:
+        """No memory."""
+        return np.zeros(theta.shape[0])
+
+    def draw(
+        self, theta: FloatArray, samples: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw no discrepancy, and independent normal errors."""
+        return np.zeros(samples), theta[0, 0] * generator.standard_normal(samples)
+
+    def at(self, interval: float) -> WhiteNoise:
+        """Return the same noise for readings ``interval`` seconds apart."""
+        return replace(self, interval=interval)
 
 
 @dataclass(frozen=True)
@@ -153,7 +213,11 @@ class DiscrepancyNoise:
     """
 
     interval: float
-    parameters: tuple[str, ...] = ("sensor_sd", "discrepancy_sd", "discrepancy_time")
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Sds of sensor and discrepancy, and the discrepancy's correlation time."""
+        return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
 
     def whiten(
         self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
@@ -181,6 +245,21 @@ class DiscrepancyNoise:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
 
+    def memory(self, theta: FloatArray) -> FloatArray:
+        """Return the correlation time."""
+        return theta[:, 2]
+
+    def draw(
+        self, theta: FloatArray, samples: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw a stationary Ornstein-Uhlenbeck process and independent normal errors."""
+        sensor, sd, time = theta[0]
+        rate = self.interval / time
+        shocks = sd * generator.standard_normal(samples)
+        shocks[1:] *= np.sqrt(-np.expm1(-2 * rate))
+        discrepancy = np.asarray(lfilter([1.0], [1.0, -np.exp(-rate)], shocks), dtype=np.float64)
+        return discrepancy, sensor * generator.standard_normal(samples)
+
     def at(self, interval: float) -> DiscrepancyNoise:
         """Return the same noise for readings ``interval`` seconds apart."""
         return replace(self, interval=interval)
@@ -198,6 +277,12 @@ class DiscrepancyNoise:
             log_a = np.minimum(-rate - np.log1p(predicted / sensor), -1e-300)
         surplus = np.maximum(process - predicted, 0.0)
         return SteadyState(np.exp(-rate), predicted, predicted + sensor, surplus, log_a, rate)
+
+
+NOISES: Mapping[str, Callable[..., Noise]] = {
+    "discrepancy": DiscrepancyNoise,
+    "white": WhiteNoise,
+}
 
 
 @dataclass

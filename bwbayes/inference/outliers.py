@@ -96,7 +96,7 @@ def surprise(posterior: Posterior, place: FloatArray) -> FloatArray:
     readings, likelihood = posterior.readings, posterior.likelihood
     simulated = posterior.simulate(theta, readings.rows)[0]
     residual = readings.values - simulated
-    steady = likelihood.spaced.steady_state(theta[:, len(posterior.actuator.parameters) :])
+    steady = likelihood.spaced.steady_state(posterior.table.noise(theta))
     own = float(steady.predicted[0] + steady.surplus[0])
     sensor = float(steady.variance[0] - steady.predicted[0])
     if own <= 0:

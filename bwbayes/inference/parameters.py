@@ -1,19 +1,17 @@
 """Parameters: what they are called, what is known of them, and where they may lie.
 
 Each parameter is either fixed or has a prior. The priors are independent but for the physical
-constraints, which cut the joint prior: 0 < α < d, |γ| ≤ β, an initial state inside the hysteresis
-ceiling. With |γ| ≤ β the hysteresis is passive, taking no energy from nowhere on any path; some
-published actuators have larger γ, and that constraint can be left at β + γ ≥ 0, without which h
-runs away. :class:`JointPrior` draws from the cut prior and gives its log density, up to the one
-constant that the cut leaves. It also maps parameters to coordinates without bounds and back: the
-normal scores of each prior between the bounds that hold there. In them every prior is nearly a
-standard normal, whatever its scale and bounds, and so a posterior has Gaussian tails even where it
-leans on a bound (γ near β, a discrepancy near zero).
+constraints that the model's parts declare, which cut the joint prior: for Bouc-Wen 0 < α < d,
+|γ| ≤ β, an initial state inside the hysteresis ceiling. :class:`JointPrior` draws from the cut
+prior and gives its log density, up to the one constant that the cut leaves. It also maps parameters
+to coordinates without bounds and back: the normal scores of each prior between the bounds that hold
+there. In them every prior is nearly a standard normal, whatever its scale and bounds, and so a
+posterior has Gaussian tails even where it leans on a bound (γ near β, a discrepancy near zero).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,49 +19,27 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.boucwen import ceiling
+from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
 
-__all__ = ["COORDINATES", "FLOORS", "POSITIVE", "JointPrior", "Parameter", "passive_remark"]
+__all__ = ["COORDINATES", "Constraint", "JointPrior", "Parameter"]
 
 # The version of the map from parameters to coordinates: a chain of another one means other draws.
 COORDINATES = 1
 
-Values = dict[str, FloatArray]
-
-POSITIVE = (
-    "d",
-    "alpha",
-    "beta",
-    "lag",
-    "mass",
-    "damping",
-    "stiffness",
-    "sensor_sd",
-    "discrepancy_sd",
-    "discrepancy_time",
-)
-
-# No parameter may be lower. What is positive does not reach its floor, an exponent of one does.
-FLOORS = {**dict.fromkeys(POSITIVE, 0.0), "exponent": 1.0}
-
-# γ presses against β when more than this share of draws lies within the margin below it.
-PRESSING_SHARE = 0.25
-PRESSING_MARGIN = 0.05
+Constraint = Callable[[Values], BoolArray | np.bool_]
+"""Tells which models (models,) meet what the bounds of single parameters do not say."""
 
 # Normal scores beyond this have no probability that a float can hold.
 FARTHEST = 37.0
-
-# Stands for an infinite ceiling (β + γ = 0), um.
-HIGHEST_CEILING = 1e9
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One parameter: names for people, and a prior or a fixed value.
 
-    ``lower`` and ``upper`` cut the prior; physical bounds hold besides. ``unit`` and ``label``
-    (LaTeX, without the dollar signs) go to tables and pictures.
+    ``lower`` and ``upper`` cut the prior; the bounds that its part ``declared`` hold besides.
+    ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures.
 
     Raises
     ------
@@ -79,6 +55,15 @@ class Parameter:
     fixed: float | None = None
     lower: float = -np.inf
     upper: float = np.inf
+    declared: Declaration | None = None
+
+    @classmethod
+    def of(cls, declared: Declaration, known: Distribution | float) -> Parameter:
+        """Return a declared parameter with a prior or a fixed value."""
+        names = declared.name, declared.unit, declared.label, declared.description
+        if isinstance(known, Distribution):
+            return cls(*names, prior=known, declared=declared)
+        return cls(*names, fixed=known, declared=declared)
 
     def __post_init__(self) -> None:
         if (self.prior is None) == (self.fixed is None):
@@ -91,18 +76,38 @@ class Parameter:
     def _check_fixed(self, value: float) -> None:
         if not np.isfinite(value) or not self.lower <= value <= self.upper:
             raise InputError(f"{self.name}: fixed at {value}; give a finite value in its bounds")
-        if not _above_floor(self.name, np.array(value)):
-            least = "above" if self.name in POSITIVE else "at least"
-            raise InputError(
-                f"{self.name}: fixed at {value:g}; must be {least} {FLOORS[self.name]:g}"
-            )
+        if not self.above_floor(np.array(value)):
+            least = "above" if self.positive else "at least"
+            raise InputError(f"{self.name}: fixed at {value:g}; must be {least} {self.floor:g}")
+
+    @property
+    def floor(self) -> float:
+        """What the parameter cannot be lower than."""
+        return -np.inf if self.declared is None else self.declared.floor
+
+    @property
+    def positive(self) -> bool:
+        """Whether it lies above zero."""
+        return self.declared is not None and self.declared.positive
+
+    def above_floor(self, x: FloatArray) -> BoolArray:
+        """Tell which values are not too low. Some parameters reach their floor."""
+        reaches = self.declared is None or self.declared.reaches_floor
+        return np.asarray(x >= self.floor if reaches else x > self.floor)
+
+    def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Bounds (models,) given the values of other parameters; infinite without a constraint."""
+        if self.declared is None or self.declared.bounds is None:
+            return np.asarray(-np.inf), np.asarray(np.inf)
+        low, high = self.declared.bounds(values)
+        return np.asarray(low), np.asarray(high)
 
     @cached_property
     def support(self) -> tuple[float, float]:
         """Where prior, bounds and sign allow the parameter."""
         assert self.prior is not None
         low, high = self.prior.support
-        return max(low, self.lower, FLOORS.get(self.name, -np.inf)), min(high, self.upper)
+        return max(low, self.lower, self.floor), min(high, self.upper)
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
@@ -118,31 +123,47 @@ class JointPrior:
     Parameters
     ----------
     parameters
-        All parameters of the model and the noise, in the order of θ's columns; α after d, γ after
-        β, and the initial state after both, because their bounds depend on those.
-    passive
-        Whether |γ| ≤ β, and not only β + γ ≥ 0.
+        All parameters of the model and the noise, in the order of θ's columns. Bounds depend on
+        those that come before and on fixed ones.
+    constraint
+        What must hold besides.
     """
 
-    def __init__(self, parameters: Iterable[Parameter], *, passive: bool = True) -> None:
+    def __init__(
+        self, parameters: Iterable[Parameter], constraint: Constraint | None = None
+    ) -> None:
         self.parameters = tuple(parameters)
-        self.passive = passive
+        self.constraint = constraint
         self.names = tuple(p.name for p in self.parameters)
         self.free = tuple(p for p in self.parameters if p.fixed is None)
         self.free_names = tuple(p.name for p in self.free)
         self._fixed = {p.name: p.fixed for p in self.parameters if p.fixed is not None}
-        self._check_fixed_pairs()
+        # What the bounds of each parameter may know.
+        self._known = {
+            p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
+        }
+        self._check_fixed()
 
-    def _check_fixed_pairs(self) -> None:
-        fixed = self._fixed
-        if fixed.get("alpha", 0.0) >= fixed.get("d", np.inf):
-            raise InputError("alpha: fixed at or above d; must be below it")
-        if fixed.get("beta", np.inf) < self._least_beta(fixed.get("gamma", 0.0)):
-            demand = "must lie between -beta and beta" if self.passive else "must be above -beta"
-            raise InputError(f"gamma: fixed beyond beta; {demand}")
+    def _check_fixed(self) -> None:
+        """Refuse values that are fixed where others leave them no room."""
+        fixed = {name: np.array([value]) for name, value in self._fixed.items()}
+        for parameter in self.parameters:
+            if parameter.fixed is None or parameter.declared is None:
+                continue
+            others = {name: value for name, value in fixed.items() if name != parameter.name}
+            low, high = parameter.limits(others)
+            stated = parameter.declared.stated_bounds
+            if stated and not (low <= parameter.fixed) & (parameter.fixed <= high):
+                raise InputError(
+                    f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
+                )
+        if self.constraint is not None and not np.all(self.constraint(fixed)):
+            raise InputError(f"priors: what is fixed must have {self._stated()}")
 
-    def _least_beta(self, gamma: float) -> float:
-        return abs(gamma) if self.passive else -gamma
+    def _stated(self) -> str:
+        """Return the physical constraints in words."""
+        stated = (p.declared.stated_bounds for p in self.parameters if p.declared)
+        return " and ".join(filter(None, stated))
 
     @property
     def dimensions(self) -> int:
@@ -166,7 +187,8 @@ class JointPrior:
             assert parameter.prior is not None
             result += parameter.prior.frozen.logpdf(values[parameter.name])
             inside &= self._inside(parameter, values)
-        inside &= self._start_holds(values)
+        if self.constraint is not None:
+            inside &= self.constraint(values)
         return np.where(inside, result, -np.inf)
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
@@ -184,8 +206,7 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                bound = "|gamma| <= beta" if self.passive else "beta + gamma >= 0"
-                raise InputError(f"priors: hardly a draw has 0 < alpha < d and {bound}")
+                raise InputError(f"priors: hardly a draw has {self._stated()}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
@@ -217,15 +238,16 @@ class JointPrior:
             bounds = self._limits(parameter, values)
             x, between = parameter.prior.from_normal(z, *bounds)
             # Rounding may put a positive parameter on its open bound, where there is no model.
-            room = room * np.where(_above_floor(parameter.name, x), between, 0)
+            room = room * np.where(parameter.above_floor(x), between, 0)
             values[parameter.name] = x
-        room = np.where(self._start_holds(values), room, 0)
+        if self.constraint is not None:
+            room = np.where(self.constraint(values), room, 0)
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
         log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
         return np.stack([values[name] for name in self.free_names], axis=1), log_prior
 
-    def _values(self, free: FloatArray | None, rows: int = 0) -> Values:
+    def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
         values = {name: np.full(size, value) for name, value in self._fixed.items()}
         if free is not None:
@@ -234,77 +256,21 @@ class JointPrior:
 
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
-        support_low, support_high = parameter.support
-        low = np.asarray(support_low)
-        high = np.asarray(support_high)
-        match parameter.name:
-            case "d" if "alpha" in self._fixed:
-                low = np.maximum(low, self._fixed["alpha"])
-            case "alpha" if "d" in values:
-                high = np.minimum(high, values["d"])
-            case "beta" if "gamma" in self._fixed:
-                low = np.maximum(low, self._least_beta(self._fixed["gamma"]))
-            case "gamma" if "beta" in values:
-                low = np.maximum(low, -values["beta"])
-                high = np.minimum(high, values["beta"]) if self.passive else high
-            case "initial":
-                top = _ceiling(values)
-                low, high = np.maximum(low, -top), np.minimum(high, top)
+        low, high = (np.asarray(end) for end in parameter.support)
+        if parameter.declared is None or parameter.declared.bounds is None:
+            return low, high
+        known = {name: values[name] for name in self._known[parameter.name]}
+        least, most = parameter.limits(known)
+        # Bounds that cut nothing stay numbers: the map is then the prior's own.
+        low = low if np.all(np.isneginf(least)) else np.maximum(low, least)
+        high = high if np.all(np.isposinf(most)) else np.minimum(high, most)
         return low, high
 
     def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
         low, high = self._limits(parameter, values)
         x = values[parameter.name]
-        inside: BoolArray = (low <= x) & (x <= high) & _above_floor(parameter.name, x)
-        if parameter.name in ("d", "alpha"):
-            inside &= values["alpha"] < values["d"]
+        inside: BoolArray = (low <= x) & (x <= high) & parameter.above_floor(x)
         return inside
-
-    def _start_holds(self, values: Values) -> BoolArray | np.bool_:
-        """Tell where h does not run away from an initial state that is fixed: γ ≤ β or below top.
-
-        A free one has its bounds.
-        """
-        start = abs(self._fixed.get("initial", 0.0))
-        if self.passive or start == 0 or "gamma" not in values:
-            return np.True_
-        return (values["gamma"] <= values["beta"]) | (start <= _ceiling(values))
-
-
-def passive_remark(prior: JointPrior, draws: FloatArray) -> str | None:
-    """Say that a posterior presses against γ ≤ β, if it does.
-
-    Parameters
-    ----------
-    prior
-        The prior of the draws.
-    draws
-        (..., free), parameters in their own units.
-    """
-    if not prior.passive or "gamma" not in prior.free_names:
-        return None
-    values = dict(zip(prior.names, prior.theta(draws.reshape(-1, prior.dimensions)).T, strict=True))
-    share = float(np.mean(values["gamma"] > (1 - PRESSING_MARGIN) * values["beta"]))
-    if not share > PRESSING_SHARE:
-        return None
-    return (
-        f"the posterior presses against |gamma| <= beta ({share:.0%} of the draws have gamma "
-        f"within {PRESSING_MARGIN:.0%} of beta); if the actuator need not be passive, set "
-        "[model] passive = false"
-    )
-
-
-def _above_floor(name: str, x: FloatArray) -> BoolArray:
-    floor = FLOORS.get(name, -np.inf)
-    return np.asarray(x > floor if name in POSITIVE else x >= floor)
-
-
-def _ceiling(values: Values) -> FloatArray:
-    """Highest |h| (models,), um, not beyond a number that can be worked with."""
-    # Not a number where β + γ < 0 or α = 0, which is outside already; fmin prefers the number.
-    with np.errstate(invalid="ignore"):
-        top = ceiling(*(values[n] for n in ("alpha", "beta", "gamma", "exponent")))
-    return np.fmin(top, HIGHEST_CEILING)
 
 
 def _draw_single(parameter: Parameter, generator: np.random.Generator, size: int) -> FloatArray:

@@ -20,6 +20,7 @@ from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
+from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 
 __all__ = ["Posterior"]
@@ -62,12 +63,17 @@ class Posterior:
     from_rest: bool = False
 
     def __post_init__(self) -> None:
-        expected = (*self.actuator.parameters, *self.noise.parameters)
+        expected = self.table.names
         if self.prior.names != expected:
             raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
         edges = [edge for window in self.training for edge in (window.start, window.stop)]
         if edges != sorted(edges):
             raise InputError("training: windows must be in order of time and must not overlap")
+
+    @cached_property
+    def table(self) -> Table:
+        """The parameters in the order of θ's columns."""
+        return Table(self.actuator, self.noise)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,7 +107,7 @@ class Posterior:
         return Likelihood(
             self.voltage,
             self.readings,
-            self.actuator,
+            self.actuator.within(self.voltage),
             self.noise,
             self.engine,
             self.from_rest,
@@ -113,14 +119,16 @@ class Posterior:
 
         Where the start of the dynamics is unknown, it is the most probable one.
         """
-        likelihood, size = self.likelihood, len(self.actuator.parameters)
+        likelihood, model = self.likelihood, self.table.actuator(theta)
         unrest = likelihood.start(theta).mean if likelihood.unknown else None
-        started = likelihood.started(theta)[:, :size]
         voltage = self.voltage[: self.training[-1].stop]
         return np.concatenate(
             [
-                self.actuator.advance(
-                    started[part], voltage, unrest=None if unrest is None else unrest[part]
+                likelihood.actuator.advance(
+                    model[part],
+                    voltage,
+                    unrest=None if unrest is None else unrest[part],
+                    from_rest=self.from_rest,
                 )[0][:, rows]
                 for part in batches(len(theta), voltage.size)
             ]

@@ -1,61 +1,78 @@
 """The actuator: voltage in, displacement out, for a batch of parameter vectors at once.
 
-Hysteresis takes its part of the drive, w = d u − h, linear dynamics follow the drive, and the
-sensor adds its offset (equations (6) to (8) of the paper). An :class:`Actuator` says which dynamics
-there are, what the voltage does between samples, and how long those are apart; the parameters come
-as the columns of a matrix θ. A long record can be walked through in pieces: the
-:class:`State` at the end of one piece starts the next.
+It is put together from parts. A hysteresis operator makes the drive w of the voltage's path, linear
+dynamics follow the drive, and the sensor adds its offset (equations (6) to (8) of the paper). An
+:class:`Actuator` says which parts there are, what the voltage does between samples, and how long
+those are apart; the parameters come as the columns of a matrix θ, in the order in which the parts
+declare them. A long record can be walked through in pieces: the :class:`State` at the end of one
+piece starts the next.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, get_args
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.boucwen import hysteresis
-from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
+from bwbayes.model.declaration import Context, Declaration, normal
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.filters import Filter
+from bwbayes.model.linear import Hold, Recursion
+from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.registry import DYNAMICS, made
 
-__all__ = ["Actuator", "Dynamics", "State"]
+__all__ = ["Actuator", "State"]
 
-Dynamics = Literal["none", "lag", "second-order"]
 
-HYSTERESIS_PARAMETERS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
+def _offset(known: Context) -> Distribution:
+    return normal(known.ranges.middle, known.ranges.reach)
+
+
+OFFSET = Declaration(
+    "offset", "um", r"y_0", "sensor offset", _offset, scope="record", aliases=("y0",)
+)
 
 
 @dataclass(frozen=True)
 class State:
     """All that a batch of models remembers after a piece of a record.
 
-    ``voltage`` is the last sample in V; ``hysteretic`` is h there, (models,), um; ``rest`` is the
-    drive at the record's first sample, at which the dynamics were at rest, (models,), um;
-    ``filter`` is the state of the recursion, (models, taps - 1).
+    ``hysteresis`` is the operator's memory; ``rest`` is the drive at the record's first sample, at
+    which the dynamics were at rest, (models,), um; ``filter`` is the state of the recursion,
+    (models, taps - 1).
     """
 
-    voltage: float
-    hysteretic: FloatArray
+    hysteresis: Any
     rest: FloatArray
     filter: FloatArray
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """A Bouc-Wen actuator with linear dynamics.
+    """An actuator with hysteresis and linear dynamics.
 
     Parameters
     ----------
     dynamics
-        ``"none"``; ``"lag"``, one first-order lag; ``"second-order"``, equation (7).
+        ``"none"``; ``"lag"``, one first-order lag; ``"second-order"``, equation (7); or the import
+        path of another :class:`~bwbayes.model.filters.Filter`.
     hold
         ``"first"``: the drive goes straight from sample to sample (a measured voltage);
         ``"zero"``: it is held until the next sample (the command of a DAC).
     interval
         Sampling interval, s, above zero.
+    hysteresis
+        The operator that makes the drive.
+    span
+        The voltages that drives before a record may have had, V; by default those of the voltage
+        that is simulated.
 
     Raises
     ------
@@ -63,56 +80,53 @@ class Actuator:
         An unknown ``dynamics`` or ``hold``, or an ``interval`` that is not positive and finite.
     """
 
-    dynamics: Dynamics = "lag"
+    dynamics: str = "lag"
     hold: Hold = "first"
     interval: float = 1e-3
+    hysteresis: Operator = field(default_factory=BoucWen)
+    span: Span | None = None
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("dynamics", self.dynamics, get_args(Dynamics)),
-            ("hold", self.hold, get_args(Hold)),
-        ):
-            if value not in known:
-                raise InputError(f"{name}: {value!r} is unknown; write one of {', '.join(known)}")
+        made("dynamics", self.dynamics, DYNAMICS, {})
+        if self.hold not in get_args(Hold):
+            known = ", ".join(get_args(Hold))
+            raise InputError(f"hold: {self.hold!r} is unknown; write one of {known}")
         if not 0 < self.interval < math.inf:
             raise InputError(f"interval: {self.interval:.6g}; must be positive and finite, in s")
 
-    @property
-    def dynamics_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters of the dynamics."""
-        names: dict[Dynamics, tuple[str, ...]] = {
-            "none": (),
-            "lag": ("lag",),
-            "second-order": ("mass", "damping", "stiffness"),
-        }
-        return names[self.dynamics]
+    @cached_property
+    def filter(self) -> Filter:
+        """The linear dynamics."""
+        return made("dynamics", self.dynamics, DYNAMICS, {})
 
-    @property
+    @cached_property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """The parameters that the parts declare, in the order of θ's columns."""
+        return (*self.hysteresis.parameters, *self.filter.parameters, OFFSET)
+
+    @cached_property
     def parameters(self) -> tuple[str, ...]:
         """Names of θ's columns."""
-        return (*HYSTERESIS_PARAMETERS, *self.dynamics_parameters, "offset")
+        return tuple(declaration.name for declaration in self.declarations)
 
     @property
     def unknowns(self) -> int:
         """How many numbers say in which state the dynamics are at a record's first sample."""
-        states: dict[Dynamics, int] = {
-            "none": int(self.hold == "zero"),
-            "lag": 1,
-            "second-order": 2,
-        }
-        return states[self.dynamics]
+        return self.filter.unknowns(self.hold)
 
-    def displacement(self, theta: ArrayLike, voltage: ArrayLike) -> FloatArray:
+    def displacement(
+        self, theta: ArrayLike, voltage: ArrayLike, *, from_rest: bool = False
+    ) -> FloatArray:
         """Displacement of every model along one voltage.
 
         Parameters
         ----------
         theta
-            (models, parameters), the columns as in :attr:`parameters`: d, α in um/V; β, γ in
-            um^(1−n)/V; n; initial h in um; the lag in s, or mass, damping, stiffness in kg, N s/m,
-            N/m; offset in um.
+            (models, parameters), the columns and their units as in :attr:`declarations`.
         voltage
             (samples,), V.
+        from_rest
+            The voltage came from zero, where the actuator was at rest.
 
         Returns
         -------
@@ -122,11 +136,10 @@ class Actuator:
         Raises
         ------
         InputError
-            θ of a wrong shape or outside the model's domain: not finite, mass or stiffness not
-            positive, lag or damping negative, and what
-            :func:`~bwbayes.model.boucwen.hysteresis` refuses. The text names the parameter.
+            θ of a wrong shape or outside the model's domain: not finite, or what a part refuses.
+            The text names the parameter.
         """
-        return self.advance(theta, voltage)[0]
+        return self.advance(theta, voltage, from_rest=from_rest)[0]
 
     def advance(
         self,
@@ -134,13 +147,15 @@ class Actuator:
         voltage: ArrayLike,
         state: State | None = None,
         unrest: FloatArray | None = None,
+        *,
+        from_rest: bool = False,
     ) -> tuple[FloatArray, State]:
         """Displacement along the next piece of a record, and the state at its end.
 
-        Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here:
-        h is θ's initial one and the dynamics are at rest at the first drive, or ``unrest``
-        (models, unknowns) away from there, um, as in :class:`~bwbayes.model.linear.Recursion`;
-        (models, 0) stands for rest.
+        Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here: the
+        hysteresis is in the state that θ's initial one says, and the dynamics are at rest at the
+        first drive, or ``unrest`` (models, unknowns) away from there, um, as in
+        :class:`~bwbayes.model.linear.Recursion`; (models, 0) stands for rest.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):
@@ -150,62 +165,59 @@ class Actuator:
         path = np.asarray(voltage, dtype=np.float64)
         if path.ndim != 1 or path.size == 0:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
-        column = dict(zip(self.parameters, models.T, strict=True))
+        column = self.columns(models)
         self._check_domain(column)
         recursion = self.recursion(column)
-        h = self._hysteresis(column, path, state)
-        drive = column["d"][:, np.newaxis] * path
-        drive -= h
-        rest = drive[:, 0].copy() if state is None else state.rest
-        memory = recursion.at_rest() if state is None else state.filter.copy()
-        if state is None and unrest is not None and unrest.size:
-            memory += np.einsum("mu,mut->mt", unrest, recursion.free)
+        if state is None:
+            memory = self.begin(column, path, from_rest=from_rest)
+            drive, hysteresis = self.hysteresis.advance(column, path, memory)
+            rest, filtered = drive[:, 0].copy(), recursion.at_rest()
+            if unrest is not None and unrest.size:
+                filtered += np.einsum("mu,mut->mt", unrest, recursion.free)
+        else:
+            drive, hysteresis = self.hysteresis.advance(column, path, state.hysteresis)
+            rest, filtered = state.rest, state.filter.copy()
         # The recursion sees the drive's distance from rest, so that it starts at zero exactly.
         drive -= rest[:, np.newaxis]
-        result = recursion.run(drive, memory)
+        result = recursion.run(drive, filtered)
         result += (rest + column["offset"])[:, np.newaxis]
-        return result, State(float(path[-1]), h[:, -1].copy(), rest, memory)
+        return result, State(hysteresis, rest, filtered)
 
-    def _hysteresis(
-        self, column: dict[str, FloatArray], path: FloatArray, state: State | None
-    ) -> FloatArray:
-        shape = {name: column[name] for name in ("alpha", "beta", "gamma", "exponent")}
-        if state is None:
-            return hysteresis(path, **shape, initial=column["initial"])
-        joined = np.concatenate([[state.voltage], path])
-        return hysteresis(joined, **shape, initial=state.hysteretic)[:, 1:]
+    def drive(self, theta: FloatArray, voltage: FloatArray, *, from_rest: bool) -> FloatArray:
+        """Return what the hysteresis makes of a record's voltage, w (models, samples), um."""
+        column = self.columns(theta)
+        memory = self.begin(column, voltage, from_rest=from_rest)
+        return self.hysteresis.advance(column, voltage, memory)[0]
 
-    def _check_domain(self, column: dict[str, FloatArray]) -> None:
-        """Refuse what :func:`hysteresis` does not see."""
-        for name in ("d", *self.dynamics_parameters, "offset"):
-            values = column[name]
-            allowed, demand = np.isfinite(values), "must be finite"
-            if name in ("mass", "stiffness"):
-                allowed, demand = allowed & (values > 0), "must be positive and finite"
-            elif name in ("lag", "damping"):
-                allowed, demand = allowed & (values >= 0), "must be finite and not negative"
-            if not allowed.all():
-                row = int(np.argmin(allowed))
-                raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
+    def gain(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:
+        """Return a typical slope (models,) of the drive within a voltage's range, um/V."""
+        return self.hysteresis.gain(self.columns(theta), self._span(voltage))
+
+    def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
+        """Return the columns (models,) of θ (models, parameters) by name."""
+        return dict(zip(self.parameters, theta.T, strict=True))
+
+    def begin(self, column: Mapping[str, FloatArray], path: FloatArray, *, from_rest: bool) -> Any:
+        """Return the operator's memory at the first sample of a record."""
+        span = self._span(path)
+        return self.hysteresis.begin(column, float(path[0]), span, from_rest=from_rest)
+
+    def within(self, voltage: FloatArray) -> Actuator:
+        """Return the actuator with a span; by default the range of a whole record's voltage."""
+        return replace(self, span=self._span(voltage))
+
+    def _span(self, voltage: FloatArray) -> Span:
+        return self.span or Span(float(np.min(voltage)), float(np.max(voltage)))
+
+    def _check_domain(self, column: Mapping[str, FloatArray]) -> None:
+        """Refuse what the recursion or a sum does not see."""
+        self.hysteresis.check(column)
+        self.filter.check(column)
+        if not np.isfinite(column["offset"]).all():
+            row = int(np.argmin(np.isfinite(column["offset"])))
+            value = column["offset"][row]
+            raise InputError(f"offset: {value:.6g} in model {row}; must be finite")
 
     def recursion(self, column: Mapping[str, FloatArray]) -> Recursion:
         """Return the dynamics' recursion of models given by the columns (models,) of θ."""
-        if self.dynamics == "second-order":
-            return second_order(
-                column["mass"], column["damping"], column["stiffness"], self.interval, self.hold
-            )
-        if self.dynamics == "lag":
-            return first_order_lag(column["lag"], self.interval, self.hold)
-        return no_dynamics(column["d"].size, self.hold)
-
-    def at_rest(self, theta: FloatArray, voltage: float) -> FloatArray:
-        """Return θ (models, parameters) whose initial h is the one at a first ``voltage`` (V).
-
-        The initial h of ``theta`` is taken for the one at zero volts, before the record: from there
-        the voltage went straight to the record's first.
-        """
-        column = dict(zip(self.parameters, theta.T, strict=False))
-        shape = {name: column[name] for name in ("alpha", "beta", "gamma", "exponent", "initial")}
-        started = theta.copy()
-        started[:, self.parameters.index("initial")] = hysteresis([0.0, voltage], **shape)[:, -1]
-        return started
+        return self.filter.recursion(column, column["offset"].size, self.interval, self.hold)

@@ -106,6 +106,8 @@ class Declaration:
         Other names that people give it.
     unit_given
         The unit, where it depends on what is stated of other parameters.
+    without_default
+        Why there is no default prior, for messages.
     """
 
     name: str
@@ -117,11 +119,12 @@ class Declaration:
     reaches_floor: bool = False
     bounds: Callable[[Values], tuple[ArrayLike, ArrayLike]] | None = None
     stated_bounds: str = ""
-    pressed: Mapping[Literal["lower", "upper"], str] = field(default_factory=dict)
+    pressed: Mapping[str, str] = field(default_factory=dict)
     scope: Scope = "actuator"
     loop: bool = False
     aliases: tuple[str, ...] = ()
     unit_given: Callable[[Context], str] | None = None
+    without_default: str = ""
 
     @property
     def positive(self) -> bool:

@@ -8,7 +8,10 @@ them, ``initial``: a state that an earlier drive within a ``span`` of voltages c
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
@@ -23,7 +26,7 @@ class Span(NamedTuple):
     high: float
 
 
-class Operator(Protocol):
+class Operator(ABC):
     """A hysteresis operator: w = Γ[u], um, for a batch of models.
 
     All columns are (models,), named and in the units of ``parameters``; voltages are in V,
@@ -31,15 +34,15 @@ class Operator(Protocol):
     """
 
     @property
+    @abstractmethod
     def parameters(self) -> tuple[Declaration, ...]:
         """Its parameters; the last is ``initial``, of scope ``record``."""
 
+    @abstractmethod
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
 
-    def holds(self, column: Values) -> BoolArray:
-        """Tell which models (models,) meet what the bounds of single parameters do not say."""
-
+    @abstractmethod
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Any:
         """Return the memory at a record's first voltage.
 
@@ -48,19 +51,40 @@ class Operator(Protocol):
         which of the reachable states it is.
         """
 
+    @abstractmethod
     def advance(self, column: Values, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
         """Return w (models, samples) along the next samples, and the memory after them.
 
         The memory that is given stays as it is.
         """
 
+    @abstractmethod
     def reachable(
         self, column: Values, voltage: float, span: Span
     ) -> tuple[FloatArray, FloatArray]:
         """Return the lowest and highest ``initial`` (models,) that earlier drives could leave."""
 
+    @abstractmethod
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return a typical slope dw/du (models,), um/V: the scale of an unknown start."""
 
+    def holds(self, column: Values) -> BoolArray | np.bool_:
+        """Tell which models (models,) meet what the bounds of single parameters do not say.
+
+        A column may be missing.
+        """
+        del column
+        return np.True_
+
     def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
         """Say what the draws (columns) of the ``free`` parameters tell that a user must know."""
+        del column, free
+        return []
+
+    def opening(self, column: Values, half_range: float) -> FloatArray | None:
+        """Return how far (models,) a drive of half a range (V) opens the loop; one closes it.
+
+        None if this operator cannot say.
+        """
+        del column, half_range
+        return None

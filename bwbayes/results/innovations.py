@@ -112,7 +112,7 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     theta = posterior.prior.theta(free[np.newaxis])
     simulated = posterior.simulate(theta, readings.rows)
     residual = readings.values - simulated
-    noise = theta[:, len(posterior.actuator.parameters) :]
+    noise = posterior.table.noise(theta)
     white, _ = posterior.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
     interval = posterior.actuator.interval
     # A measured voltage is noisy, and its change noisier: a five-hundredth of the record.

@@ -139,8 +139,7 @@ def predict_record(
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    noise = theta[:, len(posterior.actuator.parameters) :]
-    return _Draws(start, *posterior.noise.marginal_sd(noise))
+    return _Draws(start, *posterior.noise.marginal_sd(posterior.table.noise(theta)))
 
 
 def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
@@ -178,7 +177,9 @@ def _simulated(
     state = None
     for first in range(0, window.stop, PIECE):
         piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, state = start.actuator.advance(start.model, piece, state, start.unrest)
+        simulated, state = start.actuator.advance(
+            start.model, piece, state, start.unrest, from_rest=start.from_rest
+        )
         skipped = max(window.start - first, 0)
         if skipped < piece.size:
             yield first + skipped, simulated[:, skipped:]

@@ -40,9 +40,6 @@ DRAWS = 400
 # Fewer readings than this tell too little without their first part.
 FEWEST = 200
 
-# Parameters of the start itself.
-OF_THE_START = ("initial", "offset")
-
 
 @dataclass(frozen=True)
 class Moved:
@@ -102,7 +99,8 @@ def without_start(
     physical = [
         i
         for i, p in enumerate(posterior.prior.free)
-        if p.name in posterior.actuator.parameters and p.name not in OF_THE_START
+        if p.name in posterior.actuator.parameters
+        and p.name not in posterior.table.of_scope("record")
     ]
     if not physical or len(free) < DRAWS // 4:
         return None

@@ -28,7 +28,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import predict_windows, thinned
-from bwbayes.results.simulated import OtherRecord, Simulated, covered, discrepancy
+from bwbayes.results.simulated import OtherRecord, Simulated, covered
 
 __all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
 
@@ -275,16 +275,19 @@ def _simulated(
     theta = source.prior.theta(source.prior.draw(generator, 1))
     column = dict(zip(source.prior.names, theta.T, strict=True))
     sd = source.likelihood.start_sd(theta)
-    model = source.actuator.advance(
-        source.likelihood.started(theta)[:, : len(source.actuator.parameters)],
+    model = source.likelihood.actuator.advance(
+        source.table.actuator(theta),
         source.voltage,
         unrest=sd * generator.standard_normal(sd.shape),
+        from_rest=source.from_rest,
     )[0][0]
-    interval = source.actuator.interval
-    truth = model + discrepancy(column, model.size, interval, generator)
-    reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
+    discrepancy, sensor = source.noise.draw(source.table.noise(theta), model.size, generator)
+    truth = model + discrepancy
+    reading = truth + sensor
     reading[np.isnan(experiment.posterior.displacement)] = np.nan
-    return column, Simulated(Record(source.voltage, reading, interval, truth=truth), model)
+    return column, Simulated(
+        Record(source.voltage, reading, source.actuator.interval, truth=truth), model
+    )
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:

@@ -7,13 +7,11 @@ dynamics as far from rest as their prior says, and with an offset of its own.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record, Window
@@ -22,7 +20,7 @@ from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import predict_record
 from bwbayes.results.start import Start, started
 
-__all__ = ["OtherRecord", "Simulated", "covered", "discrepancy"]
+__all__ = ["OtherRecord", "Simulated", "covered"]
 
 
 class Simulated(NamedTuple):
@@ -61,12 +59,15 @@ class OtherRecord:
         """
         planned = replace(self.record, displacement=None, truth=None)
         begun = started(posterior, theta, planned, self.start, generator)
-        model = begun.actuator.advance(begun.model, planned.voltage, unrest=begun.unrest)[0][0]
+        model = begun.actuator.advance(
+            begun.model, planned.voltage, unrest=begun.unrest, from_rest=begun.from_rest
+        )[0][0]
         if self.start.own_offset and self.record.displacement is not None:
             model = model + np.ptp(posterior.readings.values) * generator.standard_normal()
-        column = dict(zip(posterior.prior.names, theta.T, strict=True))
-        truth = model + discrepancy(column, model.size, planned.interval, generator)
-        reading = truth + column["sensor_sd"] * generator.standard_normal(truth.size)
+        noise = posterior.noise.at(planned.interval)
+        discrepancy, sensor = noise.draw(posterior.table.noise(theta), model.size, generator)
+        truth = model + discrepancy
+        reading = truth + sensor
         if self.record.displacement is not None:
             reading[np.isnan(self.record.displacement)] = np.nan
         return Simulated(replace(planned, displacement=reading, truth=truth), model)
@@ -86,18 +87,6 @@ class OtherRecord:
         if self.window is not None:
             part = record.window_slice(*self.window)
         return bands, slice(part.start + bands.scored_from, part.stop)
-
-
-def discrepancy(
-    theta: Mapping[str, FloatArray], samples: int, interval: float, generator: np.random.Generator
-) -> FloatArray:
-    """Draw a stationary Ornstein-Uhlenbeck process (samples,) in um, if the noise has one."""
-    if "discrepancy_sd" not in theta:
-        return np.zeros(samples)
-    rate = interval / float(theta["discrepancy_time"][0])
-    shocks = float(theta["discrepancy_sd"][0]) * generator.standard_normal(samples)
-    shocks[1:] *= math.sqrt(-math.expm1(-2 * rate))
-    return np.asarray(lfilter([1.0], [1.0, -math.exp(-rate)], shocks), dtype=np.float64)
 
 
 def covered(every: list[tuple[Bands, slice]], made: Simulated) -> Iterator[tuple[Kind, int, float]]:

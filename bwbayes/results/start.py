@@ -24,8 +24,8 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
 
 __all__ = ["Start", "Started", "fitted", "started", "uniform"]
@@ -110,15 +110,17 @@ class Started:
     """What every draw takes for a record's start.
 
     ``actuator`` with the record's interval and hold; ``model`` (draws, parameters of the actuator)
-    with initial h and offset; ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd``
-    (draws,), um, what is unsure of the offset still; ``lead_in`` says how that went, if there is
-    one, and ``judged_from`` is the first sample after it.
+    with initial state and offset; ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd``
+    (draws,), um, what is unsure of the offset still; ``from_rest`` if the record starts so;
+    ``lead_in`` says how that went, if there is one, and ``judged_from`` is the first sample after
+    it.
     """
 
     actuator: Actuator
     model: FloatArray
     unrest: FloatArray
     offset_sd: FloatArray
+    from_rest: bool
     lead_in: LeadIn | None = None
     judged_from: int = 0
 
@@ -138,17 +140,17 @@ def started(
         A lead-in that does not fit into the record.
     """
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
-    actuator = replace(posterior.actuator, interval=record.interval, hold=hold)
+    span = _voltages(posterior, record)
+    actuator = replace(posterior.actuator, interval=record.interval, hold=hold, span=span)
     window = start.window(record)
     likelihood = _likelihood(posterior, actuator, record, start, window)
-    states = _States(actuator, theta, record.voltage, _voltages(posterior, record), start.from_rest)
     if window is None:
-        return _unseen(likelihood, states, theta, generator)
+        return _unseen(likelihood, theta, generator)
     if start.own_offset:
         assert record.displacement is not None
-        theta = theta.copy()
-        offset = actuator.parameters.index("offset")
-        theta[:, offset] = np.nanmean(record.displacement[window])
+        level = np.full(len(theta), np.nanmean(record.displacement[window]))
+        theta = likelihood.table.replaced(theta, "offset", level)
+    states = _States(likelihood, theta)
     chosen = states.at(_chosen(likelihood, states, generator))
     return _informed(likelihood, chosen, record, window, generator)
 
@@ -158,8 +160,8 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     likelihood = posterior.likelihood
     start = likelihood.start(theta)
     unrest = _normal(start.mean, start.covariance, generator)
-    model = likelihood.started(theta)[:, : len(posterior.actuator.parameters)]
-    return Started(posterior.actuator, model, unrest, np.zeros(len(theta)))
+    model, none = posterior.table.actuator(theta), np.zeros(len(theta))
+    return Started(likelihood.actuator, model, unrest, none, posterior.from_rest)
 
 
 def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
@@ -168,10 +170,10 @@ def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
     return parts
 
 
-def _voltages(posterior: Posterior, record: Record) -> tuple[float, float]:
+def _voltages(posterior: Posterior, record: Record) -> Span:
     """Return the least and the largest voltage of both records, V."""
     both = record.voltage, posterior.voltage
-    return min(float(np.min(v)) for v in both), max(float(np.max(v)) for v in both)
+    return Span(min(float(np.min(v)) for v in both), max(float(np.max(v)) for v in both))
 
 
 def _likelihood(
@@ -199,48 +201,33 @@ def _likelihood(
 class _States:
     """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
 
-    The highest and the lowest are those that sweeps through the whole range of voltages leave, from
-    below and from above, or none at all, as after small and smaller loops.
+    The highest and the lowest are those that an earlier drive within the range of voltages leaves.
     """
 
-    def __init__(
-        self,
-        actuator: Actuator,
-        theta: FloatArray,
-        voltage: FloatArray,
-        range_: tuple[float, float],
-        from_rest: bool,
-    ) -> None:
-        self.column = actuator.parameters.index("initial")
-        self.theta = theta
-        if from_rest:
+    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
+        self.table, self.theta = likelihood.table, theta
+        if likelihood.from_rest:
             self.low = self.high = np.zeros(len(theta))
             return
-        values = dict(zip(actuator.parameters, theta.T, strict=False))
-        shape = {name: values[name] for name in ("alpha", "beta", "gamma", "exponent")}
-        low, high = range_
-        sweeps = [0.0, high, low, high, low, voltage[0]], [0.0, low, high, low, high, voltage[0]]
-        ends = [hysteresis(sweep, **shape)[:, -1] for sweep in sweeps]
-        self.low = np.minimum(np.min(ends, axis=0), 0.0)
-        self.high = np.maximum(np.max(ends, axis=0), 0.0)
+        actuator = likelihood.actuator
+        assert actuator.span is not None
+        self.low, self.high = actuator.hysteresis.reachable(
+            self.table.columns(theta), float(likelihood.voltage[0]), actuator.span
+        )
 
     def at(self, part: FloatArray) -> FloatArray:
         """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
-        theta = self.theta.copy()
-        theta[:, self.column] = self.low + part * (self.high - self.low)
-        return theta
+        return self.table.replaced(self.theta, "initial", self.low + part * (self.high - self.low))
 
 
-def _unseen(
-    likelihood: Likelihood, states: _States, theta: FloatArray, generator: np.random.Generator
-) -> Started:
+def _unseen(likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator) -> Started:
     """Draw the start from what is known of it beforehand."""
     draws = len(theta)
     sd = likelihood.start_sd(theta)
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    model = likelihood.started(states.at(uniform(generator, draws)))
-    size = len(likelihood.actuator.parameters)
-    return Started(likelihood.actuator, model[:, :size], unrest, np.zeros(draws))
+    begun = _States(likelihood, theta).at(uniform(generator, draws))
+    model, none = likelihood.table.actuator(begun), np.zeros(draws)
+    return Started(likelihood.actuator, model, unrest, none, likelihood.from_rest)
 
 
 def _chosen(likelihood: Likelihood, states: _States, generator: np.random.Generator) -> FloatArray:
@@ -288,20 +275,19 @@ def _informed(
     window: slice,
     generator: np.random.Generator,
 ) -> Started:
-    """Let the lead-in tell offset and unrest of draws θ whose initial h is chosen."""
+    """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
     posterior = likelihood.start(theta)
     offsets = int(likelihood.offset_sd > 0)
     mean, covariance = posterior.mean, posterior.covariance
     unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
-    size = len(likelihood.actuator.parameters)
-    model = likelihood.started(theta)[:, :size].copy()
-    sd = np.zeros(len(theta))
+    begun, sd = theta, np.zeros(len(theta))
     if offsets:
         # Given the unrest the offset is normal still.
         pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
         shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
         left = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
-        model[:, likelihood.actuator.parameters.index("offset")] += mean[:, 0] + shift
+        level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
+        begun = likelihood.table.replaced(theta, "offset", level)
         sd = np.sqrt(np.maximum(left, 0.0))
     lead_in = LeadIn(
         float(record.time[window.start]),
@@ -309,7 +295,10 @@ def _informed(
         likelihood.readings.rows.size,
         _p_value(likelihood, theta, posterior.squares),
     )
-    return Started(likelihood.actuator, model, unrest, sd, lead_in, window.stop)
+    model = likelihood.table.actuator(begun)
+    return Started(
+        likelihood.actuator, model, unrest, sd, likelihood.from_rest, lead_in, window.stop
+    )
 
 
 def _p_value(likelihood: Likelihood, theta: FloatArray, squares: FloatArray) -> float:

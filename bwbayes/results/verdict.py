@@ -86,13 +86,9 @@ class Background:
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
         """Return what a posterior and its draws (draws, free) say."""
-        names, actuator = posterior.prior.names, posterior.actuator.parameters
-        theta = posterior.prior.theta(draws)
-        memory = 0.0
-        if "discrepancy_time" in names:
-            times = theta[:, names.index("discrepancy_time")]
-            memory = float(np.quantile(times, LONG))
-        sds = posterior.noise.marginal_sd(theta[:, len(actuator) :])
+        noise = posterior.table.noise(posterior.prior.theta(draws))
+        memory = float(np.quantile(posterior.noise.memory(noise), LONG))
+        sds = posterior.noise.marginal_sd(noise)
         sizes = np.log(np.sqrt(sum(sd**2 for sd in sds)))
         voltage = np.concatenate([posterior.voltage[window] for window in posterior.training])
         return cls(

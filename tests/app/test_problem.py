@@ -15,6 +15,7 @@ from bwbayes.app.run import load_run
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
+from bwbayes.model.operators.bouc_wen import BoucWen
 from tests.app import small
 from tests.data.spoilt import SPOILT, looping
 
@@ -247,9 +248,9 @@ def test_hold_that_is_given_is_kept(folder: Path) -> None:
 
 
 def test_model_that_need_not_be_passive_stays_so(folder: Path) -> None:
-    assert of(RECORD, folder).posterior.prior.passive
+    assert of(RECORD, folder).posterior.actuator.hysteresis == BoucWen(passive=True)
     problem = of(RECORD + "[model]\npassive = false", folder)
-    assert not problem.posterior.prior.passive
+    assert problem.posterior.actuator.hysteresis == BoucWen(passive=False)
     assert not problem.config.model.passive
     assert "passive = false" in dump(problem.config)
 

@@ -11,9 +11,7 @@ from bwbayes.app.config import Config, load
 from bwbayes.app.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Dynamics
 from tests.benchmarks.stock import stock
 from tests.inference.problems import posterior_of, truth
 
@@ -39,8 +37,8 @@ __all__ = [
 ROOT = Path(__file__).resolve().parents[2]
 ENGINES: tuple[Engine, ...] = ("numba", "numpy")
 BATCHES = (1, 8, 16, 32, 64, 256)
-DYNAMICS: tuple[Dynamics, ...] = ("none", "lag", "second-order")
-NOISES: tuple[NoiseKind, ...] = ("white", "discrepancy")
+DYNAMICS: tuple[str, ...] = ("none", "lag", "second-order")
+NOISES: tuple[str, ...] = ("white", "discrepancy")
 LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
 
 # Models of a batch where nothing else is said.
@@ -85,7 +83,7 @@ def on_engine(posterior: Posterior, name: str) -> Posterior:
 
 
 def variant(
-    posterior: Posterior, dynamics: Dynamics, noise: NoiseKind, samples: int | None = None
+    posterior: Posterior, dynamics: str, noise: str, samples: int | None = None
 ) -> Posterior:
     """Return a posterior of the same record with another model, repeated to so many samples."""
     voltage, displacement = posterior.voltage, posterior.displacement

@@ -67,7 +67,7 @@ def batches(posterior: Posterior, effort: Effort) -> Table:
 def models(posterior: Posterior, effort: Effort) -> Table:
     """Measure all dynamics and noises."""
     rows = [
-        {"dynamics": dynamics, "noise": noise}
+        dict[str, Cell](dynamics=dynamics, noise=noise)
         | _row(variant(posterior, dynamics, noise), MODELS, effort.rounds)
         for dynamics in DYNAMICS
         for noise in NOISES

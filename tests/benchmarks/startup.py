@@ -22,11 +22,12 @@ MAIN = "import sys; from bwbayes.app.cli import main; sys.argv[0] = 'bwbayes'; m
 # One model through all that is compiled, with a record as a run has it: not to be written to.
 COMPILED = """
 import numpy as np
-from bwbayes.inference import kernels, lanes
+from bwbayes.inference.compiled import kernels, lanes, stages
 record = np.ones(9)
 record.flags.writeable = False
 one = np.ones((1, len(lanes.PARAMETERS)))
-kernels.sums(record, record, 0 * record, one, np.empty((1, 0)), 0, 1)
+own = np.ones((1, 9))
+kernels.sums(record, record, 0 * record, one, stages.BOUC_WEN, own, np.empty((0, 0)), 0, 1)
 """
 
 STARTS: Mapping[str, list[str]] = {

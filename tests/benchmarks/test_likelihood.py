@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Dynamics
 from bwbayes.model.boucwen import hysteresis
 from tests.benchmarks.cases import BATCHES, DYNAMICS, ENGINES, LENGTHS, MODELS, NOISES, variant
 from tests.benchmarks.likelihood import Call, likelihood_of, shape_of
@@ -49,8 +47,8 @@ def test_model(
     benchmark: BenchmarkFixture,
     paper: Posterior,
     engine: str,
-    dynamics: Dynamics,
-    noise: NoiseKind,
+    dynamics: str,
+    noise: str,
 ) -> None:
     call = likelihood_of(variant(paper, dynamics, noise), engine)
     measure(benchmark, call, MODELS * paper.voltage.size)

@@ -21,16 +21,19 @@ from emcee.moves import Move
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
-from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
+from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.ensemble import advance, start
-from bwbayes.inference.noise import NoiseKind, noise_model
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.noise import noise_model
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.proposals import StudentProposal
-from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.inference.table import Table
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
+from tests.declared import NAMES, default_prior, joint, parameter
 
 __all__ = [
     "ALARM",
@@ -71,11 +74,11 @@ def decaying_sine(samples: int, periods: float = 4.0, amplitude: float = 100.0) 
 def truth(posterior: Posterior) -> FloatArray:
     """Return the θ (1, parameters) that the simulated records come from."""
     table = RingBender()
-    known = {**{n: getattr(table, n, 0.0) for n in CATALOGUE}, **TRUE_NOISE, "lag": TRUE_LAG}
+    known = {**{n: getattr(table, n, 0.0) for n in NAMES}, **TRUE_NOISE, "lag": TRUE_LAG}
     return np.array([[known[name] for name in posterior.prior.names]])
 
 
-def ring_bender(actuator: Actuator, noise: NoiseKind, voltage: FloatArray, seed: int) -> FloatArray:
+def ring_bender(actuator: Actuator, noise: str, voltage: FloatArray, seed: int) -> FloatArray:
     """Simulate the displacement (samples,) of the paper's ring bender, um."""
     generator = np.random.default_rng(seed)
     table = RingBender()
@@ -109,18 +112,15 @@ def joint_prior(
             known = priors[name]
         else:
             known = default_prior(name, ranges, fixed.get("exponent", 1.0), 4.1e5)
-        if isinstance(known, Distribution):
-            parameters.append(Parameter(name, *CATALOGUE[name], prior=known))
-        else:
-            parameters.append(Parameter(name, *CATALOGUE[name], fixed=known))
-    return JointPrior(parameters)
+        parameters.append(parameter(name, known))
+    return joint(parameters)
 
 
 def posterior_of(
     voltage: FloatArray,
     displacement: FloatArray,
     actuator: Actuator,
-    noise: NoiseKind,
+    noise: str,
     fixed: Mapping[str, float] | None = None,
     *,
     training: tuple[slice, ...] | None = None,
@@ -129,17 +129,17 @@ def posterior_of(
 ) -> Posterior:
     """Return the posterior with default priors, of a record that starts from rest."""
     model = noise_model(noise, actuator.interval)
-    names = (*actuator.parameters, *model.parameters)
-    ranges = Ranges.of(voltage, displacement, actuator.interval)
+    names = Table(actuator, model).names
+    ranges = ranges_of(voltage, displacement, actuator.interval)
     prior = joint_prior(names, ranges, {"initial": 0.0} if fixed is None else fixed, priors)
     windows = training or (slice(0, voltage.size),)
     return Posterior(voltage, displacement, windows, actuator, model, prior, from_rest=from_rest)
 
 
 def short_posterior(
-    noise: NoiseKind = "discrepancy",
+    noise: str = "discrepancy",
     samples: int = 400,
-    dynamics: Dynamics = "none",
+    dynamics: str = "none",
     fixed: Mapping[str, float] | None = None,
     *,
     seed: int = 1,
@@ -167,8 +167,7 @@ def single(
     name: str, prior: Distribution, lower: float = -np.inf, upper: float = np.inf
 ) -> JointPrior:
     """Return the joint prior of one parameter alone."""
-    only = Parameter(name, *CATALOGUE[name], prior=prior, lower=lower, upper=upper)
-    return JointPrior([only])
+    return joint([parameter(name, prior, lower, upper)])
 
 
 @dataclass(frozen=True)

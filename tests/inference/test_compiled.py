@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import engine
+from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.engine import choose
-from bwbayes.inference.lanes import LANES
-from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Dynamics
 from bwbayes.model.linear import Hold
 from tests.inference.problems import posterior_of, ring_bender, short_posterior, truth
 
@@ -49,7 +47,7 @@ def changed(posterior: Posterior, **values: float) -> FloatArray:
 
 @pytest.mark.parametrize("noise", ["white", "discrepancy"])
 @pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
-def test_engines_agree_on_prior_draws(noise: NoiseKind, dynamics: Dynamics) -> None:
+def test_engines_agree_on_prior_draws(noise: str, dynamics: str) -> None:
     fixed = {} if dynamics != "second-order" else MASS
     posterior = short_posterior(noise, 700, dynamics, fixed)
     assert_engines_agree(posterior, prior_draws(posterior, 300))

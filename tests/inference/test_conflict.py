@@ -13,11 +13,13 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.conflict import around, conflicts, effective
-from bwbayes.inference.defaults import CATALOGUE, Defaults, Ranges
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.defaults import default_priors, ranges_of
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.pointfit import fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
+from tests.declared import context, declared, joint, parameter
 from tests.inference.problems import INTERVAL, joint_prior, short_posterior
 
 RANGES = Ranges(voltage=100.0, displacement=60.0, middle=0.0, time=0.5)
@@ -25,7 +27,7 @@ NAMES = (
     "d", "alpha", "beta", "gamma", "exponent", "initial", "lag", "offset", "sensor_sd",
     "discrepancy_sd", "discrepancy_time",
 )  # fmt: skip
-DEFAULTS = Defaults(RANGES).priors(NAMES)
+DEFAULTS = default_priors([declared(name) for name in NAMES], context(RANGES))
 
 # What a good run's posterior is like: mean and sd.
 GOOD = {
@@ -46,12 +48,8 @@ def lognormal(median: float, sigma: float) -> Distribution:
 def with_prior(name: str, prior: Distribution | float, upper: float = np.inf) -> JointPrior:
     """Return the default joint prior but for one parameter."""
     known = joint_prior(NAMES, RANGES, {})
-    other = (
-        Parameter(name, *CATALOGUE[name], prior=prior, upper=upper)
-        if isinstance(prior, Distribution)
-        else Parameter(name, *CATALOGUE[name], fixed=prior)
-    )
-    return JointPrior([other if p.name == name else p for p in known.parameters])
+    other = parameter(name, prior, upper=upper)
+    return joint([other if p.name == name else p for p in known.parameters])
 
 
 def posterior_draws(prior: JointPrior, **other: FloatArray) -> FloatArray:
@@ -136,10 +134,10 @@ def test_gamma_on_beta_is_said_with_the_switch() -> None:
     prior = joint_prior(NAMES, RANGES, {})
     beta = np.random.default_rng(3).normal(0.02, 1e-3, 2000)
     (remark,) = said(prior, beta=beta, gamma=beta - piled_up(0, 2e-4))
-    assert remark.startswith("gamma: lies on its bound beta")
+    assert remark.startswith("gamma: lies on its upper bound of |gamma| <= beta")
     assert "passive = false" in remark
     (remark,) = said(prior, beta=beta, gamma=-beta + piled_up(0, 2e-4))
-    assert remark.startswith("gamma: lies on its bound -beta")
+    assert remark.startswith("gamma: lies on its lower bound of |gamma| <= beta")
 
 
 def test_gamma_anywhere_between_its_bounds_is_not_said() -> None:
@@ -154,7 +152,7 @@ def test_alpha_on_d_is_said() -> None:
     prior = joint_prior(NAMES, RANGES, {})
     d = np.full(2000, 0.7)
     (remark,) = said(prior, d=d, alpha=d - piled_up(0, 1e-3))
-    assert remark.startswith("alpha: lies on its bound d")
+    assert remark.startswith("alpha: lies on its upper bound of 0 < alpha < d")
 
 
 def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:
@@ -183,7 +181,9 @@ def judged(posterior: Posterior, ranges: Ranges) -> list[str]:
     generator = np.random.default_rng(1)
     point = fit(posterior, generator)
     draws = around(posterior.prior, point, generator)
-    return conflicts(posterior.prior, draws, Defaults(ranges).priors(posterior.prior.names))
+    return conflicts(
+        posterior.prior, draws, default_priors(posterior.table.declarations, context(ranges))
+    )
 
 
 def test_forty_good_records_raise_no_remark() -> None:
@@ -197,7 +197,7 @@ def test_forty_good_records_raise_no_remark() -> None:
             {"initial": 0.0} if seed % 8 < 4 else {},
             seed=seed,
         )
-        ranges = Ranges.of(posterior.voltage, posterior.displacement, INTERVAL)
+        ranges = ranges_of(posterior.voltage, posterior.displacement, INTERVAL)
         alarms += judged(posterior, ranges)
     assert [] == alarms
 
@@ -206,7 +206,7 @@ def test_displacement_in_another_unit_contradicts_an_informed_prior() -> None:
     """A record in nm that is taken for um, and a user who knows the actuator's d."""
     good = short_posterior("white", 200, priors={"d": normal(0.7, 0.07)})
     wrong = replace(good, displacement=4 * good.displacement)
-    ranges = Ranges.of(wrong.voltage, wrong.displacement, INTERVAL)
+    ranges = ranges_of(wrong.voltage, wrong.displacement, INTERVAL)
     known = joint_prior(good.prior.names, ranges, {"initial": 0.0}, {"d": normal(0.7, 0.07)})
     remarks = judged(replace(wrong, prior=known), ranges)
     assert any(remark.startswith("d: ") for remark in remarks), remarks

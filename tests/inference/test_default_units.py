@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bwbayes.inference.defaults import Ranges, default_prior
+from bwbayes.inference.defaults import ranges_of
 from bwbayes.model.distributions import Distribution
+from tests.declared import default_prior
 from tests.inference.problems import INTERVAL, decaying_sine
 
 # Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.
@@ -28,7 +29,7 @@ POWERS = {
 def scale(name: str, exponent: float, k: float = 1.0, m: float = 1.0) -> float:
     """Return half of the central 68 % of a default prior, given k and m."""
     voltage = decaying_sine(400)
-    ranges = Ranges.of(m * voltage, k * 0.6 * voltage, INTERVAL)
+    ranges = ranges_of(m * voltage, k * 0.6 * voltage, INTERVAL)
     prior = default_prior(name, ranges, exponent)
     assert isinstance(prior, Distribution)
     low, high = prior.frozen.ppf([0.16, 0.84])

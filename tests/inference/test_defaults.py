@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import RingBender
-from bwbayes.inference.defaults import CATALOGUE, Ranges, default_prior
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.defaults import ranges_of
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
+from tests.declared import NAMES as EVERY
+from tests.declared import default_prior, joint, parameter
 
-NAMES = tuple(name for name in CATALOGUE if name not in ("mass", "stiffness", "exponent"))
+NAMES = tuple(name for name in EVERY if name not in ("mass", "stiffness", "exponent"))
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
 
 
@@ -54,8 +56,8 @@ def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
 ) -> None:
     voltage = drive(amplitude, bias=bias)
     reading = displacement(voltage)
-    whole = Ranges.of(voltage, reading, 1e-3)
-    part = Ranges.of(voltage[::every], reading[::every], every * 1e-3)
+    whole = ranges_of(voltage, reading, 1e-3)
+    part = ranges_of(voltage[::every], reading[::every], every * 1e-3)
     for name in NAMES:
         one, other = prior(name, whole), prior(name, part)
         quantiles = [p.frozen.ppf([0.16, 0.5, 0.84]) for p in (one, other)]
@@ -67,7 +69,7 @@ def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
 def test_the_same_drive_ten_times_slower_has_ten_times_the_times() -> None:
     voltage = drive()
     reading = displacement(voltage)
-    fast, slow = (Ranges.of(voltage, reading, interval) for interval in (1e-3, 1e-2))
+    fast, slow = (ranges_of(voltage, reading, interval) for interval in (1e-3, 1e-2))
     for name in NAMES:
         timely = name in ("lag", "damping", "discrepancy_time")
         factor = prior(name, slow).frozen.median() - prior(name, fast).frozen.median() * (
@@ -85,7 +87,7 @@ def test_lag_of_1_ms_is_not_improbable_after_a_slow_drive() -> None:
 def test_times_of_a_1_hz_drive_are_those_that_actuators_show(rate: float) -> None:
     """A lag of 0.5 to 50 ms lies within 1.4 sds, a discrepancy's 0.1 to 0.7 s within 1.5."""
     voltage = drive(interval=1 / rate)
-    ranges = Ranges.of(voltage, displacement(voltage, 1 / rate), 1 / rate)
+    ranges = ranges_of(voltage, displacement(voltage, 1 / rate), 1 / rate)
     for lag in (0.5e-3, 5e-3, 20e-3, 50e-3):
         assert abs(score("lag", lag, ranges)) < 1.4
         assert abs(score("damping", 4.1e5 * lag, ranges)) < 1.4
@@ -99,11 +101,8 @@ def share_below(ranges: Ranges, exponent: float | Distribution, **values: float)
     parameters = []
     for name in HYSTERESIS:
         known = exponent if name == "exponent" else prior(name, ranges, exponent)
-        if isinstance(known, Distribution):
-            parameters.append(Parameter(name, *CATALOGUE[name], prior=known))
-        else:
-            parameters.append(Parameter(name, *CATALOGUE[name], fixed=known))
-    cut = JointPrior(parameters)
+        parameters.append(parameter(name, known))
+    cut = joint(parameters)
     draws = cut.draw(np.random.default_rng(1), 4000)
     return [float(np.mean(draws[:, cut.free_names.index(n)] < v)) for n, v in values.items()]
 
@@ -116,7 +115,7 @@ def share_below(ranges: Ranges, exponent: float | Distribution, **values: float)
 def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bias: float) -> None:
     """Within the central 98 % of the cut prior, and 95 % of the offset's."""
     voltage = drive(amplitude, bias=bias * amplitude)
-    ranges = Ranges.of(voltage, displacement(voltage), 1e-3)
+    ranges = ranges_of(voltage, displacement(voltage), 1e-3)
     shares = share_below(ranges, 1.0, d=0.7, alpha=0.3575, beta=0.0272, gamma=0.0172)
     assert 0.01 < min(shares), shares
     assert max(shares) < 0.99, shares
@@ -128,7 +127,7 @@ def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bi
 def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: bool) -> None:
     """What is a rate of 0.0272 / V at an h of 8 um lies inside, be the exponent known or free."""
     voltage = drive()
-    ranges = Ranges.of(voltage, displacement(voltage), 1e-3)
+    ranges = ranges_of(voltage, displacement(voltage), 1e-3)
     given = Distribution("uniform", {"lower": 1.0, "upper": 5.0}) if free else exponent
     unit = 8.0 ** (1 - exponent)
     shares = share_below(ranges, given, beta=0.0272 * unit, gamma=0.0172 * unit)
@@ -158,7 +157,7 @@ def test_offset_is_as_exact_as_the_displacements_range_asks(offset: float) -> No
     """A sensor far from its zero: the prior's mean is off by a hundredth of its sd at most."""
     voltage = drive(1.0)
     reading = displacement(voltage, offset=offset)
-    ranges = Ranges.of(voltage, reading, 1e-3)
+    ranges = ranges_of(voltage, reading, 1e-3)
     found = prior("offset", ranges).arguments
     assert abs(found["mean"] - ranges.middle) < 0.01 * found["sd"]
     assert len(f"{found['mean']:.12g}") <= 12
@@ -169,7 +168,7 @@ def test_missing_readings_do_not_matter() -> None:
     whole = displacement(voltage)
     holes = whole.copy()
     holes[1::2] = np.nan
-    one, other = (Ranges.of(voltage, reading, 1e-3) for reading in (whole, holes))
+    one, other = (ranges_of(voltage, reading, 1e-3) for reading in (whole, holes))
     assert one.time == other.time
     assert other.displacement == pytest.approx(one.displacement, rel=1e-3)
 
@@ -178,6 +177,6 @@ def test_windows_alone_give_the_ranges() -> None:
     voltage = np.concatenate([drive(), drive(10.0)])
     reading = displacement(voltage)
     window = slice(10_000, 20_000)
-    ranges = Ranges.of(voltage, reading, 1e-3, [window])
+    ranges = ranges_of(voltage, reading, 1e-3, [window])
     assert ranges.voltage == pytest.approx(np.ptp(voltage[window]) / 2)
     assert ranges.displacement == pytest.approx(np.ptp(reading[window]) / 2)

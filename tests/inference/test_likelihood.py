@@ -16,9 +16,8 @@ from scipy import linalg
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.inference.noise import NoiseKind
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold, first_order_lag, second_order
 from tests.inference.problems import (
     INTERVAL,
@@ -30,7 +29,7 @@ from tests.inference.problems import (
 
 SLOW = {"mass": 0.00134, "stiffness": 4.1e5}
 COMPLEX = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
-MODELS: list[tuple[Dynamics, dict[str, float]]] = [
+MODELS: list[tuple[str, dict[str, float]]] = [
     ("none", {}),
     ("lag", {}),
     ("second-order", SLOW),
@@ -39,7 +38,7 @@ MODELS: list[tuple[Dynamics, dict[str, float]]] = [
 
 
 def columns(likelihood: Likelihood, theta: FloatArray) -> dict[str, FloatArray]:
-    names = (*likelihood.actuator.parameters, *likelihood.noise.parameters)
+    names = likelihood.table.names
     return dict(zip(names, theta[np.newaxis].T, strict=True))
 
 
@@ -74,8 +73,8 @@ def dense(likelihood: Likelihood, theta: FloatArray) -> tuple[float, FloatArray,
 
 
 def moving(
-    noise: NoiseKind = "discrepancy",
-    dynamics: Dynamics = "lag",
+    noise: str = "discrepancy",
+    dynamics: str = "lag",
     fixed: dict[str, float] | None = None,
     *,
     hold: Hold = "first",
@@ -100,7 +99,7 @@ def moving(
 @pytest.mark.parametrize(("dynamics", "fixed"), MODELS, ids=["none", "lag", "slow", "complex"])
 @pytest.mark.parametrize("hold", ["first", "zero"])
 def test_the_unknown_start_is_integrated_out(
-    engine: str, noise: NoiseKind, dynamics: Dynamics, fixed: dict[str, float], hold: Hold
+    engine: str, noise: str, dynamics: str, fixed: dict[str, float], hold: Hold
 ) -> None:
     posterior = moving(noise, dynamics, fixed, hold=hold)
     likelihood = replace(posterior.likelihood, engine=cast(Engine, engine), offset_sd=3.0)
@@ -116,7 +115,7 @@ def test_the_unknown_start_is_integrated_out(
 
 @pytest.mark.parametrize(("dynamics", "fixed"), MODELS, ids=["none", "lag", "slow", "complex"])
 def test_a_shape_takes_what_an_unknown_of_that_shape_would(
-    dynamics: Dynamics, fixed: dict[str, float]
+    dynamics: str, fixed: dict[str, float]
 ) -> None:
     """A constant is an offset of which nothing is known."""
     posterior = moving("discrepancy", dynamics, fixed, missing=0.1)

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.stats import kstest, multivariate_normal, norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import DiscrepancyNoise, NoiseKind, WhiteNoise, noise_model
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
 from tests.inference.problems import INTERVAL, short_posterior
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
@@ -103,7 +103,7 @@ def test_white_noise_is_exact_at_extreme_values(sensor: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["white", "discrepancy"])
-def test_windows_of_a_record_are_one_multivariate_normal(kind: NoiseKind) -> None:
+def test_windows_of_a_record_are_one_multivariate_normal(kind: str) -> None:
     """One discrepancy goes through all windows; what lies between is only not seen."""
     windows = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 150))
     posterior = short_posterior(kind, 150, "lag", {}, training=windows)
@@ -196,7 +196,7 @@ def test_rows_are_independent(kind: str) -> None:
     """A model's density does not depend on its neighbours in the batch, bit for bit."""
     generator = np.random.default_rng(7)
     noise = noise_model("white" if kind == "white" else "discrepancy", 0.01)
-    theta = np.exp(generator.normal(size=(8, len(noise.parameters))))
+    theta = np.exp(generator.normal(size=(8, len(noise.declarations))))
     residual = generator.standard_normal((8, 40))
     together = noise.log_density(theta, residual)
     alone = [noise.log_density(theta[[i]], residual[[i]])[0] for i in range(8)]
@@ -204,7 +204,7 @@ def test_rows_are_independent(kind: str) -> None:
 
 
 def test_noise_model_goes_by_its_name() -> None:
-    assert noise_model("white", 0.1) == WhiteNoise()
+    assert noise_model("white", 0.1) == WhiteNoise(0.1)
     assert noise_model("discrepancy", 0.1) == DiscrepancyNoise(0.1)
 
 
@@ -269,3 +269,22 @@ def test_twin_a_gap_that_is_taken_for_one_step_is_found() -> None:
     right = DiscrepancyNoise(1.0).whiten(theta, series, skipped)[0]
     wrong = DiscrepancyNoise(1.0).whiten(theta, series, skipped / 3)[0]
     assert np.max(np.abs(right - wrong)) > 1e-2
+
+
+def test_draws_are_of_the_noise_that_the_likelihood_has() -> None:
+    """Its covariance is σ² exp(−|t − t'|/τ); 4,000 draws know it to some 3 %."""
+    noise, theta = DiscrepancyNoise(0.01), np.array([[0.3, 1.5, 0.05]])
+    generator = np.random.default_rng(1)
+    drawn = np.array([noise.draw(theta, 12, generator) for _ in range(4_000)])
+    slow, sensor = drawn[:, 0], drawn[:, 1]
+    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) * 0.01
+    for part, expected in ((slow, 1.5**2 * np.exp(-lag / 0.05)), (sensor, 0.3**2 * np.eye(12))):
+        # sd of a covariance of n draws: sqrt((c_ii c_jj + c_ij²) / n)
+        error = np.sqrt((expected[0, 0] ** 2 + expected**2) / 4_000)
+        assert np.max(np.abs(part.T @ part / 4_000 - expected) / error) < 5
+
+
+def test_white_noise_has_no_discrepancy() -> None:
+    slow, sensor = WhiteNoise().draw(np.array([[0.3]]), 500, np.random.default_rng(1))
+    np.testing.assert_array_equal(np.zeros(500), slow)
+    assert 0.25 < np.std(sensor) < 0.35

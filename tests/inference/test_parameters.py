@@ -12,10 +12,12 @@ from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.defaults import CATALOGUE, Ranges
-from bwbayes.inference.parameters import JointPrior, Parameter, passive_remark
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.boucwen import ceiling
+from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.operators.bouc_wen import BoucWen
+from tests.declared import declared, joint, parameter
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
@@ -37,17 +39,25 @@ def normal(mean: float, sd: float) -> Distribution:
     return Distribution("normal", {"mean": mean, "sd": sd})
 
 
-def parameter(name: str, **what: Any) -> Parameter:
-    return Parameter(name, *CATALOGUE[name], **what)
-
-
 def cut_prior(**fixed: float) -> JointPrior:
     return joint_prior(HYSTERESIS, RANGES, fixed, WIDE)
 
 
 def active(prior: JointPrior) -> JointPrior:
     """Return a prior without the constraint that gamma lies below beta."""
-    return JointPrior(prior.parameters, passive=False)
+    return joint(list(prior.parameters), passive=False)
+
+
+def passive(prior: JointPrior) -> bool:
+    """Whether a prior has that constraint."""
+    (gamma,) = (p.declared for p in prior.parameters if p.name == "gamma")
+    return gamma is not None and gamma.stated_bounds == "|gamma| <= beta"
+
+
+def passive_remark(prior: JointPrior, draws: FloatArray) -> str | None:
+    theta = prior.theta(draws.reshape(-1, prior.dimensions))
+    column = dict(zip(prior.names, theta.T, strict=True))
+    return next(iter(BoucWen(passive(prior)).remarks(column, prior.free_names)), None)
 
 
 PRIORS = {
@@ -100,7 +110,7 @@ def violations(prior: JointPrior, free: FloatArray) -> list[str]:
     allowed = {
         "0 < alpha < d": (v["alpha"] > 0) & (v["alpha"] <= v["d"]),
         "|gamma| <= beta": (np.abs(v["gamma"]) <= v["beta"])
-        | (np.array(not prior.passive) & (v["gamma"] >= -v["beta"])),
+        | (np.array(not passive(prior)) & (v["gamma"] >= -v["beta"])),
         "exponent": v["exponent"] >= 1,
         "initial": (np.abs(v["initial"]) <= top * (1 + 1e-12))
         | (("initial" not in prior.free_names) & (v["gamma"] <= v["beta"])),
@@ -216,7 +226,7 @@ def test_draws_have_the_density_that_log_density_says() -> None:
 def test_the_marginal_of_d_is_its_prior_times_the_room_for_alpha() -> None:
     """P(d) ∝ p(d) F_alpha(d), by quadrature; Kolmogorov-Smirnov at one in 10,000."""
     priors = {"d": normal(1.0, 0.5), "alpha": Distribution("uniform", {"lower": 0, "upper": 3})}
-    prior = JointPrior([parameter(name, prior=p) for name, p in priors.items()])
+    prior = joint([parameter(name, p) for name, p in priors.items()])
     draws = prior.draw(np.random.default_rng(5), 5000)[:, 0]
     grid = np.linspace(0, 3, 3001)
     cumulative = integrate.cumulative_simpson(stats.norm(1, 0.5).pdf(grid) * grid, x=grid)
@@ -246,7 +256,7 @@ def test_what_is_positive_stays_positive_under_any_prior(name: str) -> None:
     prior = (
         single(name, normal(-1.0, 1.0))
         if name != "d"
-        else JointPrior([parameter("d", prior=normal(-1.0, 1.0)), parameter("alpha", fixed=1e-9)])
+        else joint([parameter("d", normal(-1.0, 1.0)), parameter("alpha", 1e-9)])
     )
     assert (prior.draw(np.random.default_rng(7), 1000) > 0).all()
     x, log_prior = prior.constrain(np.linspace(-20, 20, 81)[:, np.newaxis])
@@ -285,17 +295,17 @@ def test_theta_puts_fixed_parameters_in_their_columns() -> None:
 )
 def test_a_parameter_that_cannot_be_is_refused(name: str, what: Any, says: str) -> None:
     with pytest.raises(InputError, match=says) as refused:
-        parameter(name, **what)
+        Parameter(name, "um", name, "", **what, declared=declared(name))
     assert str(refused.value).startswith(f"{name}: ")
 
 
 @pytest.mark.parametrize(
     ("fixed", "says"),
     [
-        ({"d": 0.5, "alpha": 0.5}, "^alpha: fixed at or above d"),
-        ({"d": 0.5, "alpha": 0.6}, "^alpha: fixed at or above d"),
-        ({"beta": 0.01, "gamma": 0.02}, "^gamma: fixed beyond beta"),
-        ({"beta": 0.01, "gamma": -0.02}, "^gamma: fixed beyond beta"),
+        ({"d": 0.5, "alpha": 0.5}, "^priors: what is fixed must have 0 < alpha < d"),
+        ({"d": 0.5, "alpha": 0.6}, "^alpha: fixed at 0.6; must hold: 0 < alpha < d"),
+        ({"beta": 0.01, "gamma": 0.02}, r"^gamma: fixed at 0.02; must hold: \|gamma\| <= beta"),
+        ({"beta": 0.01, "gamma": -0.02}, r"^gamma: fixed at -0.02; must hold: \|gamma\| <= beta"),
     ],
 )
 def test_fixed_values_that_contradict_each_other_are_refused(

@@ -114,9 +114,12 @@ class MirrorActuator(Actuator):
         voltage: FloatArray,
         state: State | None = None,
         unrest: FloatArray | None = None,
+        *,
+        from_rest: bool = False,
     ) -> tuple[FloatArray, State]:
         """Return the displacement, its offset taken as a size."""
-        moved, end = super().advance(np.abs(theta), voltage, state, unrest)
+        sizes = np.abs(theta)
+        moved, end = super().advance(sizes, voltage, state, unrest, from_rest=from_rest)
         jagged = self.worse * (-1.0) ** np.arange(voltage.size)
         return moved + jagged * (theta[:, -1:] < 0), end
 
@@ -133,7 +136,7 @@ def mirrored(worse: float = 0.0) -> Posterior:
         usual.voltage,
         usual.displacement + 6.0,
         usual.training,
-        MirrorActuator("none", "first", 0.01, worse),
+        MirrorActuator("none", "first", 0.01, worse=worse),
         WhiteNoise(),
         usual.prior,
     )

@@ -17,7 +17,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record
 from tests.inference.problems import posterior_of
@@ -54,7 +54,7 @@ TRUE = {
 class Case:
     """One kind of records: dynamics, lag (s), discrepancy (um), lead-in (s), where it is cut."""
 
-    dynamics: Dynamics = "lag"
+    dynamics: str = "lag"
     lag: float = 38e-3
     discrepancy: float = 0.3
     lead_in: float = 1.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.actuator import Actuator, Dynamics
+from bwbayes.model.actuator import Actuator
 from bwbayes.results import along, mixture
 
 PROBABILITIES = np.array([0.025, 0.05, 0.25, 0.75, 0.95, 0.975])
@@ -67,7 +67,7 @@ def voltage(name: str) -> FloatArray:
     return path
 
 
-def simulated(path: FloatArray, dynamics: Dynamics) -> FloatArray:
+def simulated(path: FloatArray, dynamics: str) -> FloatArray:
     """Simulate draws that differ by some per cent, with a heavy tail: (draws, samples)."""
     actuator = Actuator(dynamics, "first", INTERVAL)
     centre = np.array([VALUES[name] for name in actuator.parameters])
@@ -105,7 +105,7 @@ def worked_out(means: FloatArray, sds: FloatArray) -> float:
 
 @pytest.mark.parametrize(("dynamics", "sd"), [("none", 0.7), ("lag", 0.7), ("lag", 0.05)])
 @pytest.mark.parametrize("name", VOLTAGES)
-def test_the_error_is_below_what_is_promised(name: str, dynamics: Dynamics, sd: float) -> None:
+def test_the_error_is_below_what_is_promised(name: str, dynamics: str, sd: float) -> None:
     got = errors(simulated(voltage(name), dynamics), noise(sd))
     assert got.max() < PROMISED
     assert np.sqrt(np.mean(got**2)) < 0.1 * PROMISED

@@ -22,7 +22,7 @@ from bwbayes.results import replicates as module
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import Start
 from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
-from bwbayes.results.simulated import OtherRecord, Simulated, covered, discrepancy
+from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from tests.app import example
 from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
 
@@ -206,8 +206,7 @@ def test_another_record_from_rest_with_the_same_offset_is_simulated_so() -> None
     made = other.simulated(posterior, theta, np.random.default_rng(1))
     actuator = replace(posterior.actuator, interval=0.005)
     model = theta[:, : len(actuator.parameters)]
-    model = actuator.at_rest(model, float(other.record.voltage[0]))
-    expected = actuator.displacement(model, other.record.voltage)[0]
+    expected = actuator.displacement(model, other.record.voltage, from_rest=True)[0]
     np.testing.assert_allclose(expected, made.model)
 
 
@@ -239,23 +238,6 @@ def test_a_planned_voltage_is_predicted_without_its_readings() -> None:
     bands, judged = other.predicted(posterior, free, made.record, generator)
     assert bands.measured is None
     assert slice(0, 200) == judged
-
-
-def test_discrepancy_is_the_process_that_the_likelihood_has() -> None:
-    """Its covariance is σ² exp(−|t − t'|/τ); 4,000 draws know it to some 3 %."""
-    theta = {"discrepancy_sd": np.array([1.5]), "discrepancy_time": np.array([0.05])}
-    generator = np.random.default_rng(1)
-    drawn = np.stack([discrepancy(theta, 12, 0.01, generator) for _ in range(4_000)])
-    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) * 0.01
-    expected = 1.5**2 * np.exp(-lag / 0.05)
-    # sd of a covariance of n draws: sqrt((c_ii c_jj + c_ij²) / n)
-    error = np.sqrt((1.5**4 + expected**2) / 4_000)
-    assert np.max(np.abs(drawn.T @ drawn / 4_000 - expected) / error) < 5
-
-
-def test_white_noise_has_no_discrepancy() -> None:
-    drawn = discrepancy({}, 5, 0.01, np.random.default_rng(1))
-    np.testing.assert_array_equal(np.zeros(5), drawn)
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:

@@ -1,1 +1,1 @@
-"""Hysteresis operators, one in each file: what a voltage's path does to a displacement."""
+"""Hysteresis operators, each in a file of its own."""

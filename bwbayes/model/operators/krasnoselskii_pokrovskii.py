@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
-from bwbayes.model.operators.preisach import DENSITY
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
+from bwbayes.model.operators.preisach import DENSITY
 
 __all__ = ["KrasnoselskiiPokrovskii"]
 
@@ -90,12 +90,12 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
         omega = width / scale
         sinh, cosh = np.sinh(omega), np.cosh(omega)
         height = rayleigh * scale**2 * np.divide(sinh, omega, where=omega > 0, out=1 + 0 * omega)
-        far = omega / 2 + SATURATED
+        far = (omega / 2 + SATURATED) * scale
 
-        def everett(start: ArrayLike, voltage: FloatArray) -> FloatArray:
-            x = np.clip(voltage / scale, -far, far)
-            y = np.clip(start / scale, -far, far)
-            difference = np.sinh(x - y)
+        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
+            near, turned = np.clip(voltage, -far, far), np.clip(start, -far, far)
+            x, y = near / scale, turned / scale
+            difference = np.sinh((near - turned) / scale)
             both, square = np.cosh(x + y), difference**2
             apart = np.sqrt(1 + square)
             c = both + apart * cosh

@@ -69,6 +69,7 @@ class MaxwellSlip(RemembersExtrema):
             description="displacement per volt of long sweeps, when all elements slip",
             default=of_gain(1.4, 0.5),
             floor=0.0,
+            loop=True,
         )
         return (slope, *numbered(self.thresholds, "alpha", r"\alpha", "of element"), INITIAL)
 
@@ -80,7 +81,7 @@ class MaxwellSlip(RemembersExtrema):
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where Σ α_j ≤ d: the displacement goes where the voltage goes."""
-        held: BoolArray = self._slope(column) >= 0
+        held: BoolArray = np.asarray(self._slope(column) >= 0)
         return held
 
     def branch(self, column: Values) -> Branch:
@@ -90,4 +91,5 @@ class MaxwellSlip(RemembersExtrema):
     def _slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""
         elements = [p.name for p in self.parameters if p.name.startswith("alpha_")]
-        return np.asarray(column["d"] - np.sum([column[name] for name in elements], axis=0))
+        held = sum(column.get(name, np.array(0.0)) for name in elements)
+        return np.asarray(column.get("d", np.array(np.inf)) - held)

@@ -9,19 +9,19 @@ expression. An operator is told from another by that expression alone, its Evere
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Context, Declaration, Values
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
-from bwbayes.model.operator import Span
+from bwbayes.model.operator import Operator, Span
 
 __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refuse"]
 
@@ -44,7 +44,7 @@ INITIAL = Declaration(
     scope="record",
 )
 
-Branch = Callable[[ArrayLike, FloatArray], FloatArray]
+Branch = Callable[[float | FloatArray, FloatArray], FloatArray]
 """E(start, voltage), um, of all models, where the two broadcast to (models or 1, samples)."""
 
 
@@ -62,7 +62,7 @@ class Extremum(NamedTuple):
 
 @dataclass(frozen=True)
 class Memory:
-    """Where a path stands: ``voltage``, V, and ``displacement`` (models,), um, and how it got there.
+    """Where a path stands, ``voltage``, V, and ``displacement`` (models,), um, and what it keeps.
 
     ``extrema`` are those that still count; the first is the demagnetised state at zero volts.
     ``direction`` is the one in which the path left the last of them, zero if it did not move yet.
@@ -74,7 +74,7 @@ class Memory:
     extrema: tuple[Extremum, ...]
 
 
-class RemembersExtrema(ABC):
+class RemembersExtrema(Operator):
     """An operator that remembers the dominant extrema of its voltage.
 
     From an extremum (u_r, w_r) on, up to where the voltage closes the loop that it turned in,
@@ -95,11 +95,6 @@ class RemembersExtrema(ABC):
     Hysteresis (Springer, 1991), for the stack and the Everett function.
     """
 
-    @property
-    @abstractmethod
-    def parameters(self) -> tuple[Declaration, ...]:
-        """Its parameters; the last is ``initial``, of scope ``record``."""
-
     @abstractmethod
     def branch(self, column: Values) -> Branch:
         """Return the Everett function of the models: zero where the voltage is at the start.
@@ -119,10 +114,6 @@ class RemembersExtrema(ABC):
             elif parameter.name == INITIAL.name:
                 wrong, demand = wrong | (np.abs(values) > 1), "must lie between -1 and 1"
             refuse(parameter.name, wrong, values, demand)
-
-    def holds(self, column: Values) -> BoolArray:
-        """Tell which models (models,) meet what the bounds of single parameters do not say: all."""
-        return np.ones(column[INITIAL.name].size, dtype=bool)
 
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:
         """Return the memory at a record's first voltage.
@@ -158,17 +149,21 @@ class RemembersExtrema(ABC):
         """
         models = memory.displacement.size
         result = np.repeat(memory.displacement[:, np.newaxis], voltage.size, axis=1)
-        path = np.concatenate([[memory.voltage], voltage])
-        if np.ptp(path) == 0:
+        moves = np.flatnonzero(voltage != memory.voltage)
+        if moves.size == 0:
             return result, memory
+        # The voltage rests where it was at first, and w does; then each stretch starts at the last.
+        rests = int(moves[0])
+        path = np.concatenate([[memory.voltage], voltage[rests:]])
+        moving = result[:, rests:]
         branch, extrema, ahead = self.branch(column), list(memory.extrema), memory.direction
         here = memory.displacement
         for first, last, direction in monotone_stretches(path, max(PIECE // models, 1)):
             if direction == -ahead:
                 extrema.append(Extremum(float(path[first]), here))
             ahead = direction
-            _follow(branch, extrema, direction, path[first + 1 : last + 1], result[:, first:last])
-            here = result[:, last - 1].copy()
+            _follow(branch, extrema, direction, path[first + 1 : last + 1], moving[:, first:last])
+            here = moving[:, last - 1].copy()
             _leave_behind(extrema, float(path[last]), here)
         return result, Memory(float(path[-1]), here, ahead, tuple(extrema))
 
@@ -191,10 +186,6 @@ class RemembersExtrema(ABC):
             width = 1e-6 * max(abs(span.low), 1.0)
         climbed = branch(span.low, np.array([[span.low + width]]))
         return np.broadcast_to(climbed[:, 0], column[INITIAL.name].shape) / width
-
-    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:  # noqa: ARG002
-        """Say what the draws (columns) of the ``free`` parameters tell that a user must know."""
-        return []
 
 
 def refuse(name: str, wrong: BoolArray, values: FloatArray, demand: str) -> None:

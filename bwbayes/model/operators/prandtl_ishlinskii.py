@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Context, Declaration, Values, lognormal, rounded
 from bwbayes.model.distributions import Distribution
@@ -34,6 +34,7 @@ SLOPE = Declaration(
     description="displacement per volt just after a turn",
     default=of_gain(0.7, 0.6),
     floor=0.0,
+    loop=True,
 )
 
 
@@ -90,7 +91,7 @@ class PrandtlIshlinskii(RemembersExtrema):
         width = 2 * column["threshold"][:, np.newaxis]
         short = column["alpha"][:, np.newaxis] * width
 
-        def everett(start: ArrayLike, voltage: FloatArray) -> FloatArray:
+        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
             travel = np.abs(voltage - start)
             moved: FloatArray = travel / -width
             np.expm1(moved, out=moved)
@@ -216,7 +217,7 @@ def plays_branch(
     level = np.cumsum(np.column_stack([np.zeros_like(slope), -weights * corners]), axis=1)
     rows = np.arange(slope.size)[:, np.newaxis]
 
-    def everett(start: ArrayLike, voltage: FloatArray) -> FloatArray:
+    def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
         travel = np.atleast_2d(np.abs(voltage - start))
         if len(corners) == 1:
             passed = np.searchsorted(corners[0], travel)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Context, Declaration, Values, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
@@ -85,7 +85,7 @@ class Preisach(RemembersExtrema):
         scale = column["saturation"][:, np.newaxis]
         height = column["rayleigh"][:, np.newaxis] / 2 * scale**2
 
-        def everett(start: ArrayLike, voltage: FloatArray) -> FloatArray:
+        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
             moved: FloatArray = np.tanh(voltage / scale)
             moved -= np.tanh(start / scale)
             moved *= moved

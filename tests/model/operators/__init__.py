@@ -1,0 +1,1 @@
+"""Tests of the hysteresis operators, each against a slow and obvious one."""

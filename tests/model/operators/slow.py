@@ -1,9 +1,10 @@
-"""Slow and obvious operators: plays and relays one by one, and extrema looked for anew each time."""
+"""Slow and obvious operators: plays one by one, and extrema looked for anew each time."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,8 +17,8 @@ __all__ = [
     "by_plays",
     "history",
     "path",
-    "run",
     "rows",
+    "run",
     "walk",
 ]
 
@@ -36,7 +37,7 @@ def walk(seed: int, turns: int = 25) -> FloatArray:
     generator = np.random.default_rng(seed)
     corners = np.append(generator.normal(20.0, 60.0, turns), [50.0, 49.0, 50.0, -10.0, 50.0])
     parts = [np.zeros(1) + corners[0]]
-    for start, end in zip(corners[:-1], corners[1:], strict=True):
+    for start, end in pairwise(corners):
         count = int(generator.integers(1, 9))
         straight = np.linspace(start, end, count + 1)[1:]
         tiny = end + np.sign(end - start) * 1e-7 * np.arange(1, generator.integers(1, 4))
@@ -53,7 +54,7 @@ def history(initial: float, voltage: float, span: Span) -> list[float]:
 def path(initial: float, voltage: FloatArray, span: Span | None) -> list[float]:
     """Return all voltages from the demagnetised state on, of which the record is the end."""
     before = [0.0] if span is None else history(initial, float(voltage[0]), span)[:-1]
-    return before + voltage.tolist()
+    return before + [float(u) for u in voltage]
 
 
 def by_extrema(everett: Everett, voltages: Sequence[float], samples: int) -> FloatArray:

@@ -160,9 +160,7 @@ def _by_relays(width: float, voltages: list[float], cells: int) -> FloatArray:
     return np.array(result)
 
 
-@pytest.mark.parametrize(
-    ("name", "width"), [("preisach", 0.0), ("krasnoselskii-pokrovskii", 50.0)]
-)
+@pytest.mark.parametrize(("name", "width"), [("preisach", 0.0), ("krasnoselskii-pokrovskii", 50.0)])
 def test_densities_are_the_limit_of_many_relays(name: str, width: float) -> None:
     voltage, span = walk(7, turns=15), SPANS[0]
     got = run(CASES[name].operator, CASES[name].column, voltage, span)[3]
@@ -387,11 +385,12 @@ def test_is_finite_for_a_hundred_thousand_draws_from_the_prior(case: Case, range
     low, high = ranges.bias - ranges.voltage, ranges.bias + ranges.voltage
     voltage = low + (high - low) * np.array([0.3, 0.3, 1.0, 0.2, 0.9, 0.91, 0.0])
     column = draws(case.operator, ranges, 100_000, 1)
-    inside = case.operator.holds(column)
-    for name, (lower, upper) in (
-        (p.name, p.bounds(column)) for p in case.operator.parameters if p.bounds is not None
-    ):
-        inside = inside & (column[name] >= lower) & (column[name] <= upper)
+    inside = np.broadcast_to(case.operator.holds(column), 100_000)
+    for parameter in case.operator.parameters:
+        if parameter.bounds is not None:
+            lower, upper = (np.asarray(bound) for bound in parameter.bounds(column))
+            inside = inside & (column[parameter.name] >= lower)
+            inside = inside & (column[parameter.name] <= upper)
     assert inside.mean() > 0.5
     column = {name: values[inside] for name, values in column.items()}
     case.operator.check(column)
@@ -415,7 +414,7 @@ def test_what_cannot_be_is_refused_by_name(case: Case) -> None:
             with pytest.raises(InputError, match=rf"^{declaration.name}: .* in model 3; must "):
                 case.operator.check(column)
     case.operator.check(case.column)
-    assert case.operator.holds(case.column).all()
+    assert np.all(case.operator.holds(case.column))
     assert case.operator.parameters[-1].name == "initial"
     assert {p.scope for p in case.operator.parameters[:-1]} == {"actuator"}
     assert case.operator.remarks(case.column, ()) == []
@@ -424,6 +423,7 @@ def test_what_cannot_be_is_refused_by_name(case: Case) -> None:
 def test_springs_that_hold_back_more_than_all_are_refused() -> None:
     column = rows(d=[1.3, 0.5], **SLIPPING, initial=0.0)
     assert MaxwellSlip(VOLTS).holds(column).tolist() == [True, False]
+    assert MaxwellSlip(VOLTS).holds({"alpha_1": column["alpha_1"]}).all()
     with pytest.raises(InputError, match=r"^d: 0.5 in model 1; must not be less"):
         MaxwellSlip(VOLTS).check(column)
 

@@ -4,14 +4,14 @@ What :mod:`bwbayes.model` and :mod:`bwbayes.inference.noise` do with arrays is d
 sample, for ``LANES`` models at once, so that a processor's vector instructions take several models
 a step and nothing larger than a cache is written. A few dozen samples at a time pass two stages:
 
-    drive        hysteresis, and the drive w = d u − h it leaves
+    drive        the hysteresis (:mod:`bwbayes.inference.compiled.stages`)
     innovations  linear dynamics, the noise's filter, and the sums its density needs
 
 The second stage has two forms. Most of a record passes :func:`_settled`: each sample has a reading,
 and the filter is in its steady state. Where readings are missing, or the filter is not settled, or
 still hears of the unknown start, the samples pass :func:`_exact`.
 
-The state of all models is one flat array, laid out in :mod:`bwbayes.inference.lanes`. This module
+The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lanes`). This module
 needs numba; it knows arrays and nothing else.
 """
 
@@ -26,141 +26,22 @@ from bwbayes.arrays import FloatArray
 
 # isort: off
 # fmt: off
-from bwbayes.inference.lanes import (
-    A1, A2, AGAINST, AHEAD, ALPHA, B0, B1, B2, BEFORE, D, DECAY, ESTIMATE, FREE, GAIN, H,
-    INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS,
-    PHI, PREDICTED, PRODUCTS, RATE, RATIO, REST, SQUARES, STATE, SUMS, SURPLUS, TRUST, UNSURE,
-    VALUE, VARIANCE, X1, X2, Z,
+from bwbayes.inference.compiled.lanes import (
+    A1, A2, B0, B1, B2, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT,
+    LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO, SQUARES,
+    STATE, SUMS, SURPLUS, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
+from bwbayes.inference.compiled.stages import drive_of
 
 __all__ = ["sums"]
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
 
-# φ(z) = (1 − exp(−z)) / z by its series, to 3e-14 of itself up to this z; doubled beyond.
-SHORT = 0.1
-C1, C2, C3, C4, C5, C6, C7 = -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040, -1 / 40320
-
 # What is below this part of its size at the start adds nothing.
 FORGOTTEN = 1e-20
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _drive(
-    state: FloatArray, voltage: FloatArray, first: int, last: int, steepest: float, out: FloatArray
-) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move h on.
-
-    Along a step of v = |Δu| in direction s, g = s h follows dg/dv = α − c g exactly by
-    g + (α − c g) v φ(c v), which has no difference of nearly equal numbers at small steps.
-    """
-    for t in range(first, last):
-        u = voltage[t]
-        step = u - voltage[t - 1] if t > 0 else 0.0
-        row = (t - first) * LANES
-        s = 1.0 if step > 0.0 else -1.0
-        v = abs(step)
-        crossings = 0
-        if step == 0.0:
-            for i in range(LANES):
-                out[row + i] = state[D + i] * u - state[H + i] - state[REST + i]
-        elif v * steepest <= SHORT:
-            crossings = _short_step(state, s, u, v, row, out)
-        else:
-            crossings = _long_step(state, s, u, v, steepest, row, out)
-        if crossings > 0:
-            _cross(state, s, u, v, row, out)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _short_step(state: FloatArray, s: float, u: float, v: float, row: int, out: FloatArray) -> int:
-    """Move h along a step whose z is small; return how many models passed zero."""
-    crossings = 0
-    for i in range(LANES):
-        g = s * state[H + i]
-        # Both are read first: a compiler does not make vectors of what is read on a condition.
-        ahead = state[AHEAD + i]
-        against = state[AGAINST + i]
-        c = against if g < 0.0 else ahead
-        z = c * v
-        end = C4 + z * (C5 + z * (C6 + z * C7))
-        phi = 1.0 + z * (C1 + z * (C2 + z * (C3 + z * end)))
-        new = g + (state[ALPHA + i] - c * g) * (v * phi)
-        crossings += (g < 0.0) & (new > 0.0)
-        h = s * new
-        state[BEFORE + i] = g
-        state[H + i] = h
-        out[row + i] = state[D + i] * u - h - state[REST + i]
-    return crossings
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _long_step(
-    state: FloatArray, s: float, u: float, v: float, steepest: float, row: int, out: FloatArray
-) -> int:
-    """Move h along a step of any size: φ(2z) = φ(z) (1 − z φ(z) / 2) from a small z on."""
-    part, doublings = v, 0
-    while part * steepest > SHORT:
-        part *= 0.5
-        doublings += 1
-    for i in range(LANES):
-        g = s * state[H + i]
-        ahead = state[AHEAD + i]
-        against = state[AGAINST + i]
-        z = (against if g < 0.0 else ahead) * part
-        end = C4 + z * (C5 + z * (C6 + z * C7))
-        state[PHI + i] = 1.0 + z * (C1 + z * (C2 + z * (C3 + z * end)))
-        state[Z + i] = z
-        state[BEFORE + i] = g
-    for _ in range(doublings):
-        for i in range(LANES):
-            z = state[Z + i]
-            phi = state[PHI + i]
-            state[PHI + i] = phi * (1.0 - 0.5 * z * phi)
-            state[Z + i] = 2.0 * z
-    crossings = 0
-    for i in range(LANES):
-        g = state[BEFORE + i]
-        new = g + (state[ALPHA + i] * v - state[Z + i] * g) * state[PHI + i]
-        crossings += (g < 0.0) & (new > 0.0)
-        h = s * new
-        state[H + i] = h
-        out[row + i] = state[D + i] * u - h - state[REST + i]
-    return crossings
-
-
-@njit(nogil=True, cache=True)
-def _cross(state: FloatArray, s: float, u: float, v: float, row: int, out: FloatArray) -> None:
-    """Redo the models whose g passed zero within the step, where its rate changes."""
-    for i in range(LANES):
-        g, alpha = state[BEFORE + i], state[ALPHA + i]
-        if g < 0.0 < s * state[H + i]:
-            against, ahead = state[AGAINST + i], state[AHEAD + i]
-            ratio = -g * against / alpha
-            # What is left of v after zero, and how far g gets in it: with limits at a rate of zero.
-            left = max(v - (-g / alpha if ratio == 0.0 else math.log1p(ratio) / against), 0.0)
-            gone = ahead * left
-            h = s * alpha * (left if gone == 0.0 else -math.expm1(-gone) / ahead)
-            state[H + i] = h
-            out[row + i] = state[D + i] * u - h - state[REST + i]
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _given(
-    state: FloatArray,
-    voltage: FloatArray,
-    first: int,
-    last: int,
-    known: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write w − w₀ for h (lanes, samples) that is known already."""
-    for t in range(first, last):
-        for i in range(LANES):
-            out[(t - first) * LANES + i] = state[D + i] * voltage[t] - known[i, t] - state[REST + i]
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -305,19 +186,18 @@ def _begin(state: FloatArray, offset: int, free: int) -> None:
 
 @njit(nogil=True, cache=True)
 def _group(
+    kind: int,
+    own: FloatArray,
+    plan: FloatArray,
     state: FloatArray,
     voltage: FloatArray,
     displacement: FloatArray,
     skipped: FloatArray,
-    hysteretic: FloatArray,
     offset: int,
     free: int,
     result: FloatArray,
 ) -> None:
     """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
-    steepest = 0.0
-    for i in range(LANES):
-        steepest = max(steepest, state[AHEAD + i], state[AGAINST + i])
     _begin(state, offset, free)
     drive = _aligned(PIECE * LANES)
     now, settled, heard = 0, False, True
@@ -330,10 +210,7 @@ def _group(
             while end < last and skipped[end] == 0.0:
                 end += 1
             last = end
-        if hysteretic.shape[1] > 0:
-            _given(state, voltage, now, last, hysteretic, drive)
-        else:
-            _drive(state, voltage, now, last, steepest, drive)
+        drive_of(kind, own, plan, voltage, now, last, drive)
         if plain:
             _settled(state, displacement, now, last, drive)
         else:
@@ -363,7 +240,9 @@ def sums(
     displacement: FloatArray,
     skipped: FloatArray,
     models: FloatArray,
-    hysteretic: FloatArray,
+    kind: int,
+    own: FloatArray,
+    plan: FloatArray,
     offset: int,
     free: int,
 ) -> FloatArray:
@@ -381,20 +260,22 @@ def sums(
         (samples,) how many readings are missing just before one, −1 where there is none.
     models
         (models, parameters), the columns as in ``PARAMETERS``.
-    hysteretic
-        h, (models, samples), um, if it is known; (models, 0) to be worked out for n = 1.
+    kind, own, plan
+        The stage that makes the drive, what each model is in it (models, rows), and what it knows
+        of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     """
     count = models.shape[0]
     result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
-    state, known = _aligned(STATE), np.empty((LANES, hysteretic.shape[1]))
+    state, mine = _aligned(STATE), _aligned(own.shape[1] * LANES)
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            known[i] = hysteretic[model]
-        _group(state, voltage, displacement, skipped, known, offset, free, part)
+            for row in range(own.shape[1]):
+                mine[row * LANES + i] = own[model, row]
+        _group(kind, mine, plan, state, voltage, displacement, skipped, offset, free, part)
         last = min(first + LANES, count)
         result[:, first:last] = part[:, : last - first]
     return result

@@ -1,27 +1,26 @@
 """The likelihood on the compiled engine: the same numbers as with NumPy, ten times faster.
 
 Coefficients of the dynamics and of the noise's filter come from the same functions that the NumPy
-likelihood uses; :mod:`bwbayes.inference.kernels` walks through the samples. It works out n = 1 with
-|γ| ≤ β itself; for other models h comes from :func:`bwbayes.model.boucwen.hysteresis`, and the
-rest of the work is compiled still.
+likelihood uses; :mod:`~bwbayes.inference.compiled.kernels` walks through the samples. Operators
+with a compiled stage (:mod:`~bwbayes.inference.compiled.stages`) are walked through with it; for
+others the drive comes from NumPy, and the rest of the work is compiled still.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import kernels, lanes
+from bwbayes.inference.compiled import kernels, lanes
+from bwbayes.inference.compiled.stages import GIVEN, STAGES
 from bwbayes.inference.noise import Noise, SteadyState
+from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.linear import Recursion
 
 __all__ = ["moments"]
 
-# Elements (models x samples) of h that is worked out beforehand, at a time.
+# Elements (models x samples) of the drive that is worked out beforehand, at a time.
 LARGEST = 1 << 23
 
 
@@ -34,6 +33,8 @@ def moments(
     noise: Noise,
     offset: int,
     free: int,
+    *,
+    from_rest: bool,
 ) -> tuple[FloatArray, FloatArray]:
     """Return products and log determinants as :class:`~bwbayes.inference.likelihood.Moments` does.
 
@@ -49,22 +50,33 @@ def moments(
         The model; the noise for the interval between readings.
     offset, free
         How many offsets and free responses of the dynamics are unknown.
+    from_rest
+        The record starts from rest.
     """
-    column = dict(zip((*actuator.parameters, *noise.parameters), theta.T, strict=True))
-    steady = noise.steady_state(theta[:, len(actuator.parameters) :])
-    models = _models(column, float(voltage[0]), actuator.recursion(column), steady)
-    closed = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
+    table = Table(actuator, noise)
+    column = table.columns(theta)
+    steady = noise.steady_state(table.noise(theta))
+    recursion = actuator.recursion(column)
     sums = np.empty((lanes.SUMS, len(theta)))
     record = voltage, displacement, skipped
-    if closed.any():
-        unknown = np.empty((int(closed.sum()), 0))
-        sums[:, closed] = kernels.sums(*record, models[closed], unknown, offset, free)
-    others = np.flatnonzero(~closed)
+    able = np.zeros(len(theta), dtype=bool)
+    prepare = STAGES.get(type(actuator.hysteresis))
+    if prepare:
+        memory = actuator.begin(column, voltage, from_rest=from_rest)
+        stage = prepare(actuator.hysteresis, column, voltage, memory)
+        able = stage.able
+        models = _models(stage.rest + column["offset"], recursion, steady)[able]
+        mine = stage.kind, stage.own[able], stage.plan
+        sums[:, able] = kernels.sums(*record, models, *mine, offset, free)
+    others = np.flatnonzero(~able)
     size = max(LARGEST // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
-        names = ("alpha", "beta", "gamma", "exponent", "initial")
-        known = hysteresis(voltage, **{name: column[name][rows] for name in names})
-        sums[:, rows] = kernels.sums(*record, models[rows], known, offset, free)
+        drive = actuator.drive(table.actuator(theta[rows]), voltage, from_rest=from_rest)
+        rest = np.zeros(len(theta))
+        rest[rows] = drive[:, 0]
+        models = _models(rest + column["offset"], recursion, steady)[rows]
+        own = np.stack([np.arange(rows.size), drive[:, 0]], axis=1)
+        sums[:, rows] = kernels.sums(*record, models, GIVEN, own, drive, offset, free)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):
@@ -75,28 +87,16 @@ def moments(
     return products, log_determinant
 
 
-def _models(
-    column: Mapping[str, FloatArray],
-    first_voltage: float,
-    recursion: Recursion,
-    steady: SteadyState,
-) -> FloatArray:
-    """Return the kernel's parameters, (models, parameters)."""
+def _models(level: FloatArray, recursion: Recursion, steady: SteadyState) -> FloatArray:
+    """Return the kernel's parameters (models, parameters); ``level`` (models,) is x at rest, um."""
     nothing = np.zeros(steady.kept.size)
     b = [*recursion.numerator.T, nothing, nothing]
     a = [*recursion.denominator.T, nothing, nothing]
     free = np.zeros((nothing.size, 2, 2))
     unknowns, memory = recursion.free.shape[1:]
     free[:, :unknowns, :memory] = recursion.free
-    rest = column["d"] * first_voltage - column["initial"]
     rows = {
-        "initial": column["initial"],
-        "alpha": column["alpha"],
-        "against": column["beta"] - column["gamma"],
-        "ahead": column["beta"] + column["gamma"],
-        "d": column["d"],
-        "rest": rest,
-        "level": rest + column["offset"],
+        "level": level,
         "b0": b[0],
         "b1": b[1],
         "b2": b[2],

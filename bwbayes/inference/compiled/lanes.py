@@ -12,18 +12,18 @@ LANES = 32
 
 # Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
 PARAMETERS = (
-    "initial", "alpha", "against", "ahead", "d", "rest", "level",
+    "level",
     "b0", "b1", "b2", "a1", "a2",
     "kept", "decay", "gain", "predicted", "variance", "surplus", "rate",
     "free_11", "free_12", "free_21", "free_22",
 )  # fmt: skip
 (
-    H, ALPHA, AGAINST, AHEAD, D, REST, LEVEL, B0, B1, B2, A1, A2,
+    LEVEL, B0, B1, B2, A1, A2,
     KEPT, DECAY, GAIN, PREDICTED, VARIANCE, SURPLUS, RATE, FREE,
-) = (LANES * row for row in range(20))  # fmt: skip
-MEMORY = 11
+) = (LANES * row for row in range(14))  # fmt: skip
+MEMORY = 8
 (
-    X1, X2, UNSURE, SQUARES, RATIO, INVERSE, TRUST, BEFORE, Z, PHI, LOG,
+    X1, X2, UNSURE, SQUARES, RATIO, INVERSE, TRUST, LOG,
 ) = (LANES * (len(PARAMETERS) + row) for row in range(MEMORY))  # fmt: skip
 
 # The series that are filtered: the residual, the record's own offset, two free responses. Each has

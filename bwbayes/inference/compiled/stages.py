@@ -1,0 +1,82 @@
+"""The hysteresis stages of the compiled likelihood: which operators have one, and who calls it.
+
+A stage writes the drive's distance from that of the first sample, w − w₀, of a piece of a record
+for ``LANES`` models side by side. What a model is and remembers stands in rows of ``LANES`` numbers
+of one flat array, ``own``; what the stage may know of the voltage beforehand is its ``plan``. An
+operator without a stage is worked out with NumPy, and its drive is the plan.
+
+A new stage is a file of its own, a line in ``KINDS`` and one in :func:`drive_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.inference.compiled import bouc_wen
+from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.model.declaration import Values
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.bouc_wen import BoucWen
+
+__all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
+
+GIVEN, BOUC_WEN = range(2)
+
+
+class Stage(NamedTuple):
+    """What a compiled stage starts from.
+
+    ``kind`` says which; ``able`` (models,) for which models; ``rest`` (models,) is w₀, um; ``own``
+    (models, rows) and ``plan`` are the stage's own.
+    """
+
+    kind: int
+    able: BoolArray
+    rest: FloatArray
+    own: FloatArray
+    plan: FloatArray
+
+
+def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take n = 1 with |γ| ≤ β."""
+    del operator
+    able = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
+    rest = column["d"] * voltage[0] - memory.hysteretic
+    own = bouc_wen.rows(column, memory.hysteretic, rest)
+    return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
+
+
+STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
+    BoucWen: _bouc_wen,
+}
+
+
+@njit(nogil=True, cache=True)
+def drive_of(
+    kind: int,
+    own: FloatArray,
+    plan: FloatArray,
+    voltage: FloatArray,
+    first: int,
+    last: int,
+    out: FloatArray,
+) -> None:
+    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
+    if kind == BOUC_WEN:
+        bouc_wen.bouc_wen(own, voltage, first, last, out)
+    else:
+        _given(own, plan, first, last, out)
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _given(own: FloatArray, plan: FloatArray, first: int, last: int, out: FloatArray) -> None:
+    """Take a drive that is known: row i of the plan for the model whose number is own[0][i]."""
+    for i in range(LANES):
+        drive = plan[int(own[i])]
+        for t in range(first, last):
+            out[(t - first) * LANES + i] = drive[t] - own[LANES + i]

@@ -1,0 +1,164 @@
+"""Linear dynamics as parts: none, a first-order lag, or a mass on a spring.
+
+A filter follows the drive that the hysteresis leaves. It declares its parameters and becomes a
+recursion on the samples (:mod:`bwbayes.model.linear`), which knows what free responses its unknown
+start can add.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.declaration import Context, Declaration, Values, lognormal
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
+
+__all__ = ["Filter", "Lag", "NoDynamics", "SecondOrder"]
+
+# Of T: drives are mostly slow for the actuator. Wide, because its lag does not follow the drive.
+LAG, LAG_SIGMA = 0.005, 2.3
+
+
+class Filter(ABC):
+    """Linear dynamics, exact for a drive that is held or goes straight between samples."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Its parameters."""
+
+    @abstractmethod
+    def unknowns(self, hold: Hold) -> int:
+        """Return how many numbers say in which state it is at a record's first sample."""
+
+    @abstractmethod
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:
+        """Return the recursion of a number of ``models`` with these columns (models,)."""
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError that names the parameter where a model is outside of the domain.
+
+        A positive parameter may be zero here, where the recursion has that limit.
+        """
+        for declaration in self.parameters:
+            values = column[declaration.name]
+            allowed, demand = np.isfinite(values), "must be finite"
+            if declaration.positive:
+                allowed, demand = allowed & (values >= 0), "must be finite and not negative"
+            _refuse(declaration.name, values, allowed, demand)
+
+
+def _refuse(name: str, values: FloatArray, allowed: np.ndarray, demand: str) -> None:
+    if not allowed.all():
+        row = int(np.argmin(allowed))
+        raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
+
+
+@dataclass(frozen=True)
+class NoDynamics(Filter):
+    """x = w: the displacement follows at once, or with the hold."""
+
+    parameters: tuple[Declaration, ...] = ()
+
+    def unknowns(self, hold: Hold) -> int:
+        """One if the drive is held: what the last sample held."""
+        return int(hold == "zero")
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # nothing to tell it
+        """Return x = w; see :func:`~bwbayes.model.linear.no_dynamics`."""
+        return no_dynamics(models, hold)
+
+
+@dataclass(frozen=True)
+class Lag(Filter):
+    """One first-order lag, τ x′ + x = w."""
+
+    parameters: tuple[Declaration, ...] = (
+        Declaration(
+            "lag",
+            "s",
+            r"\tau_\mathrm{lag}",
+            "time constant of the first-order lag",
+            lambda known: lognormal(LAG * known.ranges.time, LAG_SIGMA),
+            floor=0.0,
+            aliases=("tau", "time_constant"),
+        ),
+    )
+
+    def unknowns(self, hold: Hold) -> int:  # noqa: ARG002  # with either
+        """One: how far the displacement is from rest."""
+        return 1
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the column has them
+        """Return that of :func:`~bwbayes.model.linear.first_order_lag`."""
+        return first_order_lag(column["lag"], interval, hold)
+
+
+def _damping(known: Context) -> Distribution | None:
+    """Return the prior of the damping that gives such a lag, if the stiffness is known."""
+    stiffness = known.value("stiffness")
+    if stiffness is None:
+        return None
+    return lognormal(LAG * known.ranges.time * stiffness, LAG_SIGMA)
+
+
+# A record shows at most the ratios of the three.
+RATIOS = "a record shows mass and stiffness only through the damping"
+
+
+@dataclass(frozen=True)
+class SecondOrder(Filter):
+    """Equation (7) of the paper, (m/k) x″ + (b/k) x′ + x = w."""
+
+    parameters: tuple[Declaration, ...] = (
+        Declaration(
+            "mass",
+            "kg",
+            r"m",
+            "effective mass",
+            lambda _: None,
+            floor=0.0,
+            aliases=("m",),
+            without_default=RATIOS,
+        ),
+        Declaration(
+            "damping",
+            "N s/m",
+            r"b",
+            "effective damping",
+            _damping,
+            floor=0.0,
+            aliases=("b",),
+            without_default=RATIOS,
+        ),
+        Declaration(
+            "stiffness",
+            "N/m",
+            r"k",
+            "mechanical stiffness",
+            lambda _: None,
+            floor=0.0,
+            aliases=("k",),
+            without_default=RATIOS,
+        ),
+    )
+
+    def check(self, column: Values) -> None:
+        """Refuse, too, a mass or a stiffness of zero."""
+        for name in ("mass", "stiffness"):
+            allowed = np.isfinite(column[name]) & (column[name] > 0)
+            _refuse(name, column[name], allowed, "must be positive and finite")
+        super().check(column)
+
+    def unknowns(self, hold: Hold) -> int:  # noqa: ARG002  # with either
+        """Two: how far the displacement is from rest, and how fast it moves."""
+        return 2
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the columns have them
+        """Return that of :func:`~bwbayes.model.linear.second_order`."""
+        return second_order(column["mass"], column["damping"], column["stiffness"], interval, hold)

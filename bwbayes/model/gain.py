@@ -1,0 +1,96 @@
+"""Polynomial gain: what an actuator's displacement has of the voltage's square and cube.
+
+Measured loops are not symmetric about their middle; a curve without memory beside the hysteresis
+says most of that. It is taken about the middle of the voltage's range and in units of half of it,
+so that its coefficients are displacements at the edge of the range, as large on any actuator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError, suggestion
+from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.operator import Span
+
+__all__ = ["PolynomialGain"]
+
+
+class Term(NamedTuple):
+    """A power of the voltage: which, its label, and the prior's sd as a part of Y."""
+
+    power: int
+    label: str
+    part: float
+
+
+# On measured stacks the square makes a tenth of the half range or less, the cube less than that.
+TERMS = {"quadratic": Term(2, r"q_2", 0.15), "cubic": Term(3, r"q_3", 0.1)}
+
+
+@dataclass(frozen=True)
+class PolynomialGain:
+    """Displacement q₂ x² + q₃ x³ in um, with x = (u − m)/U.
+
+    m and U are the middle and half of the range of the voltage u, V; q₂ and q₃ are in um.
+
+    Parameters
+    ----------
+    terms
+        ``"quadratic"``, ``"cubic"``, or both.
+
+    Raises
+    ------
+    InputError
+        An unknown term.
+    """
+
+    terms: Sequence[str] = tuple(TERMS)
+
+    def __post_init__(self) -> None:
+        for term in self.terms:
+            if term not in TERMS:
+                raise InputError(f"gain: {term!r} is unknown; {suggestion(term, TERMS)}")
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """The coefficients, um."""
+        return tuple(self._declared(name) for name in TERMS if name in self.terms)
+
+    def _declared(self, name: str) -> Declaration:
+        power, label, part = TERMS[name]
+        return Declaration(
+            name,
+            "um",
+            label,
+            f"{name} part of the displacement at the edge of the voltage's range",
+            lambda known: normal(0.0, part * known.ranges.displacement),
+            loop=True,
+            aliases=(f"q{power}",),
+        )
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where a coefficient is not finite."""
+        for declared in self.parameters:
+            finite = np.isfinite(column[declared.name])
+            if not finite.all():
+                row = int(np.argmin(finite))
+                value = column[declared.name][row]
+                raise InputError(f"{declared.name}: {value:.6g} in model {row}; must be finite")
+
+    def displacement(self, column: Values, voltage: FloatArray, span: Span) -> FloatArray:
+        """Return q₂ x² + q₃ x³ (models, samples), um, along voltages (samples,), V.
+
+        A span without any width has none.
+        """
+        middle, half = (span.low + span.high) / 2, (span.high - span.low) / 2
+        x = (voltage - middle) / half if half > 0 else np.zeros_like(voltage)
+        columns = [(column[name], TERMS[name].power) for name in TERMS if name in self.terms]
+        return sum(
+            (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.size))
+        )

@@ -1,0 +1,67 @@
+"""Backlash-like hysteresis: a loop that opens and settles at the same rate in both directions.
+
+It is the Bouc-Wen model with n = 1 and γ = 0, written otherwise, and the same code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.declaration import Declaration, Values
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.one_state import OneState, alpha, below_d, beta, d, initial, refuse
+
+__all__ = ["BacklashLike"]
+
+
+@dataclass(frozen=True)
+class BacklashLike(OneState):
+    """Backlash-like hysteresis of Su and others, exact.
+
+    The displacement w in um follows the voltage u in V by
+
+        dw = a |du| (c u − w) + b du.
+
+    With h = c u − w this is dh = (c − b) du − a |du| h: n = 1 Bouc-Wen hysteresis with d = c,
+    α = c − b, β = a and γ = 0, so d, α (um/V) and β (1/V) are its parameters. The slope at rest, b,
+    is positive where α < d.
+
+    Notes
+    -----
+    C.-Y. Su, Y. Stepanenko, J. Svoboda, T. P. Leung, Robust adaptive control of a class of
+    nonlinear systems with unknown backlash-like hysteresis, IEEE Transactions on Automatic Control
+    45 (2000).
+    """
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, α, β and the initial h."""
+        return d(), alpha(), beta(), initial()
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where a parameter is not finite, or α or β is not positive."""
+        for name in ("d", "alpha", "beta", "initial"):
+            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
+        refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
+        refuse(column, "beta", column["beta"] < 0, "must not be negative")
+
+    def holds(self, column: Values) -> BoolArray:
+        """Tell where α < d."""
+        return below_d(column)
+
+    def trace(
+        self, column: Values, voltage: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w = d u − h (models, samples), and h at the end."""
+        h = hysteresis(voltage, column["alpha"], column["beta"], 0.0, initial=state)
+        after = h[:, -1].copy()
+        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
+        return h, after
+
+    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+        """Return d."""
+        return column["d"]

@@ -1,0 +1,291 @@
+"""Bouc-Wen hysteresis as a part: w = d u − h, equations (5) and (6) of the paper.
+
+The mathematics is in :mod:`bwbayes.model.boucwen`; here is what its parameters are called, in which
+unit, where they may lie, and what is known of them beforehand. With U half the range of the voltage
+and Y that of the displacement, d is Y/U or twice that, α a part of it, β near 1/U.
+
+With half a range below about a third of 1/β a small drive shows no loop that closes; then the
+priors, not the record, say how large β is, and leave room for the value that a large drive shows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.boucwen import ceiling, hysteresis
+from bwbayes.model.declaration import Context, Declaration, Ranges, Values, lognormal, normal
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.operator import Operator, Span
+
+__all__ = ["BoucWen"]
+
+SHAPE = ("alpha", "beta", "gamma", "exponent")
+
+# Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
+# what is left for β has its median a little above 1/U, and room for a factor of thirty either way.
+BETA, BETA_SIGMA = 0.15, 2.3
+GAMMA = 4.0
+
+# Beyond this the hysteresis hardly changes: a prior that goes further still gets a scale for this.
+LARGEST_EXPONENT = 20.0
+
+# Stands for an infinite ceiling (β + γ = 0), um.
+HIGHEST_CEILING = 1e9
+
+# γ presses against β when more than this share of draws lies within the margin below it.
+PRESSING_SHARE = 0.25
+PRESSING_MARGIN = 0.05
+
+# The remedy where γ presses against ±β.
+NOT_PASSIVE = "this actuator may need a gamma beyond it: give passive = false under [model]"
+
+
+class Memory(NamedTuple):
+    """The last voltage, V, and h (models,) there, um."""
+
+    voltage: float
+    hysteretic: FloatArray
+
+
+@dataclass(frozen=True)
+class BoucWen(Operator):
+    """Bouc-Wen hysteresis, w = d u − h, for any n ≥ 1.
+
+    dh = α du − β |du| h |h|^(n−1) − γ du |h|^n, rate-independent and exact
+    (:func:`~bwbayes.model.boucwen.hysteresis`).
+
+    Parameters
+    ----------
+    passive
+        Whether |γ| ≤ β: then the hysteresis takes no energy from nowhere on any path. Some
+        published actuators have a larger γ; without the constraint only β + γ ≥ 0 holds, beyond
+        which h runs away.
+    """
+
+    passive: bool = True
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, α, β, γ, n and the initial h."""
+        pressed = {"lower": NOT_PASSIVE, "upper": NOT_PASSIVE} if self.passive else {}
+        return (
+            Declaration(
+                "d",
+                "um/V",
+                r"d",
+                "piezoelectric coefficient",
+                # A drive that is small for the loop shows d - α, which may be half of d.
+                lambda known: lognormal(1.6 * known.ranges.gain, 0.6),
+                floor=0.0,
+                bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
+                loop=True,
+                aliases=("gain", "d33"),
+            ),
+            Declaration(
+                "alpha",
+                "um/V",
+                r"\alpha",
+                "hysteretic displacement per volt at h = 0",
+                lambda known: lognormal(0.7 * known.ranges.gain, 1.0),
+                floor=0.0,
+                bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
+                stated_bounds="0 < alpha < d",
+                pressed={
+                    "upper": "the model's slope is zero there; check the displacement's sign and "
+                    "unit, or fix alpha"
+                },
+                loop=True,
+                aliases=("a",),
+            ),
+            Declaration(
+                "beta",
+                "1/V",
+                r"\beta",
+                "hysteresis loop shape",
+                _beta,
+                floor=0.0,
+                bounds=self._beta_bounds,
+                loop=True,
+                unit_given=_rate_unit,
+            ),
+            Declaration(
+                "gamma",
+                "1/V",
+                r"\gamma",
+                "hysteresis loop shape, loading against unloading",
+                _gamma,
+                bounds=self._gamma_bounds,
+                stated_bounds="|gamma| <= beta" if self.passive else "beta + gamma >= 0",
+                pressed=pressed,
+                loop=True,
+                unit_given=_rate_unit,
+            ),
+            Declaration(
+                "exponent",
+                "-",
+                r"n",
+                "smoothness of the transition",
+                lambda _: 1.0,
+                floor=1.0,
+                reaches_floor=True,
+                loop=True,
+                aliases=("n",),
+            ),
+            Declaration(
+                "initial",
+                "um",
+                r"h_0",
+                "hysteretic displacement at the first sample",
+                lambda known: normal(0.0, 0.3 * known.ranges.reach),
+                bounds=_initial_bounds,
+                scope="record",
+                aliases=("h0",),
+            ),
+        )
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where d is not finite; :func:`hysteresis` sees to the rest."""
+        if not np.isfinite(column["d"]).all():
+            row = int(np.argmin(np.isfinite(column["d"])))
+            raise InputError(f"d: {column['d'][row]:.6g} in model {row}; must be finite")
+
+    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:  # noqa: ARG002  # h says all of the past
+        """Return h at the first voltage: the initial one, or what it becomes from zero volts on."""
+        if from_rest and voltage != 0:
+            shape = {name: column[name] for name in SHAPE}
+            h = hysteresis([0.0, voltage], **shape, initial=column["initial"])[:, -1]
+            return Memory(voltage, h)
+        return Memory(voltage, column["initial"])
+
+    def advance(
+        self, column: Values, voltage: FloatArray, memory: Memory
+    ) -> tuple[FloatArray, Memory]:
+        """Return w = d u − h (models, samples), and where h got to."""
+        joined = np.concatenate([[memory.voltage], voltage])
+        shape = {name: column[name] for name in SHAPE}
+        h = hysteresis(joined, **shape, initial=memory.hysteretic)[:, 1:]
+        after = Memory(float(voltage[-1]), h[:, -1].copy())
+        drive = column["d"][:, np.newaxis] * voltage
+        drive -= h
+        return drive, after
+
+    def reachable(
+        self, column: Values, voltage: float, span: Span
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the h (models,) that sweeps through the span leave, from below and from above.
+
+        No hysteresis at all, as after small and smaller loops, lies between.
+        """
+        low, high = span
+        shape = {name: column[name] for name in SHAPE}
+        sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
+        ends = [hysteresis(sweep, **shape)[:, -1] for sweep in sweeps]
+        return np.minimum(np.min(ends, axis=0), 0.0), np.maximum(np.max(ends, axis=0), 0.0)
+
+    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+        """Return d."""
+        return column["d"]
+
+    def holds(self, column: Values) -> BoolArray | np.bool_:
+        """Tell where α < d, and h does not run away from the initial state.
+
+        That is where γ ≤ β, or the initial state lies below the ceiling.
+        """
+        inside: BoolArray | np.bool_ = np.True_
+        if "alpha" in column and "d" in column:
+            inside = column["alpha"] < column["d"]
+        names = {*SHAPE, "initial"}
+        if self.passive or not names <= column.keys() or not np.any(column["initial"]):
+            return inside
+        start = np.abs(column["initial"])
+        return inside & ((column["gamma"] <= column["beta"]) | (start <= _top(column)))
+
+    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
+        """Say that a posterior presses against γ ≤ β, if it does."""
+        if not self.passive or "gamma" not in free:
+            return []
+        share = float(np.mean(column["gamma"] > (1 - PRESSING_MARGIN) * column["beta"]))
+        if not share > PRESSING_SHARE:
+            return []
+        return [
+            f"the posterior presses against |gamma| <= beta ({share:.0%} of the draws have gamma "
+            f"within {PRESSING_MARGIN:.0%} of beta); if the actuator need not be passive, set "
+            "[model] passive = false"
+        ]
+
+    def opening(self, column: Values, half_range: float) -> FloatArray | None:
+        """Return β U for n = 1."""
+        return column["beta"] * half_range if np.all(column["exponent"] == 1.0) else None
+
+    def _beta_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+        if "gamma" not in earlier:
+            return -np.inf, np.inf
+        return np.abs(earlier["gamma"]) if self.passive else -earlier["gamma"], np.inf
+
+    def _gamma_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+        if "beta" not in earlier:
+            return -np.inf, np.inf
+        return -earlier["beta"], earlier["beta"] if self.passive else np.inf
+
+
+def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    if not all(name in earlier for name in SHAPE):
+        return -np.inf, np.inf
+    top = _top(earlier)
+    return -top, top
+
+
+def _top(column: Values) -> FloatArray:
+    """Highest |h| (models,), um, not beyond a number that can be worked with."""
+    # Not a number where β + γ < 0 or α = 0, which is outside already; fmin prefers the number.
+    with np.errstate(invalid="ignore"):
+        top = ceiling(*(column[name] for name in SHAPE))
+    return np.fmin(top, HIGHEST_CEILING)
+
+
+def _rate_unit(known: Context) -> str:
+    return "1/V" if known.stated.get("exponent", 1.0) == 1.0 else "um^(1-n)/V"
+
+
+def _beta(known: Context) -> Distribution:
+    """Return β's default prior; its scale follows the exponent, and it allows for γ's cut."""
+    low, middle, high = (_log_rate(n, known.ranges) for n in _likely(known))
+    part = BETA if known.value("gamma") is None else 1.0
+    return lognormal(part * _exp(middle), math.hypot(BETA_SIGMA, (high - low) / 4))
+
+
+def _gamma(known: Context) -> Distribution:
+    low, _, high = (_log_rate(n, known.ranges) for n in _likely(known))
+    return normal(0.0, GAMMA * _exp(max(low, high)))
+
+
+def _log_rate(exponent: float, ranges: Ranges) -> float:
+    """Return the logarithm of the scale of β and γ, um^(1-n)/V.
+
+    β |h|^(n-1) is a rate per volt, about 1/U; h is some fifth of the displacement.
+    """
+    return (1 - exponent) * math.log(0.2 * ranges.displacement) - math.log(ranges.voltage)
+
+
+def _exp(logarithm: float) -> float:
+    """Return the exponential, or a number that is out of proportion instead of an overflow."""
+    return math.exp(min(logarithm, 700.0))
+
+
+def _likely(known: Context) -> tuple[float, float, float]:
+    """Return the exponent's 2.5 %, 50 % and 97.5 % quantiles above one."""
+    exponent = known.stated.get("exponent", 1.0)
+    if not isinstance(exponent, Distribution):
+        return exponent, exponent, exponent
+    below = float(exponent.frozen.cdf(1.0))
+    if below >= 1:
+        return 1.0, 1.0, 1.0
+    likely = exponent.frozen.ppf(below + (1 - below) * np.array([0.025, 0.5, 0.975]))
+    low, middle, high = (float(n) for n in np.minimum(likely, LARGEST_EXPONENT))
+    return low, middle, high

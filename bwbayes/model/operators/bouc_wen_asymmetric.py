@@ -1,0 +1,223 @@
+"""Bouc-Wen hysteresis whose loops need not be symmetric.
+
+How fast h settles may depend on the signs of the voltage, of its rate and of h, as in the
+generalised Bouc-Wen model of Song and Der Kiureghian. Between the places where one of them changes
+its sign, that is plain Bouc-Wen hysteresis with a β and a γ of its own; the places are known in
+closed form, so it is as exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.errors import InputError, suggestion
+from bwbayes.model.boucwen import PIECE, _LinearFlow
+from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.one_state import OneState, alpha, below_d, beta, d, initial, refuse
+
+__all__ = ["BoucWenAsymmetric"]
+
+# What each term depends on, in the order in which their bounds follow from each other.
+TERMS = {
+    "b4": "the voltage's direction",
+    "b5": "the sign of h",
+    "b2": "the voltage's sign and direction",
+    "b6": "the voltage's sign",
+    "b3": "the signs of voltage and h",
+}
+
+SIGNS = (1.0, -1.0)
+
+# Bounds that other parameters put on one may be rounded.
+SLACK = 1e-12
+
+
+@dataclass(frozen=True)
+class BoucWenAsymmetric(OneState):
+    """Generalised Bouc-Wen hysteresis with n = 1, w = d u − h, exact.
+
+    The hysteretic displacement h in um follows the voltage u in V by
+
+        dh = α du − |h| ψ du,
+        ψ = γ + β [sgn(u̇ h) + b₂ sgn(u u̇) + b₃ sgn(u h) + b₄ sgn(u̇) + b₅ sgn(h) + b₆ sgn(u)],
+
+    with α in um/V, β and γ in 1/V, and the b without unit: β b₂ to β b₆ are the β₂ to β₆ of the
+    source, which has no γ. Where the voltage has sign x and goes in direction s, this is plain
+    Bouc-Wen hysteresis with
+
+        β' = β (1 + s b₅ + s x b₃),   γ' = γ + β (s b₄ + s x b₂ + x b₆).
+
+    It takes no energy from nowhere where |γ'| ≤ β' for all four pairs of signs, and that is asked
+    for. A voltage that never changes its sign cannot tell b₂ from b₄, b₃ from b₅, and b₆ from γ:
+    give two ``terms`` then.
+
+    Parameters
+    ----------
+    terms
+        Those of b2 to b6 that are parameters; the others are zero. Without any it is plain
+        Bouc-Wen hysteresis.
+
+    Raises
+    ------
+    InputError
+        An unknown term.
+
+    Notes
+    -----
+    J. Song, A. Der Kiureghian, Generalized Bouc-Wen model for highly asymmetric hysteresis,
+    Journal of Engineering Mechanics 132 (2006).
+    """
+
+    terms: Sequence[str] = tuple(sorted(TERMS))
+
+    def __post_init__(self) -> None:
+        for term in self.terms:
+            if term not in TERMS:
+                raise InputError(f"terms: {term!r} is unknown; {suggestion(term, TERMS)}")
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, α, β, γ, the terms and the initial h."""
+        gamma = Declaration(
+            "gamma",
+            "1/V",
+            r"\gamma",
+            "hysteresis loop shape, loading against unloading",
+            lambda known: normal(0.0, 4.0 / known.ranges.voltage),
+            bounds=lambda earlier: _within(earlier.get("beta", np.inf)),
+            stated_bounds="|gamma| <= beta",
+            loop=True,
+        )
+        # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
+        return d(), alpha(), beta(0.15), gamma, *self._asymmetry(), initial()
+
+    def _asymmetry(self) -> list[Declaration]:
+        return [
+            Declaration(
+                name,
+                "-",
+                f"b_{name[1]}",
+                f"hysteresis loop shape, by {signs}",
+                lambda _: normal(0.0, 0.3),
+                bounds=partial(_bounds, name),
+                stated_bounds="the loop shape takes no energy from nowhere",
+                loop=True,
+            )
+            for name, signs in TERMS.items()
+            if name in self.terms
+        ]
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where a parameter is not finite or |γ'| > β' for a pair of signs."""
+        for declared in self.parameters:
+            wrong = ~np.isfinite(column[declared.name])
+            refuse(column, declared.name, wrong, "must be finite")
+        refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
+        refuse(column, "beta", column["beta"] < 0, "must not be negative")
+        demand = "with beta and b2 to b6 it must not let the loop take energy from nowhere"
+        refuse(column, "gamma", ~_passive(column), demand)
+
+    def holds(self, column: Values) -> BoolArray:
+        """Tell where α < d and, for all four pairs of signs, |γ'| ≤ β'."""
+        inside = below_d(column)
+        if "beta" not in column or "gamma" not in column:
+            return inside
+        return inside & _passive(column)
+
+    def trace(
+        self, column: Values, voltage: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w = d u − h (models, samples), and h at the end."""
+        h = np.repeat(state[:, np.newaxis], voltage.size, axis=1)
+        if np.ptp(voltage) > 0:
+            flows = {signs: _flow(column, *signs) for signs in product(SIGNS, SIGNS)}
+            for first, last, s in monotone_stretches(voltage, max(PIECE // state.size, 1)):
+                g = _follow(flows, s, s * h[:, first], s * voltage[first : last + 1])
+                np.multiply(g, s, out=h[:, first + 1 : last + 1])
+        after = h[:, -1].copy()
+        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
+        return h, after
+
+    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+        """Return d."""
+        return column["d"]
+
+
+def _follow(
+    flows: dict[tuple[float, float], _LinearFlow], s: float, start: FloatArray, along: FloatArray
+) -> FloatArray:
+    """Return g = s h (models, points - 1) along s u (points,), which ascends, from its start."""
+    before = int(np.searchsorted(along, 0.0, side="right"))
+    if before == 0:
+        return flows[s, s].advance(start, along[1:] - along[0])
+    if before == along.size:
+        return flows[s, -s].advance(start, along - along[0])[:, 1:]
+    # At zero volts the rates change, for all models alike.
+    early = flows[s, -s].advance(start, np.append(along[1:before], 0.0) - along[0])
+    late = flows[s, s].advance(early[:, -1], along[before:])
+    return np.hstack((early[:, :-1], late))
+
+
+def _flow(column: Values, s: float, x: float) -> _LinearFlow:
+    """Return how g evolves where the voltage goes in direction s and has the sign x."""
+    slow, fast = _rates(column, s, x)
+    slow = np.maximum(column["beta"] * slow, 0.0)
+    fast = np.clip(column["beta"] * fast + column["gamma"], -slow, slow)
+    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
+
+
+def _rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
+    """Return β'/β and (γ' − γ)/β."""
+    b = {name: column.get(name, np.zeros(1)) for name in TERMS}
+    return 1 + s * b["b5"] + s * x * b["b3"], s * b["b4"] + s * x * b["b2"] + x * b["b6"]
+
+
+def _passive(column: Values) -> BoolArray:
+    inside = np.full(column["beta"].shape, fill_value=True)
+    for signs in product(SIGNS, SIGNS):
+        slow, fast = _rates(column, *signs)
+        gamma = np.abs(column["gamma"] + column["beta"] * fast)
+        inside &= gamma <= column["beta"] * (slow + SLACK)
+    return inside
+
+
+def _within(top: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    return np.negative(top), top
+
+
+def _bounds(name: str, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    """Return where a term leaves others of those that come after it some room.
+
+    For either direction s, G = γ/β + s b₄, B = 1 + s b₅ and K = b₆ + s b₂ must meet
+    |G + x K| ≤ B + s x b₃ for either sign x of the voltage.
+    """
+    if "beta" not in earlier or "gamma" not in earlier:
+        return -1.0, 1.0
+    b = {term: earlier.get(term, np.zeros(1)) for term in TERMS}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = earlier["gamma"] / earlier["beta"]
+    up, down = ratio + b["b4"], ratio - b["b4"]
+    match name:
+        case "b5":
+            return np.abs(up) - 1, 1 - np.abs(down)
+        case "b6":
+            high, low = 1 + b["b5"], 1 - b["b5"]
+            return np.maximum(-high - b["b2"], b["b2"] - low), np.minimum(
+                high - b["b2"], low + b["b2"]
+            )
+        case "b3":
+            high, low = 1 + b["b5"], 1 - b["b5"]
+            to_up, to_down = b["b6"] + b["b2"], b["b6"] - b["b2"]
+            return (
+                np.maximum(np.abs(up + to_up) - high, np.abs(down - to_down) - low),
+                np.minimum(high - np.abs(up - to_up), low - np.abs(down + to_down)),
+            )
+    return -1.0, 1.0

@@ -1,0 +1,181 @@
+"""What operators given by a differential equation in the voltage's path have in common.
+
+Their whole memory is one number in each model: a displacement. It changes along the path of the
+voltage, and it starts as the parameter ``initial``. An operator of this kind says how the number
+changes along a path; where it starts, how pieces of a record are joined, and which states earlier
+drives may have left then follow.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.declaration import Declaration, Values, lognormal, normal
+from bwbayes.model.operator import Operator, Span
+
+__all__ = [
+    "Memory",
+    "OneState",
+    "alpha",
+    "below_ceiling",
+    "below_d",
+    "beta",
+    "d",
+    "initial",
+    "refuse",
+]
+
+# Stands for an infinite ceiling, um.
+HIGHEST_CEILING = 1e9
+
+
+class Memory(NamedTuple):
+    """The last voltage, V, and the state (models,) there, um."""
+
+    voltage: float
+    state: FloatArray
+
+
+class OneState(Operator):
+    """An operator that remembers the last voltage and one displacement in each model."""
+
+    @abstractmethod
+    def trace(
+        self, column: Values, voltage: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w (models, samples) along a path, and the state (models,) at its end.
+
+        ``voltage`` (samples,), V; ``state`` (models,), um, is that at its first sample.
+        """
+
+    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:  # noqa: ARG002  # the state says all of the past
+        """Return the state at the first voltage: ``initial``, or what it becomes from 0 V on."""
+        state = column["initial"]
+        if from_rest and voltage != 0:
+            state = self.trace(column, np.array([0.0, voltage]), state)[1]
+        return Memory(voltage, state)
+
+    def advance(
+        self, column: Values, voltage: FloatArray, memory: Memory
+    ) -> tuple[FloatArray, Memory]:
+        """Return w (models, samples), um, and the memory after the last sample."""
+        joined = np.concatenate([[memory.voltage], voltage])
+        w, state = self.trace(column, joined, memory.state)
+        return w[:, 1:], Memory(float(joined[-1]), state)
+
+    def reachable(
+        self, column: Values, voltage: float, span: Span
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the states (models,) that sweeps through the span leave, lowest and highest.
+
+        From below and from above. No hysteresis at all, as after small and smaller loops, lies
+        between.
+        """
+        low, high = span
+        none = self.unbiased(column, voltage)
+        sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
+        start = np.zeros_like(none)
+        ends = [none, *(self.trace(column, np.array(sweep), start)[1] for sweep in sweeps)]
+        return np.min(ends, axis=0), np.max(ends, axis=0)
+
+    def unbiased(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002
+        """Return the state (models,) without hysteresis at a voltage."""
+        return np.zeros_like(column["initial"])
+
+    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:  # noqa: ARG002
+        """Return nothing: there is nothing to say."""
+        return []
+
+
+def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:
+    """Raise an InputError that names the parameter and the first model that is wrong."""
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(f"{name}: {column[name][row]:.6g} in model {row}; {demand}")
+
+
+# What is the same thing as in the Bouc-Wen model, with the same priors.
+
+
+def d() -> Declaration:
+    """Declare d, the slope behind the hysteresis."""
+    return Declaration(
+        "d",
+        "um/V",
+        r"d",
+        "piezoelectric coefficient",
+        # A drive that is small for the loop shows d - α, which may be half of d.
+        lambda known: lognormal(1.6 * known.ranges.gain, 0.6),
+        floor=0.0,
+        bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
+        loop=True,
+        aliases=("gain", "d33"),
+    )
+
+
+def alpha() -> Declaration:
+    """Declare α, below d."""
+    return Declaration(
+        "alpha",
+        "um/V",
+        r"\alpha",
+        "hysteretic displacement per volt at h = 0",
+        lambda known: lognormal(0.7 * known.ranges.gain, 1.0),
+        floor=0.0,
+        bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
+        stated_bounds="0 < alpha < d",
+        pressed={
+            "upper": "the model's slope is zero there; check the displacement's sign and unit, or "
+            "fix alpha"
+        },
+        loop=True,
+        aliases=("a",),
+    )
+
+
+def below_d(column: Values) -> BoolArray:
+    """Tell which models (models,) have α < d, or lack one of them."""
+    inside: BoolArray = np.asarray(column.get("alpha", -np.inf) < column.get("d", np.inf))
+    return inside
+
+
+def beta(part: float = 1.0) -> Declaration:
+    """Declare β, near 1/U or a ``part`` of it, where other parameters' bounds favour a large β."""
+    return Declaration(
+        "beta",
+        "1/V",
+        r"\beta",
+        "hysteresis loop shape",
+        lambda known: lognormal(part / known.ranges.voltage, 2.3),
+        floor=0.0,
+        loop=True,
+    )
+
+
+def initial() -> Declaration:
+    """Declare h at the first sample, below the ceiling α/(β + γ) if α and β are known."""
+    return Declaration(
+        "initial",
+        "um",
+        r"h_0",
+        "hysteretic displacement at the first sample",
+        lambda known: normal(0.0, 0.3 * known.ranges.reach),
+        bounds=below_ceiling,
+        scope="record",
+        aliases=("h0",),
+    )
+
+
+def below_ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    """Return the bounds ∓α/(β + γ) of h, um, with γ = 0 where there is none."""
+    if "alpha" not in earlier or "beta" not in earlier:
+        return -np.inf, np.inf
+    rate = earlier["beta"] + earlier.get("gamma", 0.0)
+    with np.errstate(divide="ignore", over="ignore"):
+        top = np.minimum(earlier["alpha"] / np.maximum(rate, 0.0), HIGHEST_CEILING)
+    return -top, top

@@ -1,0 +1,76 @@
+"""Which parts there are, by the names that a config gives them.
+
+A new part is a file of its own and a line here. A part that is not in the package goes by its
+import path, ``module:Class``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from bwbayes.errors import InputError, suggestion
+from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.bouc_wen import BoucWen
+
+__all__ = ["DYNAMICS", "HYSTERESIS", "choose", "made"]
+
+HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
+    "bouc-wen": BoucWen,
+}
+
+DYNAMICS: Mapping[str, Callable[..., Filter]] = {
+    "none": NoDynamics,
+    "lag": Lag,
+    "second-order": SecondOrder,
+}
+
+
+def choose[Part](
+    place: str, name: str, registry: Mapping[str, Callable[..., Part]]
+) -> Callable[..., Part]:
+    """Return what makes the part of that name, or of that import path ``module:Class``.
+
+    Raises
+    ------
+    InputError
+        No part has that name, or nothing can be imported from that path; ``place`` says where.
+    """
+    if name in registry:
+        return registry[name]
+    module, _, attribute = name.partition(":")
+    if not attribute:
+        raise InputError(f"{place}: {name!r} is unknown; {suggestion(name, registry)}")
+    try:
+        maker: Callable[..., Part] = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"{place}: cannot import {name!r} ({error}); write module:Class, and make sure that "
+            "Python can import the module"
+        ) from None
+    return maker
+
+
+def made[Part](
+    place: str,
+    name: str,
+    registry: Mapping[str, Callable[..., Part]],
+    options: Mapping[str, Any],
+) -> Part:
+    """Return the part of that name, with those ``options`` that are not None.
+
+    Raises
+    ------
+    InputError
+        As :func:`choose`; or the part does not take an option.
+    """
+    maker = choose(place, name, registry)
+    given = {key: value for key, value in options.items() if value is not None}
+    takes = inspect.signature(maker).parameters
+    for key in given:
+        if key not in takes:
+            raise InputError(f"{place}: {name!r} has no option {key}; remove it")
+    return maker(**given)

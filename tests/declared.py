@@ -1,0 +1,79 @@
+"""What the parts of the model declare, by parameter name, for tests that put models together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bwbayes.app.parameters import every_declaration
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.model.declaration import Context, Declaration, Ranges
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.operators.bouc_wen import BoucWen
+
+__all__ = ["NAMES", "context", "declared", "default_prior", "joint", "parameter"]
+
+BOUC_WEN = BoucWen()
+DECLARED = {d.name: d for d in every_declaration()} | {d.name: d for d in BOUC_WEN.parameters}
+
+# Those of Bouc-Wen, the filters, the offset and the noises.
+NAMES = (
+    "d", "alpha", "beta", "gamma", "exponent", "initial", "lag", "mass", "damping", "stiffness",
+    "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time",
+)  # fmt: skip
+
+
+def declared(name: str, *, passive: bool = True) -> Declaration:
+    """Return a declaration; Bouc-Wen's where several operators have a parameter of that name."""
+    own = {d.name: d for d in BoucWen(passive).parameters}
+    return own.get(name, DECLARED[name])
+
+
+def parameter(
+    name: str, known: Distribution | float, lower: float | None = None, upper: float | None = None
+) -> Parameter:
+    """Return a declared parameter with a prior or a fixed value, and bounds."""
+    one = Parameter.of(declared(name), known)
+    return replace(
+        one,
+        lower=one.lower if lower is None else lower,
+        upper=one.upper if upper is None else upper,
+    )
+
+
+def joint(parameters: list[Parameter], *, passive: bool = True) -> JointPrior:
+    """Return a joint prior with Bouc-Wen's constraints."""
+    own = {d.name: d for d in BoucWen(passive).parameters}
+    every = [replace(p, declared=own.get(p.name, p.declared)) for p in parameters]
+    return JointPrior(every, BoucWen(passive).holds)
+
+
+def context(
+    ranges: Ranges,
+    exponent: float | Distribution = 1.0,
+    stiffness: float | None = None,
+    *,
+    gamma_free: bool = True,
+) -> Context:
+    """Return what default priors may know."""
+    stated: dict[str, float | Distribution] = {"exponent": exponent}
+    if stiffness is not None:
+        stated["stiffness"] = stiffness
+    if not gamma_free:
+        stated["gamma"] = 0.0
+    return Context(ranges, stated)
+
+
+def default_prior(
+    name: str,
+    ranges: Ranges,
+    exponent: float | Distribution = 1.0,
+    stiffness: float | None = None,
+    *,
+    gamma_free: bool = True,
+) -> Distribution | float:
+    """Return a parameter's default prior, or the value at which it is fixed."""
+    known = context(ranges, exponent, stiffness, gamma_free=gamma_free)
+    default = declared(name).default(known)
+    if default is None:
+        raise KeyError(name)
+    return default
