@@ -1,0 +1,475 @@
+"""Operators that remember extrema: against slow plain ones, and the laws they keep or do not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.declaration import Context, Ranges
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.memory import RemembersExtrema
+from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
+from bwbayes.model.operators.preisach import Preisach
+from tests.model.operators.slow import Rows, by_extrema, by_plays, path, rows, run, walk
+
+SPANS = (Span(-100.0, 120.0), Span(-150.0, 90.0), Span(5.0, 160.0), Span(-30.0, -20.0), None)
+INITIALS = [-1.0, -0.6, 0.0, 0.37, 0.9, 1.0]
+
+
+@dataclass(frozen=True)
+class Case:
+    """An operator, a model of it, and its Everett function as a scalar formula."""
+
+    operator: RemembersExtrema
+    column: Rows
+    everett: Callable[[float, float], float]
+
+
+def _exponential(low: float, high: float) -> float:
+    x = abs(high - low) / 2
+    return 2 * (0.7 * x + 0.4 * (x - 30.0 * (1 - math.exp(-x / 30.0))))
+
+
+def _plays(low: float, high: float) -> float:
+    travel = abs(high - low)
+    return 0.7 * travel + sum(
+        w * max(travel - 2 * r, 0) for w, r in zip(WEIGHTS, VOLTS, strict=True)
+    )
+
+
+def _bells(low: float, high: float) -> float:
+    moved = 80.0 * (math.tanh(high / 80.0) - math.tanh(low / 80.0))
+    return 0.7 * abs(high - low) + 0.002 * moved**2
+
+
+NODES, PARTS = np.polynomial.legendre.leggauss(40)
+
+
+def _ramps(low: float, high: float) -> float:
+    shifts = 25.0 * NODES
+    # tanh x − tanh y without its cancellation.
+    split = np.cosh((high - shifts) / 80.0) * np.cosh((low - shifts) / 80.0)
+    moved = 80.0 * np.sinh((high - low) / 80.0) / split
+    return 0.7 * abs(high - low) + 0.002 * float(PARTS @ moved**2) / 2
+
+
+VOLTS = (2.0, 9.0, 31.0, 70.0)
+WEIGHTS = (0.1, 0.3, 0.0, 0.2)
+NUMBERED = {f"weight_{j + 1}": w for j, w in enumerate(WEIGHTS)}
+SLIPPING = {f"alpha_{j + 1}": w for j, w in enumerate(WEIGHTS)}
+BELLS = {"d": 0.7, "rayleigh": 0.004, "saturation": 80.0}
+EVEN = {"threshold": 75.0, "d": 0.7} | {f"weight_{j}": 0.1 * j for j in range(1, 5)}
+
+
+def _even(low: float, high: float) -> float:
+    travel = abs(high - low)
+    return 0.7 * travel + sum(0.1 * j * max(travel - 30.0 * j, 0) for j in range(1, 5))
+
+
+CASES = {
+    "prandtl-ishlinskii": Case(
+        PrandtlIshlinskii(), rows(d=0.7, alpha=0.4, threshold=30.0, initial=INITIALS), _exponential
+    ),
+    "plays": Case(Plays(VOLTS), rows(d=0.7, **NUMBERED, initial=INITIALS), _plays),
+    "plays evenly": Case(Plays(4), rows(**EVEN, initial=INITIALS), _even),
+    "maxwell-slip": Case(MaxwellSlip(VOLTS), rows(d=1.3, **SLIPPING, initial=INITIALS), _plays),
+    "preisach": Case(Preisach(), rows(**BELLS, initial=INITIALS), _bells),
+    "krasnoselskii-pokrovskii": Case(
+        KrasnoselskiiPokrovskii(), rows(**BELLS, width=50.0, initial=INITIALS), _ramps
+    ),
+}
+every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+INVARIANT = ("prandtl-ishlinskii", "plays", "plays evenly", "maxwell-slip")
+voltages = st.floats(-150, 150).map(lambda u: round(u, 3))
+paths = st.lists(voltages, min_size=2, max_size=30).map(np.array)
+spans = st.sampled_from(SPANS)
+
+
+def assert_close(expected: FloatArray, got: FloatArray, part: float = 1e-9) -> None:
+    """Compare to a part of the range."""
+    assert np.max(np.abs(got - expected)) <= part * max(np.ptp(expected), 1e-9)
+
+
+def slowly(case: Case, voltage: FloatArray, span: Span | None) -> FloatArray:
+    starts = case.column["initial"].tolist()
+    full = [path(start, voltage, span) for start in starts]
+    return np.array([by_extrema(case.everett, one, voltage.size) for one in full])
+
+
+@every_case
+@pytest.mark.parametrize("span", SPANS)
+def test_agrees_with_extrema_looked_for_anew(case: Case, span: Span | None) -> None:
+    for seed in range(3):
+        voltage = walk(seed, turns=12)
+        assert_close(slowly(case, voltage, span), run(case.operator, case.column, voltage, span))
+
+
+@pytest.mark.parametrize("name", ["plays", "maxwell-slip"])
+@pytest.mark.parametrize("span", SPANS)
+def test_agrees_with_plays_updated_one_by_one(name: str, span: Span | None) -> None:
+    voltage = walk(5, turns=40)
+    got = run(CASES[name].operator, CASES[name].column, voltage, span)
+    for start, row in zip(INITIALS, got, strict=True):
+        full = path(start, voltage, span)
+        expected = by_plays(0.7, np.array(VOLTS), np.array(WEIGHTS), full)
+        assert_close(expected[-voltage.size :], row)
+
+
+def test_exponential_thresholds_are_the_limit_of_many_plays() -> None:
+    voltage = walk(6, turns=30)
+    case, span = CASES["prandtl-ishlinskii"], SPANS[0]
+    got = run(case.operator, case.column, voltage, span)
+    errors = []
+    for count in (1_000, 4_000):
+        edges = np.linspace(0.0, 900.0, count + 1)
+        middles, weights = (edges[1:] + edges[:-1]) / 2, -0.4 * np.diff(np.exp(-edges / 30.0))
+        plain = by_plays(0.7, middles, weights, path(INITIALS[3], voltage, span))
+        errors.append(np.max(np.abs(got[3] - plain[-voltage.size :])) / np.ptp(got))
+    assert errors[1] < 2e-5
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.5)
+
+
+def _by_relays(width: float, voltages: list[float], cells: int) -> FloatArray:
+    """Follow ramps of a width, one by one, on a grid of switching voltages."""
+    grid = (np.arange(cells) + 0.5) / cells * 640.0 - 320.0
+    up, down = (one[np.tril_indices(cells)] for one in np.meshgrid(grid, grid, indexing="ij"))
+    weight = 0.002 / np.cosh(up / 80.0) ** 2 / np.cosh(down / 80.0) ** 2 * (640.0 / cells) ** 2
+    weight[up == down] /= 2
+
+    def ramp(beyond: FloatArray) -> FloatArray:
+        if width == 0:
+            return np.sign(beyond)
+        return np.clip(2 * beyond / width, -1.0, 1.0)
+
+    state = ramp(-(up + down) / 2)
+    result = []
+    for u in voltages:
+        state = np.maximum(ramp(u - up), np.minimum(ramp(u - down), state))
+        result.append(0.7 * u + float(weight @ state))
+    return np.array(result)
+
+
+@pytest.mark.parametrize(("name", "width"), [("preisach", 0.0), ("krasnoselskii-pokrovskii", 50.0)])
+def test_densities_are_the_limit_of_many_relays(name: str, width: float) -> None:
+    voltage, span = walk(7, turns=15), SPANS[0]
+    got = run(CASES[name].operator, CASES[name].column, voltage, span)[3]
+    errors = []
+    for cells in (150, 600):
+        plain = _by_relays(width, path(INITIALS[3], voltage, span), cells)[-voltage.size :]
+        # Relays and displacement are counted from different zeros.
+        errors.append(np.ptp(got - plain) / np.ptp(got))
+    # A grid of relays is as good as its cells are small.
+    assert errors[1] < 3e-3
+    assert errors[1] < errors[0] / 3
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths, span=spans, cuts=st.lists(st.integers(0, 30), max_size=6))
+def test_pieces_do_not_matter(
+    case: Case, voltage: FloatArray, span: Span | None, cuts: list[int]
+) -> None:
+    whole = run(case.operator, case.column, voltage, span)
+    cut = run(case.operator, case.column, voltage, span, [min(k, voltage.size) for k in cuts])
+    np.testing.assert_array_equal(whole, cut)
+
+
+@every_case
+def test_small_expressions_do_not_matter(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    voltage = walk(8)
+    whole = run(case.operator, case.column, voltage, SPANS[0])
+    monkeypatch.setattr("bwbayes.model.operators.memory.PIECE", 13)
+    np.testing.assert_array_equal(whole, run(case.operator, case.column, voltage, SPANS[0]))
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths, span=spans)
+def test_a_model_does_not_feel_its_neighbours(
+    case: Case, voltage: FloatArray, span: Span | None
+) -> None:
+    together = run(case.operator, case.column, voltage, span)
+    for row, alone in enumerate(together):
+        column = {name: values[row : row + 1] for name, values in case.column.items()}
+        np.testing.assert_array_equal(alone, run(case.operator, column, voltage, span)[0])
+
+
+@every_case
+def test_advancing_leaves_the_memory_as_it_was(case: Case) -> None:
+    voltage = walk(9)
+    memory = case.operator.begin(case.column, float(voltage[0]), Span(-9, 99), from_rest=False)
+    once = case.operator.advance(case.column, voltage, memory)[0]
+    np.testing.assert_array_equal(once, case.operator.advance(case.column, voltage, memory)[0])
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths, span=spans, samples=st.integers(2, 5))
+def test_pace_does_not_matter(
+    case: Case, voltage: FloatArray, span: Span | None, samples: int
+) -> None:
+    slow = np.interp(
+        np.arange(samples * (voltage.size - 1) + 1) / samples, np.arange(voltage.size), voltage
+    )
+    got = run(case.operator, case.column, slow, span)[:, ::samples]
+    np.testing.assert_allclose(
+        run(case.operator, case.column, voltage, span), got, rtol=0, atol=1e-11
+    )
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths, inside=paths)
+def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: FloatArray) -> None:
+    """A detour that stays between a record's end and its turn before leaves no trace."""
+    turn, end = float(voltage[-2]), float(voltage[-1])
+    low, high = min(turn, end), max(turn, end)
+    detour = np.clip(inside, low, high)
+    after = np.array([end, -170.0, 170.0, 0.0])
+    span = SPANS[0]
+    straight = run(case.operator, case.column, np.concatenate([voltage, after]), span)
+    around = run(case.operator, case.column, np.concatenate([voltage, detour, after]), span)
+    np.testing.assert_allclose(straight[:, -4:], around[:, -4:], rtol=0, atol=1e-11)
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(first=paths, second=paths, low=voltages, high=voltages)
+def test_loops_between_the_same_voltages_are_congruent(
+    case: Case, first: FloatArray, second: FloatArray, low: float, high: float
+) -> None:
+    loop = np.array([low, high, (low + high) / 2, low, (low + high) / 2, high])
+    shapes = []
+    for before in (first, second):
+        got = run(case.operator, case.column, np.concatenate([before, loop]), SPANS[0])[:, -4:]
+        shapes.append(got - got[:, :1])
+    np.testing.assert_allclose(shapes[0], shapes[1], rtol=0, atol=1e-11)
+
+
+@every_case
+def test_loops_elsewhere_are_alike_only_for_plays(
+    case: Case, request: pytest.FixtureRequest
+) -> None:
+    shapes = []
+    for mean in (0.0, 90.0):
+        loop = mean + np.array([-40.0, 40.0, 0.0, -40.0, 0.0, 40.0])
+        got = run(case.operator, case.column, loop, SPANS[0])[:, -4:]
+        shapes.append(got - got[:, :1])
+    apart = np.max(np.abs(shapes[0] - shapes[1]))
+    if request.node.callspec.id in INVARIANT:
+        assert apart < 1e-12
+    else:
+        assert apart > 1.0
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths)
+def test_from_rest_it_is_odd(case: Case, voltage: FloatArray) -> None:
+    there = run(case.operator, case.column, voltage, None)
+    np.testing.assert_allclose(
+        -there, run(case.operator, case.column, -voltage, None), rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", INVARIANT)
+@settings(max_examples=30, deadline=None)
+@given(voltage=paths, travel=st.floats(0.1, 100))
+def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
+    """From a turn at the largest voltage so far it is the first curve, twice as large."""
+    case = CASES[name]
+    top = float(np.max(np.abs(voltage))) + 60
+    path_down = np.array([*voltage, top, top - min(travel, top)])
+    got = run(case.operator, case.column, path_down, None)
+    first = run(case.operator, case.column, np.array([0.0, min(travel, top) / 2]), None)
+    np.testing.assert_allclose(got[:, -2] - got[:, -1], 2 * first[:, -1], rtol=0, atol=1e-11)
+
+
+def test_preisach_does_not_obey_masing() -> None:
+    case = CASES["preisach"]
+    got = run(case.operator, case.column, np.array([0.0, 120.0, 20.0]), None)
+    first = run(case.operator, case.column, np.array([0.0, 50.0]), None)
+    assert np.min(np.abs(got[:, 1] - got[:, 2] - 2 * first[:, 1])) > 1.0
+
+
+@every_case
+def test_the_first_curve_rises_and_rises_faster_than_a_branch_starts(case: Case) -> None:
+    up = run(case.operator, case.column, np.linspace(0.0, 300.0, 500), None)
+    assert np.min(np.diff(up, axis=1)) > 0
+
+
+@every_case
+@settings(max_examples=50, deadline=None)
+@given(voltage=paths, loop=paths)
+def test_a_closed_cycle_loses_energy(case: Case, voltage: FloatArray, loop: FloatArray) -> None:
+    cycle = np.concatenate([loop, loop[:1]])
+    fine = np.interp(np.linspace(0, cycle.size - 1, 40 * cycle.size), np.arange(cycle.size), cycle)
+    twice = np.concatenate([voltage, fine, fine])
+    w = run(case.operator, case.column, twice, SPANS[0])[:, -fine.size :]
+    u = twice[-fine.size :]
+    lost = np.sum((u[1:] + u[:-1]) / 2 * np.diff(w, axis=1), axis=1)
+    assert np.min(lost) >= -1e-9
+
+
+@every_case
+@settings(max_examples=30, deadline=None)
+@given(voltage=voltages, span=spans.filter(bool))
+def test_the_start_goes_from_the_ascending_to_the_descending_branch(
+    case: Case, voltage: float, span: Span
+) -> None:
+    column = {name: np.resize(values, 21) for name, values in case.column.items()}
+    column["initial"] = np.linspace(-1, 1, 21)
+    w = run(case.operator, column, np.array([voltage]), span)[:, 0]
+    assert np.min(np.diff(w)) >= -1e-11
+    low, high = min(span.low, voltage), max(span.high, voltage)
+    one = {name: values[:1] for name, values in column.items()}
+    ascending = run(case.operator, one, np.array([0.0, high, low, voltage]), None)[0, -1]
+    descending = run(case.operator, one, np.array([0, high, low, high, voltage]), None)[0, -1]
+    assert w[0] == pytest.approx(ascending, abs=1e-11)
+    assert w[-1] == pytest.approx(descending, abs=1e-11)
+    lowest, highest = case.operator.reachable(column, voltage, span)
+    alike = np.ptp(w) <= 1e-11
+    if not span.low < voltage < span.high:
+        assert alike
+        assert not highest.any()
+    else:
+        assert (lowest == -1).all()
+        assert (highest == 1).all()
+
+
+@every_case
+def test_the_typical_slope_is_that_of_the_whole_span(case: Case) -> None:
+    span = Span(-50.0, 70.0)
+    sweep = run(case.operator, case.column, np.array([-50.0, 70.0]), span)
+    expected = (sweep[:, 1] - sweep[:, 0])[0] / 120
+    np.testing.assert_allclose(case.operator.gain(case.column, span), expected, rtol=1e-12)
+    still = case.operator.gain(case.column, Span(3.0, 3.0))
+    np.testing.assert_allclose(still, 0.7, rtol=1e-3)
+
+
+RANGES = (
+    Ranges(100.0, 60.0, 0.0, 1.0),
+    Ranges(1.6, 19.5, -95.0, 0.5, bias=1.8),
+    Ranges(1e-3, 1e3, 5.0, 10.0, bias=75.0),
+)
+
+
+def draws(operator: Operator, ranges: Ranges, count: int, seed: int) -> Rows:
+    """Draw models from the default priors."""
+    generator = np.random.default_rng(seed)
+    column: Rows = {}
+    for declaration in operator.parameters:
+        default = declaration.default(Context(ranges))
+        assert default is not None
+        if isinstance(default, Distribution):
+            column[declaration.name] = default.frozen.rvs(count, random_state=generator)
+        else:
+            column[declaration.name] = np.full(count, default)
+    return column
+
+
+@every_case
+@pytest.mark.parametrize("ranges", RANGES)
+def test_is_finite_for_a_hundred_thousand_draws_from_the_prior(case: Case, ranges: Ranges) -> None:
+    low, high = ranges.bias - ranges.voltage, ranges.bias + ranges.voltage
+    voltage = low + (high - low) * np.array([0.3, 0.3, 1.0, 0.2, 0.9, 0.91, 0.0])
+    column = draws(case.operator, ranges, 100_000, 1)
+    inside = np.broadcast_to(case.operator.holds(column), 100_000)
+    for parameter in case.operator.parameters:
+        if parameter.bounds is not None:
+            lower, upper = (np.asarray(bound) for bound in parameter.bounds(column))
+            inside = inside & (column[parameter.name] >= lower)
+            inside = inside & (column[parameter.name] <= upper)
+    assert inside.mean() > 0.5
+    column = {name: values[inside] for name, values in column.items()}
+    case.operator.check(column)
+    w = run(case.operator, column, voltage, Span(low, high))
+    assert np.isfinite(w).all()
+    # The scales are right: half of the models move by what the record moves, give or take three.
+    moved = np.ptp(w, axis=1) / (2 * ranges.displacement)
+    assert 1 / 3 < np.median(moved) < 3
+
+
+@every_case
+def test_what_cannot_be_is_refused_by_name(case: Case) -> None:
+    for declaration in case.operator.parameters:
+        bad = [math.nan, math.inf]
+        bad += [-0.1] if declaration.floor == 0 else []
+        bad += [0.0] if declaration.positive else []
+        bad += [1.1] if declaration.name == "initial" else []
+        for value in bad:
+            column = {name: values.copy() for name, values in case.column.items()}
+            column[declaration.name][3] = value
+            with pytest.raises(InputError, match=rf"^{declaration.name}: .* in model 3; must "):
+                case.operator.check(column)
+    case.operator.check(case.column)
+    assert np.all(case.operator.holds(case.column))
+    assert case.operator.parameters[-1].name == "initial"
+    assert {p.scope for p in case.operator.parameters[:-1]} == {"actuator"}
+    assert case.operator.remarks(case.column, ()) == []
+
+
+def test_springs_that_hold_back_more_than_all_are_refused() -> None:
+    column = rows(d=[1.3, 0.5], **SLIPPING, initial=0.0)
+    assert MaxwellSlip(VOLTS).holds(column).tolist() == [True, False]
+    assert MaxwellSlip(VOLTS).holds({"alpha_1": column["alpha_1"]}).all()
+    with pytest.raises(InputError, match=r"^d: 0.5 in model 1; must not be less"):
+        MaxwellSlip(VOLTS).check(column)
+
+
+def test_ramps_wider_than_ten_bells_are_refused() -> None:
+    column = rows(**BELLS, width=801.0, initial=0.0)
+    with pytest.raises(InputError, match=r"^width: 801 in model 0; must be at most 10 times"):
+        KrasnoselskiiPokrovskii().check(column)
+
+
+@pytest.mark.parametrize("thresholds", [0, -1, (), (0.0, 1.0), (2.0, 1.0), (1.0, math.nan)])
+@pytest.mark.parametrize("kind", [Plays, MaxwellSlip])
+def test_thresholds_that_cannot_be_are_refused(kind: type[Plays], thresholds: object) -> None:
+    with pytest.raises(InputError, match=r"^thresholds: "):
+        kind(thresholds)  # type: ignore[arg-type]
+
+
+def test_ramps_of_no_width_are_relays() -> None:
+    voltage = walk(10)
+    column = rows(**BELLS, width=0.0, initial=INITIALS)
+    relays = run(Preisach(), column, voltage, SPANS[0])
+    assert_close(relays, run(KrasnoselskiiPokrovskii(), column, voltage, SPANS[0]), 1e-13)
+
+
+def test_one_play_of_its_own_threshold_for_each_model() -> None:
+    voltage = walk(11)
+    column = rows(**EVEN, initial=INITIALS)
+    column["threshold"] = np.linspace(10.0, 90.0, 6)
+    together = run(Plays(4), column, voltage, SPANS[0])
+    for row in range(6):
+        one = {name: values[row : row + 1] for name, values in column.items()}
+        np.testing.assert_array_equal(together[row], run(Plays(4), one, voltage, SPANS[0])[0])
+
+
+@pytest.mark.parametrize("saturation", [1e-1, 1.0, 1e2, 1e4])
+@pytest.mark.parametrize("ratio", [1e-6, 1e-2, 1.0, 10.0])
+def test_ramps_keep_their_digits(saturation: float, ratio: float) -> None:
+    """Small branches and far saturation, against quadrature over the shift."""
+    width = ratio * saturation
+    column = rows(d=0.0, rayleigh=1.0, saturation=saturation, width=width, initial=0.0)
+    branch = KrasnoselskiiPokrovskii().branch(column)
+    nodes, parts = np.polynomial.legendre.leggauss(150)
+    shifts = width / 2 * nodes
+    for start, end in ((0.0, 1.0), (-0.3, 0.2), (0.7, 0.7 + 1e-7), (0.5, 0.5 + 1e-3)):
+        u, v = start * 5 * saturation, end * 5 * saturation
+        split = np.cosh((v - shifts) / saturation) * np.cosh((u - shifts) / saturation)
+        moved = saturation * math.sinh((v - u) / saturation) / split
+        expected = float(parts @ moved**2) / 4
+        assert branch(u, np.array([v]))[0, 0] == pytest.approx(expected, rel=1e-10, abs=1e-300)
