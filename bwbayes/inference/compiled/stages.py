@@ -17,15 +17,18 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.compiled import bouc_wen
+from bwbayes.inference.compiled import bouc_wen, bouc_wen_asymmetric, duhem
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
+from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
 
 __all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
 
-GIVEN, BOUC_WEN = range(2)
+GIVEN, BOUC_WEN, BOUC_WEN_ASYMMETRIC, DUHEM = range(4)
 
 
 class Stage(NamedTuple):
@@ -46,13 +49,40 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
     """Take n = 1 with |γ| ≤ β."""
     del operator
     able = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
-    rest = column["d"] * voltage[0] - memory.hysteretic
-    own = bouc_wen.rows(column, memory.hysteretic, rest)
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen.rows(column, memory.state, rest)
     return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
+
+
+def _backlash_like(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models: Bouc-Wen hysteresis with n = 1 and γ = 0."""
+    nothing = np.zeros_like(column["beta"])
+    values = {**column, "gamma": nothing, "exponent": nothing + 1}
+    return _bouc_wen(operator, values, voltage, memory)
+
+
+def _bouc_wen_asymmetric(
+    operator: Operator, column: Values, voltage: FloatArray, memory: Any
+) -> Stage:
+    del operator
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen_asymmetric.rows(column, memory.state, rest)
+    able = np.ones(rest.size, dtype=bool)
+    return Stage(BOUC_WEN_ASYMMETRIC, able, rest, own, np.empty((0, 0)))
+
+
+def _duhem(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    assert isinstance(operator, Duhem)
+    rest = operator.polynomial(column, voltage[:1])[:, 0] - memory.state
+    own = duhem.rows(column, memory.state, rest)
+    return Stage(DUHEM, np.ones(rest.size, dtype=bool), rest, own, np.empty((0, 0)))
 
 
 STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
     BoucWen: _bouc_wen,
+    BacklashLike: _backlash_like,
+    BoucWenAsymmetric: _bouc_wen_asymmetric,
+    Duhem: _duhem,
 }
 
 
@@ -69,6 +99,10 @@ def drive_of(
     """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
     if kind == BOUC_WEN:
         bouc_wen.bouc_wen(own, voltage, first, last, out)
+    elif kind == BOUC_WEN_ASYMMETRIC:
+        bouc_wen_asymmetric.bouc_wen_asymmetric(own, voltage, first, last, out)
+    elif kind == DUHEM:
+        duhem.duhem(own, voltage, first, last, out)
     else:
         _given(own, plan, first, last, out)
 

@@ -23,7 +23,7 @@ from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import OneState, alpha, below_d, beta, d, initial, refuse
 
-__all__ = ["BoucWenAsymmetric"]
+__all__ = ["SIGNS", "BoucWenAsymmetric", "rates"]
 
 # What each term depends on, in the order in which their bounds follow from each other.
 TERMS = {
@@ -172,10 +172,16 @@ def _follow(
 
 def _flow(column: Values, s: float, x: float) -> _LinearFlow:
     """Return how g evolves where the voltage goes in direction s and has the sign x."""
+    slow, fast = rates(column, s, x)
+    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
+
+
+def rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
+    """Return β′ and γ′ (models,), 1/V, where the voltage goes in direction s and has the sign x."""
     slow, fast = _rates(column, s, x)
     slow = np.maximum(column["beta"] * slow, 0.0)
-    fast = np.clip(column["beta"] * fast + column["gamma"], -slow, slow)
-    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
+    # Rounding may have them beyond what is passive.
+    return slow, np.clip(column["beta"] * fast + column["gamma"], -slow, slow)
 
 
 def _rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:

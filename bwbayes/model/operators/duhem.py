@@ -149,7 +149,7 @@ class Duhem(OneState):
             step *= v
             np.add(start, step, out=h[:, first + 1 : last + 1])
         after = h[:, -1].copy()
-        np.subtract(self._gain(column, voltage), h, out=h)
+        np.subtract(self.polynomial(column, voltage), h, out=h)
         return h, after
 
     def _about(self, column: Values, u: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,7 +158,7 @@ class Duhem(OneState):
         alpha1 = 0.0 if self.odd else column["alpha1"]
         return alpha0 + u * (alpha1 + u * alpha2), alpha1 + 2 * u * alpha2, alpha2
 
-    def _gain(self, column: Values, voltage: FloatArray) -> FloatArray:
+    def polynomial(self, column: Values, voltage: FloatArray) -> FloatArray:
         """Return f (models, samples), um."""
         curve = column["d3"][:, np.newaxis] * voltage
         if not self.odd:
