@@ -9,11 +9,14 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.inference.compiled.stages import STAGES, drive_of
+from bwbayes.inference.compiled.stages import DRIVES, STAGES, drive_of
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.jiles_atherton import JilesAtherton
+from bwbayes.model.operators.pinned import Pinned
 from tests.model.operators.differential import SPAN, paths, prior_draws
 
 OPERATORS: dict[str, Operator] = {
@@ -78,3 +81,15 @@ def test_stages_agree_on_any_path(
 ) -> None:
     place = np.linspace(0, len(corners) - 1, (len(corners) - 1) * samples + 1)
     assert_alike(name, np.interp(place, np.arange(len(corners)), corners), seed, piece)
+
+
+@pytest.mark.parametrize("operator", [JilesAtherton(), DomainWall()])
+@pytest.mark.parametrize("path", paths())
+def test_drives_agree_with_their_operators(operator: Pinned, path: str) -> None:
+    """The steps of the integrator are the same, so its error is; what is left is rounding."""
+    column, voltage = models(operator, 3), paths()[path]
+    memory = operator.begin(column, float(voltage[0]), SPAN, from_rest=False)
+    expected = operator.advance(column, voltage, memory)[0]
+    got = DRIVES[type(operator)](operator, column, voltage, memory)
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    assert (np.abs(got - expected) <= 1e-10 * size).all()

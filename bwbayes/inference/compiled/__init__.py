@@ -12,7 +12,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import kernels, lanes
-from bwbayes.inference.compiled.stages import GIVEN, STAGES
+from bwbayes.inference.compiled.stages import DRIVES, GIVEN, STAGES
 from bwbayes.inference.noise import Noise, SteadyState
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
@@ -73,7 +73,7 @@ def moments(
     others = np.flatnonzero(~able)
     size = max(LARGEST // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
-        drive = actuator.hysteretic(table.actuator(theta[rows]), voltage, from_rest=from_rest)
+        drive = _drive(actuator, table.actuator(theta[rows]), voltage, from_rest=from_rest)
         rest = np.zeros(len(theta))
         rest[rows] = drive[:, 0]
         models = _models(actuator, column, rest, steady, voltage)[rows]
@@ -87,6 +87,18 @@ def moments(
     readings = np.count_nonzero(skipped >= 0)
     log_determinant = readings * np.log(steady.variance) + sums[lanes.LOG_RATIO]
     return products, log_determinant
+
+
+def _drive(
+    actuator: Actuator, theta: FloatArray, voltage: FloatArray, *, from_rest: bool
+) -> FloatArray:
+    """Return what the operator makes of a record's voltage, (models, samples), um."""
+    compiled = DRIVES.get(type(actuator.hysteresis))
+    if compiled is None:
+        return actuator.hysteretic(theta, voltage, from_rest=from_rest)
+    column = actuator.columns(theta)
+    memory = actuator.begin(column, voltage, from_rest=from_rest)
+    return compiled(actuator.hysteresis, column, voltage, memory)
 
 
 def _parts(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

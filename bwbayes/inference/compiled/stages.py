@@ -17,16 +17,18 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.compiled import bouc_wen, bouc_wen_asymmetric, duhem
+from bwbayes.inference.compiled import bouc_wen, bouc_wen_asymmetric, duhem, pinned
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.jiles_atherton import JilesAtherton
 
-__all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
+__all__ = ["DRIVES", "GIVEN", "STAGES", "Stage", "drive_of"]
 
 GIVEN, BOUC_WEN, BOUC_WEN_ASYMMETRIC, DUHEM = range(4)
 
@@ -83,6 +85,12 @@ STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], St
     BacklashLike: _backlash_like,
     BoucWenAsymmetric: _bouc_wen_asymmetric,
     Duhem: _duhem,
+}
+
+# What makes the drive of a whole record at once, (models, samples), as the operator does.
+DRIVES: Mapping[type[Operator], Callable[[Any, Values, FloatArray, Any], FloatArray]] = {
+    JilesAtherton: pinned.drive,
+    DomainWall: pinned.drive,
 }
 
 

@@ -33,8 +33,8 @@ ODD = ("backlash-like", "duhem", "bouc-wen-asymmetric by the voltage", "jiles-at
 NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
 
 every = pytest.mark.parametrize("name", OPERATORS)
-few = settings(deadline=None, max_examples=12)
-corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=6)
+few = settings(deadline=None, max_examples=6)
+corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=5)
 
 
 def models(operator: OneState, size: int, seed: int) -> dict[str, FloatArray]:
@@ -233,6 +233,11 @@ def test_sweeps_reach_what_they_say_and_the_memory_stays_as_it_is(name: str) -> 
     np.testing.assert_array_equal(memory.state, before)
     start = operator.begin(column, 0.0, SPAN, from_rest=True)
     _, end = operator.advance(column, np.array([70.0, -30.0, 70.0, -30.0, 20.0]), start)
-    size = np.maximum(np.abs(low), np.abs(high))
-    assert (end.state >= low - 1e-6 * size).all()
-    assert (end.state <= high + 1e-6 * size).all()
+    # The state need not be what the parameter is, and may grow as that falls.
+    ends = [
+        operator.begin({**column, "initial": one}, 20.0, SPAN, from_rest=False).state
+        for one in (low, high)
+    ]
+    slack = 1e-6 * np.max(np.abs(ends), axis=0)
+    assert (end.state >= np.min(ends, axis=0) - slack).all()
+    assert (end.state <= np.max(ends, axis=0) + slack).all()

@@ -1,0 +1,213 @@
+"""The Jiles-Atherton and the domain wall model compiled: model by model, stretch by stretch.
+
+The same steps as :mod:`bwbayes.model.operators.walls` takes, so that both engines have the same
+error. Steps of an integrator do not end at samples; so this is no stage that takes samples as they
+come, but makes the drive of a whole record, which is then taken as given.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from scipy.integrate import RK45
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.model.declaration import Values
+from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.operators.domain_wall import DomainWall
+from bwbayes.model.operators.jiles_atherton import ABOVE, BELOW, STEPS
+from bwbayes.model.operators.one_state import Memory
+from bwbayes.model.operators.pinned import LONGEST, Pinned
+from bwbayes.model.operators.walls import (
+    CONVERGED,
+    FIRST,
+    GROW,
+    ROUNDS,
+    SAFE,
+    SATURATED,
+    SHRINK,
+    STABLE,
+    TOLERANCE,
+)
+
+__all__ = ["drive"]
+
+A, B, C, E, P = RK45.A, RK45.B, RK45.C, RK45.E, RK45.P
+STAGES = 6
+
+
+def drive(operator: Pinned, column: Values, voltage: FloatArray, memory: Memory) -> FloatArray:
+    """Return w (models, samples), um, as ``operator.advance`` does."""
+    joined = np.concatenate([[memory.voltage], voltage])
+    stretches = list(monotone_stretches(joined, LONGEST))
+    ends = np.array([[one.first, one.last] for one in stretches], dtype=np.int64)
+    directions = np.array([one.direction for one in stretches])
+    walls = np.stack(operator.walls(column), axis=1)
+    spins = isinstance(operator, DomainWall)
+    state = np.ascontiguousarray(memory.state)
+    return _follow(spins, walls, joined, ends, directions, state)[:, 1:]
+
+
+@njit(nogil=True, cache=True)
+def _follow(
+    spins: bool,
+    walls: FloatArray,
+    voltage: FloatArray,
+    ends: IntArray,
+    directions: FloatArray,
+    state: FloatArray,
+) -> FloatArray:
+    """Return w (models, samples) along stretches from the irreversible displacements ``state``."""
+    result = np.empty((state.size, voltage.size))
+    for model in range(state.size):
+        own, fixed = walls[model], state[model]
+        out = result[model]
+        out[0] = _at_rest(spins, own, fixed, voltage[0])
+        for stretch in range(directions.size):
+            first, last = ends[stretch]
+            s = directions[stretch]
+            fixed = s * _rise(spins, own, s * fixed, s, voltage[first : last + 1], out[first:])
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _rise(
+    spins: bool, own: FloatArray, fixed: float, s: float, voltage: FloatArray, out: FloatArray
+) -> float:
+    """Fill in w along s u, which rises, after its first sample; return the last s P_irr."""
+    ws, e0, a, c = own[0], own[1], own[2], own[4]
+    level = min(max(fixed / ws, -SATURATED), SATURATED)
+    free = e0 * _field_at(spins, level) - a * fixed
+    begin, end = s * voltage[0], s * voltage[-1]
+    since = max(free, begin)
+    t = 1
+    while t < voltage.size and s * voltage[t] <= since:
+        out[t] = s * _at_rest(spins, own, fixed, s * voltage[t])
+        t += 1
+    if not since < end:
+        return fixed
+    start = _at_rest(spins, own, fixed, since)
+    p = _move(spins, own, since, start, s, voltage, t, out)
+    level, _ = _curve(spins, (end + a * p) / e0)
+    return float((p - c * ws * level) / (1 - c))
+
+
+@njit(nogil=True, cache=True)
+def _move(
+    spins: bool,
+    own: FloatArray,
+    u: float,
+    p: float,
+    s: float,
+    voltage: FloatArray,
+    t: int,
+    out: FloatArray,
+) -> float:
+    """Let walls move from s u and s P on; fill in w from sample t on, and return the last s P."""
+    end = s * voltage[-1]
+    scale = TOLERANCE * min(own[0], own[6] * (end - u))
+    step = FIRST * (own[3] - own[2] * own[5])
+    k = np.empty(STAGES + 1)
+    k[0], decay = _slope(spins, own, u, p)
+    while True:
+        step = min(step, STABLE * decay)
+        last = step >= end - u
+        h = end - u if last else step
+        for stage in range(1, STAGES):
+            change = h * _weighted(A[stage], k, stage)
+            k[stage], _ = _slope(spins, own, u + C[stage] * h, p + change)
+        reached = p + h * _weighted(B, k, STAGES)
+        arrived = end if last else u + h
+        k[STAGES], within = _slope(spins, own, arrived, reached)
+        error = abs(h * _weighted(E, k, STAGES + 1)) / scale
+        step = h * (min(max(SAFE * error**-0.2, SHRINK), GROW) if error > 0.0 else GROW)
+        if not error <= 1.0:
+            continue
+        if t < voltage.size and s * voltage[t] <= arrived:
+            terms = (
+                _weighted(P[:, 0], k, STAGES + 1),
+                _weighted(P[:, 1], k, STAGES + 1),
+                _weighted(P[:, 2], k, STAGES + 1),
+                _weighted(P[:, 3], k, STAGES + 1),
+            )
+            while t < voltage.size and s * voltage[t] <= arrived:
+                travel = s * voltage[t] - u
+                part = travel / (arrived - u)
+                polynomial = terms[0] + part * (terms[1] + part * (terms[2] + part * terms[3]))
+                out[t] = s * (p + travel * polynomial)
+                t += 1
+        u, p, decay = arrived, reached, within
+        k[0] = k[STAGES]
+        if last:
+            return p
+
+
+@njit(nogil=True, cache=True)
+def _weighted(weights: FloatArray, slopes: FloatArray, count: int) -> float:
+    total = 0.0
+    for stage in range(count):
+        total += weights[stage] * slopes[stage]
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _slope(spins: bool, own: FloatArray, u: float, p: float) -> tuple[float, float]:
+    """Return dP/du while walls move under a rising voltage, and within what an error decays, V."""
+    ws, e0, a, k, c, most = own[0], own[1], own[2], own[3], own[4], own[5]
+    level, slope = _curve(spins, (u + a * p) / e0)
+    behind = min(max((ws * level - p) / (1 - c), 0.0), most)
+    slope = slope * ws / e0
+    left = k - a * behind
+    return (c * slope + (1 - c) * behind / left) / (1 - a * c * slope), left * left / k
+
+
+@njit(nogil=True, cache=True)
+def _at_rest(spins: bool, own: FloatArray, fixed: float, u: float) -> float:
+    """Solve P = c P_an + (1 − c) P_irr for P, by Newton's method in u + a P."""
+    ws, e0, a, c = own[0], own[1], own[2], own[4]
+    base, share = u + a * (1 - c) * fixed, a * c * ws
+    near = abs(base) / (1 - share * (1.0 if spins else 1 / 3) / e0)
+    x = math.copysign(min(near, abs(base) + share), base)
+    for _ in range(ROUNDS):
+        level, slope = _curve(spins, x / e0)
+        step = (x - base - share * level) / (1 - share * slope / e0)
+        if not abs(step) > CONVERGED * (abs(x) + e0):
+            break
+        x -= step
+    level, _ = _curve(spins, x / e0)
+    return float(c * ws * level + (1 - c) * fixed)
+
+
+@njit(nogil=True, cache=True)
+def _curve(spins: bool, y: float) -> tuple[float, float]:
+    """Return L and L′ of either model."""
+    size = abs(y)
+    if spins:
+        gone = math.exp(-2 * size)
+        return math.tanh(y), 4 * gone / (1 + gone) ** 2
+    if size < 1.0:
+        square = size * size
+        above = ((ABOVE[0] * square + ABOVE[1]) * square + ABOVE[2]) * square + ABOVE[3]
+        below = ((BELOW[0] * square + BELOW[1]) * square + BELOW[2]) * square + BELOW[3]
+        quotient = above / below
+        level = size * quotient
+        return math.copysign(level, y), 1 - level * level - 2 * quotient
+    one = 1 / size
+    gone = math.exp(-2 * size)
+    ratio = 2 * gone / (1 - gone)
+    return math.copysign(1 + ratio - one, y), one * one - 2 * ratio / (1 - gone)
+
+
+@njit(nogil=True, cache=True)
+def _field_at(spins: bool, level: float) -> float:
+    """Return the inverse of L below saturation."""
+    size = abs(level)
+    if spins:
+        return math.atanh(level)
+    y = size * (3 - size**2) / (1 - size**2)
+    for _ in range(STEPS):
+        reached, slope = _curve(False, y)
+        y -= (reached - size) / slope
+    return math.copysign(y, level)
