@@ -16,7 +16,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
 from bwbayes.model.operators.prandtl_ishlinskii import (
-    check_thresholds,
+    checked_thresholds,
     numbered,
     of_gain,
     plays_branch,
@@ -57,7 +57,7 @@ class MaxwellSlip(RemembersExtrema):
     thresholds: int | tuple[float, ...] = 10
 
     def __post_init__(self) -> None:
-        check_thresholds(self.thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:

@@ -8,7 +8,7 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,17 @@ from bwbayes.model.declaration import Context, Declaration, Values, lognormal, r
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
 
-__all__ = ["SLOPE", "Plays", "PrandtlIshlinskii", "numbered", "plays_branch", "threshold_volts"]
+__all__ = [
+    "SLOPE",
+    "Plays",
+    "PrandtlIshlinskii",
+    "checked_thresholds",
+    "numbered",
+    "of_gain",
+    "plays_branch",
+    "prandtl_ishlinskii",
+    "threshold_volts",
+]
 
 
 def of_gain(part: float, sigma: float) -> Callable[[Context], Distribution]:
@@ -133,7 +143,7 @@ class Plays(RemembersExtrema):
     thresholds: int | tuple[float, ...] = 10
 
     def __post_init__(self) -> None:
-        check_thresholds(self.thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -145,18 +155,28 @@ class Plays(RemembersExtrema):
         return plays_branch(self.thresholds, "weight", column["d"], column)
 
 
-def check_thresholds(thresholds: int | tuple[float, ...]) -> None:
-    """Raise an InputError where thresholds, or their number, cannot be."""
+def prandtl_ishlinskii(
+    thresholds: int | Sequence[float] | None = None,
+) -> PrandtlIshlinskii | Plays:
+    """Return plays with given ``thresholds``, V, or that many; without any, the density."""
+    if thresholds is None:
+        return PrandtlIshlinskii()
+    return Plays(checked_thresholds(thresholds))
+
+
+def checked_thresholds(thresholds: int | Sequence[float]) -> int | tuple[float, ...]:
+    """Return thresholds, or their number; raise an InputError where they cannot be."""
     if isinstance(thresholds, int):
         if thresholds < 1:
             raise InputError(f"thresholds: {thresholds} is too few; give 1 or more")
-        return
-    volts = np.array(thresholds, dtype=np.float64)
-    rising = bool(np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all())
-    if volts.size == 0 or not rising:
+        return int(thresholds)
+    volts = tuple(float(threshold) for threshold in thresholds)
+    rising = np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all()
+    if not volts or not rising:
         raise InputError(
-            f"thresholds: {list(thresholds)}; give positive volts, each larger than the one before"
+            f"thresholds: {list(volts)}; give positive volts, each larger than the one before"
         )
+    return volts
 
 
 def numbered(
