@@ -50,8 +50,8 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
     """Take n = 1 with |γ| ≤ β."""
     del operator
     able = (column["exponent"] == 1.0) & (np.abs(column["gamma"]) <= column["beta"])
-    rest = column["d"] * voltage[0] - memory.hysteretic
-    own = bouc_wen.rows(column, memory.hysteretic, rest)
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen.rows(column, memory.state, rest)
     return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
 
 

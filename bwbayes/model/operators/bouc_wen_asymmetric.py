@@ -21,7 +21,15 @@ from bwbayes.model.boucwen import PIECE, _LinearFlow
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, alpha, below_d, beta, d, initial, refuse
+from bwbayes.model.operators.one_state import (
+    OneState,
+    alpha,
+    below_d,
+    beta,
+    d,
+    initial_anywhere,
+    refuse,
+)
 
 __all__ = ["BoucWenAsymmetric"]
 
@@ -97,7 +105,7 @@ class BoucWenAsymmetric(OneState):
             loop=True,
         )
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        return d(), alpha(), beta(0.15), gamma, *self._asymmetry(), initial()
+        return d(), alpha(), beta(0.15), gamma, *self._asymmetry(), initial_anywhere()
 
     def _asymmetry(self) -> list[Declaration]:
         return [

@@ -9,6 +9,7 @@ drives may have left then follow.
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from bwbayes.model.declaration import Declaration, Values, lognormal, normal
 from bwbayes.model.operator import Operator, Span
 
 __all__ = [
+    "HIGHEST_CEILING",
     "Memory",
     "OneState",
     "alpha",
@@ -27,6 +29,7 @@ __all__ = [
     "beta",
     "d",
     "initial",
+    "initial_anywhere",
     "refuse",
 ]
 
@@ -86,10 +89,6 @@ class OneState(Operator):
     def unbiased(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002
         """Return the state (models,) without hysteresis at a voltage."""
         return np.zeros_like(column["initial"])
-
-    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:  # noqa: ARG002
-        """Return nothing: there is nothing to say."""
-        return []
 
 
 def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:
@@ -169,6 +168,11 @@ def initial() -> Declaration:
         scope="record",
         aliases=("h0",),
     )
+
+
+def initial_anywhere() -> Declaration:
+    """Declare h at the first sample; without a ceiling that all paths have."""
+    return replace(initial(), bounds=None)
 
 
 def below_ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import RK45
 
-from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
+from bwbayes.arrays import ArrayLike, FloatArray, IntArray
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
@@ -194,10 +194,6 @@ class Pinned(OneState):
         refuse(column, "pinning", weak, demand)
         beyond = np.abs(column["initial"]) > column["saturation"]
         refuse(column, "initial", beyond, "must lie between -saturation and saturation")
-
-    def holds(self, column: Values) -> BoolArray:
-        """Tell that all models (models,) hold: the bounds say everything."""
-        return np.ones(next(iter(column.values())).shape, dtype=np.bool_)
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # at zero volts
         """Return d."""
