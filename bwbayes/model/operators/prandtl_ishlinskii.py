@@ -30,7 +30,6 @@ __all__ = [
     "numbered",
     "of_gain",
     "plays_lines",
-    "prandtl_ishlinskii",
     "threshold_volts",
 ]
 
@@ -160,15 +159,6 @@ class Plays(RemembersExtrema):
     def lines(self, column: Values) -> Lines:
         """Return the lines that E is made of."""
         return plays_lines(self.thresholds, "weight", column["d"], column)
-
-
-def prandtl_ishlinskii(
-    thresholds: int | Sequence[float] | None = None,
-) -> PrandtlIshlinskii | Plays:
-    """Return plays with given ``thresholds``, V, or that many; without any, the density."""
-    if thresholds is None:
-        return PrandtlIshlinskii()
-    return Plays(checked_thresholds(thresholds))
 
 
 def checked_thresholds(thresholds: int | Sequence[float]) -> int | tuple[float, ...]:
