@@ -17,15 +17,19 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.compiled import bouc_wen
+from bwbayes.inference.compiled import bells, bouc_wen, exponential, lines
+from bwbayes.inference.compiled.extrema import Plan
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
+from bwbayes.model.operators.preisach import Preisach
 
 __all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
 
-GIVEN, BOUC_WEN = range(2)
+GIVEN, BOUC_WEN, EXPONENTIAL, LINES, BELLS = range(5)
 
 
 class Stage(NamedTuple):
@@ -51,8 +55,41 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
     return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
 
 
+def _exponential(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models."""
+    del operator
+    plan = Plan.of(voltage, memory)
+    own = exponential.rows(column, plan, memory)
+    able = np.ones(len(own), dtype=bool)
+    return Stage(EXPONENTIAL, able, memory.displacement, own, plan.rows)
+
+
+def _lines(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take models that share their thresholds."""
+    assert isinstance(operator, Plays | MaxwellSlip)
+    plan, of = Plan.of(voltage, memory), operator.lines(column)
+    own = lines.rows(of, plan, memory)
+    able = np.full(len(own), len(of.corners) == 1)
+    return Stage(LINES, able, memory.displacement, own, lines.planned(of, plan, voltage))
+
+
+def _bells(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take models whose saturation is not out of all proportion to the voltage."""
+    del operator
+    plan = Plan.of(voltage, memory)
+    own = bells.rows(column, plan, memory)
+    highest = float(np.max(np.abs(voltage)))
+    ratio = highest / column["saturation"]
+    able = (ratio > bells.FARTHEST) & (ratio < bells.NEAREST)
+    return Stage(BELLS, able, memory.displacement, own, plan.rows)
+
+
 STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
     BoucWen: _bouc_wen,
+    PrandtlIshlinskii: _exponential,
+    Plays: _lines,
+    MaxwellSlip: _lines,
+    Preisach: _bells,
 }
 
 
@@ -69,6 +106,12 @@ def drive_of(
     """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
     if kind == BOUC_WEN:
         bouc_wen.bouc_wen(own, voltage, first, last, out)
+    elif kind == EXPONENTIAL:
+        exponential.exponential(own, plan, voltage, first, last, out)
+    elif kind == LINES:
+        lines.lines(own, plan, voltage, first, last, out)
+    elif kind == BELLS:
+        bells.bells(own, plan, voltage, first, last, out)
     else:
         _given(own, plan, first, last, out)
 
