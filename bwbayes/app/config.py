@@ -159,8 +159,15 @@ class RecordConfig(_Source):
 class ModelConfig(_Table):
     """The model. ``hold = "auto"``: zero-order for a command, first-order for an output.
 
-    ``passive``: |gamma| <= beta, and not only beta + gamma >= 0. ``outliers``: readings far outside
-    of what their neighbours predict are set aside.
+    ``hysteresis``, ``dynamics`` and ``noise`` are names of parts, or import paths of others.
+    ``gain`` adds "quadratic" and "cubic" terms of the voltage. ``creep = true`` adds creep with a
+    lag per decade of time, a list of times in s with lags of those; with ``creep_growth`` it grows
+    with the voltage. ``outliers``: readings far outside of what their neighbours predict are set
+    aside.
+
+    Some operators have options: ``passive`` (Bouc-Wen): |gamma| <= beta, and not only
+    beta + gamma >= 0; ``thresholds`` (plays, Maxwell-slip): how many, or which, V; ``odd`` (Duhem):
+    no even terms; ``terms`` (asymmetric Bouc-Wen): which shape terms.
     """
 
     hysteresis: str = "bouc-wen"
@@ -171,6 +178,9 @@ class ModelConfig(_Table):
     hold: Literal["auto", "first", "zero"] = "auto"
     noise: str = "discrepancy"
     passive: bool | None = None
+    thresholds: int | list[float] | None = None
+    odd: bool | None = None
+    terms: list[str] | None = None
     outliers: bool = False
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from bwbayes.app.config import (
     Config,
-    ModelConfig,
     RecordConfig,
     SignalConfig,
 )
+from bwbayes.app.model import actuator_of, explicit_model
 from bwbayes.app.parameters import as_config, context_of, parameters_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
@@ -36,12 +36,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.inference.table import Table
-from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.operator import Span
-from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
 
@@ -123,24 +118,11 @@ def resolve(config: Config, folder: Path) -> Problem:
     findings = _findings(record, (*split.training, *split.held_out))
     remarks += [f"record: {finding}" for finding in findings]
     remarks += [text for name, other in others.items() for text in _unlike(config, name, other)]
-    hold = config.model.hold
-    if hold == "auto":
-        hold = "zero" if record.voltage_is == "command" else "first"
-    hysteresis = made("model.hysteresis", config.model.hysteresis, HYSTERESIS, _options(config))
-    span = Span(float(np.min(record.voltage)), float(np.max(record.voltage)))
-    actuator = Actuator(
-        config.model.dynamics,
-        hold,
-        record.interval,
-        hysteresis,
-        PolynomialGain(tuple(config.model.gain), span) if config.model.gain else None,
-        _creep(config, record, span),
-        span,
-    )
+    actuator = actuator_of(config.model, record)
     noise = noise_model(config.model.noise, record.interval)
     table, context = Table(actuator, noise), context_of(config, record, split.training)
     parameters = parameters_of(config, table.declarations, context)
-    prior = JointPrior(parameters, hysteresis.holds)
+    prior = JointPrior(parameters, actuator.hysteresis.holds)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to find; free some")
     assert record.displacement is not None
@@ -191,22 +173,6 @@ def resolve(config: Config, folder: Path) -> Problem:
         default_priors(table.declarations, context),
         findings,
     )
-
-
-def _creep(config: Config, record: Record, span: Span) -> Creep | None:
-    """Return the creep that a config asks for, if any; ``true`` takes its times from the record."""
-    model = config.model
-    if model.creep is False or model.creep == []:
-        if model.creep_growth:
-            raise InputError("model.creep_growth: there is no creep; give creep = true with it")
-        return None
-    times = creep_times(record.interval, record.duration) if model.creep is True else model.creep
-    return Creep(tuple(times), model.creep_growth, span)
-
-
-def _options(config: Config) -> dict[str, object]:
-    """Return what the config says of the hysteresis operator beside its name."""
-    return {"passive": config.model.passive}
 
 
 def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
@@ -380,17 +346,7 @@ def _explicit(
                 from_rest=config.record.from_rest,
                 outliers=outliers,
             ),
-            "model": ModelConfig(
-                dynamics=config.model.dynamics,
-                hold=config.model.hold,
-                noise=config.model.noise,
-                hysteresis=config.model.hysteresis,
-                gain=config.model.gain,
-                creep=list(creep.times) if (creep := posterior.actuator.creep) else False,
-                creep_growth=config.model.creep_growth,
-                passive=getattr(posterior.actuator.hysteresis, "passive", None),
-                outliers=config.model.outliers,
-            ),
+            "model": explicit_model(config.model, posterior.actuator),
             "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
                 update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}

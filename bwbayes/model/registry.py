@@ -14,12 +14,31 @@ from typing import Any
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
 from bwbayes.model.operator import Operator
+from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.domain_wall import DomainWall
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.jiles_atherton import JilesAtherton
+from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
+from bwbayes.model.operators.preisach import Preisach
 
 __all__ = ["DYNAMICS", "HYSTERESIS", "choose", "made"]
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
+    "bouc-wen-asymmetric": BoucWenAsymmetric,
+    "backlash-like": BacklashLike,
+    "duhem": Duhem,
+    "prandtl-ishlinskii": PrandtlIshlinskii,
+    "plays": Plays,
+    "maxwell-slip": MaxwellSlip,
+    "preisach": Preisach,
+    "krasnoselskii-pokrovskii": KrasnoselskiiPokrovskii,
+    "jiles-atherton": JilesAtherton,
+    "domain-wall": DomainWall,
 }
 
 DYNAMICS: Mapping[str, Callable[..., Filter]] = {

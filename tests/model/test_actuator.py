@@ -17,9 +17,9 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.linear import Hold
+from bwbayes.model.registry import DYNAMICS
 from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
 
-DYNAMICS: tuple[str, ...] = get_args(str)
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 # The paper's Table 1 in the package's units, with a mass that lets the second order ring.
 VALUES = {

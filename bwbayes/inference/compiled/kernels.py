@@ -10,8 +10,8 @@ a step and nothing larger than a cache is written. A few dozen samples at a time
 The second stage has three forms. Most of a record passes :func:`_settled`: each sample has a
 reading, and the filter is in its steady state. Where readings are missing, or the filter is not
 settled, or still hears of the start of the dynamics, the samples pass :func:`_exact`. An offset of
-the record's own and the start of the creep are heard all along; once their innovations only follow
-them, :func:`_tracked` adds what they need to the settled form.
+the record's own and the start of the creep are heard all along; what they need is added to the
+settled form in :mod:`bwbayes.inference.compiled.responses`.
 
 The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lanes`). This module
 needs numba; it knows arrays and nothing else.
@@ -24,18 +24,19 @@ import math
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
     A1, A2, B0, B1, B2, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT,
     LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO, SQUARES,
-    STATE, STRENGTH, SUM, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
+    STATE, STRENGTH, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
 from bwbayes.inference.compiled.parts import creep, polynomial
+from bwbayes.inference.compiled.responses import is_tracked, tracked_by
 from bwbayes.inference.compiled.stages import drive_of
 
 __all__ = ["sums"]
@@ -45,9 +46,6 @@ PIECE = 64
 
 # What is below this part of its size at the start adds nothing.
 FORGOTTEN = 1e-20
-
-# An innovation that follows its response to this part of it does not do so better.
-ROUNDING = 1e-13
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -141,93 +139,6 @@ def _exact(
                     state[pair + i] += product * state[INVERSE + i]
                 pair += LANES
     _take_logs(state)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _tracked(
-    state: FloatArray,
-    displacement: FloatArray,
-    first: int,
-    last: int,
-    drive: FloatArray,
-    left: FloatArray,
-    series: IntArray,
-) -> None:
-    """Do the settled form, with responses whose innovations follow them.
-
-    A response r that keeps the part ρ of itself from reading to reading has an innovation κ r, with
-    κ = (ρ − φ)/(ρ − a), so only Σ ρᵗ η of the residual's innovations η has to be added up; products
-    of two responses are geometric sums. ``left`` is ρ of each, ``series`` says which they are.
-    """
-    count = series.size
-    for k in range(count):
-        for i in range(LANES):
-            state[INNOVATION + series[k] * LANES + i] = 0.0
-    weight = np.ones(count)
-    for t in range(first, last):
-        y = displacement[t]
-        row = (t - first) * LANES
-        for i in range(LANES):
-            w = drive[row + i]
-            x = state[B0 + i] * w + state[X1 + i]
-            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
-            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
-            residual = y - state[LEVEL + i] - x
-            estimate = state[ESTIMATE + i]
-            innovation = residual - estimate
-            state[ESTIMATE + i] = state[DECAY + i] * estimate + state[GAIN + i] * residual
-            state[SQUARES + i] += innovation * innovation
-            state[SUM + i] = innovation
-        for k in range(count):
-            part, at = weight[k], INNOVATION + series[k] * LANES
-            for i in range(LANES):
-                state[at + i] += part * state[SUM + i]
-            weight[k] *= left[k]
-    for k in range(count):
-        at, rho = series[k] * LANES, left[k]
-        for j in range(k + 1):
-            other, sigma = series[j] * LANES, left[j]
-            both = rho * sigma
-            total = float(last - first)
-            if both < 1.0:
-                total = (1.0 - weight[k] * weight[j]) / (1.0 - both)
-            pair = PRODUCTS + (series[k] * (series[k] + 1) // 2 + series[j]) * LANES
-            for i in range(LANES):
-                own = state[KEEP_1 + at + i] * _follows(state, i, rho)
-                its = state[KEEP_1 + other + i] * _follows(state, i, sigma)
-                state[pair + i] += own * its * total / state[VARIANCE + i]
-        pair = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
-        for i in range(LANES):
-            kappa = _follows(state, i, rho)
-            pull = kappa * state[KEEP_1 + at + i] * state[INNOVATION + at + i]
-            state[pair + i] += pull / state[VARIANCE + i]
-    for k in range(count):
-        at = series[k] * LANES
-        for i in range(LANES):
-            state[KEEP_1 + at + i] *= weight[k]
-            follows = _follows(state, i, left[k])
-            state[ESTIMATE + at + i] = state[KEEP_1 + at + i] * (1.0 - follows)
-
-
-@njit(nogil=True, cache=True)
-def _follows(state: FloatArray, i: int, rho: float) -> float:
-    """Return κ, the innovation of a response that keeps ρ of itself, over the response."""
-    return float((rho - state[KEPT + i]) / (rho - state[DECAY + i]))
-
-
-@njit(nogil=True, cache=True)
-def _is_tracked(state: FloatArray, left: FloatArray, series: IntArray) -> bool:
-    """Tell whether the innovations of all those responses only follow them, to their rounding."""
-    for k in range(series.size):
-        at = series[k] * LANES
-        for i in range(LANES):
-            if left[k] <= state[DECAY + i]:
-                return False
-            keep = state[KEEP_1 + at + i]
-            apart = state[ESTIMATE + at + i] - keep * (1.0 - _follows(state, i, left[k]))
-            if not abs(apart) <= ROUNDING * abs(keep):
-                return False
-    return True
 
 
 @njit(nogil=True, cache=True)
@@ -331,12 +242,12 @@ def _group(
         if plain and series.size == 0:
             _settled(state, displacement, now, last, drive)
         elif plain:
-            _tracked(state, displacement, now, last, drive, left, series)
+            tracked_by(state, displacement, now, last, drive, left, series)
         else:
             _exact(state, displacement, skipped, now, last, drive, lags, offset, free, slow)
             settled = _is_settled(state)
             heard = heard and _is_heard(state, offset, free)
-            tracked = settled and not heard and _is_tracked(state, left, series)
+            tracked = settled and not heard and is_tracked(state, left, series)
         now = last
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]

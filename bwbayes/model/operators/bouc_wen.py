@@ -11,17 +11,24 @@ priors, not the record, say how large β is, and leave room for the value that a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.errors import InputError
 from bwbayes.model.boucwen import ceiling, hysteresis
 from bwbayes.model.declaration import Context, Declaration, Ranges, Values, lognormal, normal
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.one_state import (
+    HIGHEST_CEILING,
+    OneState,
+    alpha,
+    below_d,
+    d,
+    initial,
+    refuse,
+)
 
 __all__ = ["BoucWen"]
 
@@ -35,9 +42,6 @@ GAMMA = 4.0
 # Beyond this the hysteresis hardly changes: a prior that goes further still gets a scale for this.
 LARGEST_EXPONENT = 20.0
 
-# Stands for an infinite ceiling (β + γ = 0), um.
-HIGHEST_CEILING = 1e9
-
 # γ presses against β when more than this share of draws lies within the margin below it.
 PRESSING_SHARE = 0.25
 PRESSING_MARGIN = 0.05
@@ -46,15 +50,8 @@ PRESSING_MARGIN = 0.05
 NOT_PASSIVE = "this actuator may need a gamma beyond it: give passive = false under [model]"
 
 
-class Memory(NamedTuple):
-    """The last voltage, V, and h (models,) there, um."""
-
-    voltage: float
-    hysteretic: FloatArray
-
-
 @dataclass(frozen=True)
-class BoucWen(Operator):
+class BoucWen(OneState):
     """Bouc-Wen hysteresis, w = d u − h, for any n ≥ 1.
 
     dh = α du − β |du| h |h|^(n−1) − γ du |h|^n, rate-independent and exact
@@ -75,34 +72,8 @@ class BoucWen(Operator):
         """d, α, β, γ, n and the initial h."""
         pressed = {"lower": NOT_PASSIVE, "upper": NOT_PASSIVE} if self.passive else {}
         return (
-            Declaration(
-                "d",
-                "um/V",
-                r"d",
-                "piezoelectric coefficient",
-                # A drive that is small for the loop shows d - α, which may be half of d.
-                lambda known: lognormal(1.6 * known.ranges.gain, 0.6),
-                floor=0.0,
-                bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
-                loop=True,
-                aliases=("gain", "d33"),
-            ),
-            Declaration(
-                "alpha",
-                "um/V",
-                r"\alpha",
-                "hysteretic displacement per volt at h = 0",
-                lambda known: lognormal(0.7 * known.ranges.gain, 1.0),
-                floor=0.0,
-                bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
-                stated_bounds="0 < alpha < d",
-                pressed={
-                    "upper": "the model's slope is zero there; check the displacement's sign and "
-                    "unit, or fix alpha"
-                },
-                loop=True,
-                aliases=("a",),
-            ),
+            d(),
+            alpha(),
             Declaration(
                 "beta",
                 "1/V",
@@ -137,69 +108,32 @@ class BoucWen(Operator):
                 loop=True,
                 aliases=("n",),
             ),
-            Declaration(
-                "initial",
-                "um",
-                r"h_0",
-                "hysteretic displacement at the first sample",
-                lambda known: normal(0.0, 0.3 * known.ranges.reach),
-                bounds=_initial_bounds,
-                scope="record",
-                aliases=("h0",),
-            ),
+            replace(initial(), bounds=_initial_bounds),
         )
 
     def check(self, column: Values) -> None:
         """Raise an InputError where d is not finite; :func:`hysteresis` sees to the rest."""
-        if not np.isfinite(column["d"]).all():
-            row = int(np.argmin(np.isfinite(column["d"])))
-            raise InputError(f"d: {column['d'][row]:.6g} in model {row}; must be finite")
+        refuse(column, "d", ~np.isfinite(column["d"]), "must be finite")
 
-    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:  # noqa: ARG002  # h says all of the past
-        """Return h at the first voltage: the initial one, or what it becomes from zero volts on."""
-        if from_rest and voltage != 0:
-            shape = {name: column[name] for name in SHAPE}
-            h = hysteresis([0.0, voltage], **shape, initial=column["initial"])[:, -1]
-            return Memory(voltage, h)
-        return Memory(voltage, column["initial"])
-
-    def advance(
-        self, column: Values, voltage: FloatArray, memory: Memory
-    ) -> tuple[FloatArray, Memory]:
-        """Return w = d u − h (models, samples), and where h got to."""
-        joined = np.concatenate([[memory.voltage], voltage])
-        shape = {name: column[name] for name in SHAPE}
-        h = hysteresis(joined, **shape, initial=memory.hysteretic)[:, 1:]
-        after = Memory(float(voltage[-1]), h[:, -1].copy())
-        drive = column["d"][:, np.newaxis] * voltage
-        drive -= h
-        return drive, after
-
-    def reachable(
-        self, column: Values, voltage: float, span: Span
+    def trace(
+        self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the h (models,) that sweeps through the span leave, from below and from above.
-
-        No hysteresis at all, as after small and smaller loops, lies between.
-        """
-        low, high = span
-        shape = {name: column[name] for name in SHAPE}
-        sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
-        ends = [hysteresis(sweep, **shape)[:, -1] for sweep in sweeps]
-        return np.minimum(np.min(ends, axis=0), 0.0), np.maximum(np.max(ends, axis=0), 0.0)
+        """Return w = d u − h (models, samples), and h at the end."""
+        h = hysteresis(voltage, **{name: column[name] for name in SHAPE}, initial=state)
+        after = h[:, -1].copy()
+        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
+        return h, after
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""
         return column["d"]
 
-    def holds(self, column: Values) -> BoolArray | np.bool_:
+    def holds(self, column: Values) -> BoolArray:
         """Tell where α < d, and h does not run away from the initial state.
 
         That is where γ ≤ β, or the initial state lies below the ceiling.
         """
-        inside: BoolArray | np.bool_ = np.True_
-        if "alpha" in column and "d" in column:
-            inside = column["alpha"] < column["d"]
+        inside = below_d(column)
         names = {*SHAPE, "initial"}
         if self.passive or not names <= column.keys() or not np.any(column["initial"]):
             return inside

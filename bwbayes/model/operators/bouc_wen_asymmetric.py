@@ -9,7 +9,7 @@ closed form, so it is as exact.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -21,7 +21,16 @@ from bwbayes.model.boucwen import PIECE, _LinearFlow
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, alpha, below_d, beta, d, initial, refuse
+from bwbayes.model.operators.one_state import (
+    HIGHEST_CEILING,
+    OneState,
+    alpha,
+    below_d,
+    beta,
+    d,
+    initial_anywhere,
+    refuse,
+)
 
 __all__ = ["SIGNS", "BoucWenAsymmetric", "rates"]
 
@@ -96,8 +105,9 @@ class BoucWenAsymmetric(OneState):
             stated_bounds="|gamma| <= beta",
             loop=True,
         )
+        start = replace(initial_anywhere(), bounds=_initial_bounds)
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        return d(), alpha(), beta(0.15, _beta_bounds), gamma, *self._asymmetry(), initial()
+        return d(), alpha(), beta(0.15, _beta_bounds), gamma, *self._asymmetry(), start
 
     def _asymmetry(self) -> list[Declaration]:
         return [
@@ -197,6 +207,18 @@ def _passive(column: Values) -> BoolArray:
         gamma = np.abs(column["gamma"] + column["beta"] * fast)
         inside &= gamma <= column["beta"] * (slow + SLACK)
     return inside
+
+
+def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    """Return the ceilings of h, um: where it grows no further, with the slower of two rates."""
+    if not {"alpha", "beta", "gamma"} <= set(earlier):
+        return -np.inf, np.inf
+    tops = []
+    for s in SIGNS:
+        slowest = np.min([np.add(*rates(earlier, s, x)) for x in SIGNS], axis=0)
+        with np.errstate(divide="ignore", over="ignore"):
+            tops.append(np.minimum(earlier["alpha"] / slowest, HIGHEST_CEILING))
+    return -tops[1], tops[0]
 
 
 def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -7,7 +7,7 @@ voltage. With constants for both, it is the backlash-like model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from bwbayes.model.operators.one_state import (
     below_d,
     beta,
     d,
-    initial,
+    initial_anywhere,
     refuse,
 )
 
@@ -204,11 +204,6 @@ def phi_functions(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _one_over_factorial(order: int) -> float:
     return float(1.0 / np.prod(np.arange(1.0, order + 1.0)))
-
-
-def initial_anywhere() -> Declaration:
-    """Declare h at the first sample; the ceiling depends on the voltages, so there is no bound."""
-    return replace(initial(), bounds=None)
 
 
 def _coefficient(name: str, power: int, label: str, description: str, part: float) -> Declaration:

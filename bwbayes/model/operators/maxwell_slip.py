@@ -16,10 +16,12 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
 from bwbayes.model.operators.prandtl_ishlinskii import (
-    check_thresholds,
+    Lines,
+    checked_thresholds,
+    lines_branch,
     numbered,
     of_gain,
-    plays_branch,
+    plays_lines,
 )
 
 __all__ = ["MaxwellSlip"]
@@ -57,7 +59,7 @@ class MaxwellSlip(RemembersExtrema):
     thresholds: int | tuple[float, ...] = 10
 
     def __post_init__(self) -> None:
-        check_thresholds(self.thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -86,7 +88,11 @@ class MaxwellSlip(RemembersExtrema):
 
     def branch(self, column: Values) -> Branch:
         """Return the Everett function of the plays."""
-        return plays_branch(self.thresholds, "alpha", self._slope(column), column)
+        return lines_branch(self.lines(column))
+
+    def lines(self, column: Values) -> Lines:
+        """Return the lines that E is made of."""
+        return plays_lines(self.thresholds, "alpha", self._slope(column), column)
 
     def _slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""

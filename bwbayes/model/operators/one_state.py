@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from bwbayes.model.declaration import Declaration, Values, lognormal, normal
 from bwbayes.model.operator import Operator, Span
 
 __all__ = [
+    "HIGHEST_CEILING",
     "Memory",
     "OneState",
     "alpha",
@@ -28,6 +30,7 @@ __all__ = [
     "beta",
     "d",
     "initial",
+    "initial_anywhere",
     "refuse",
 ]
 
@@ -80,16 +83,15 @@ class OneState(Operator):
         From below and from above. No hysteresis at all, as after small and smaller loops, lies
         between.
         """
-        low, high = span
-        none = self.unbiased(column, voltage)
-        sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
-        start = np.zeros_like(none)
-        ends = [none, *(self.trace(column, np.array(sweep), start)[1] for sweep in sweeps)]
-        return np.min(ends, axis=0), np.max(ends, axis=0)
+        swept = self.swept(column, voltage, span)
+        return np.minimum(np.min(swept, axis=0), 0.0), np.maximum(np.max(swept, axis=0), 0.0)
 
-    def unbiased(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002
-        """Return the state (models,) without hysteresis at a voltage."""
-        return np.zeros_like(column["initial"])
+    def swept(self, column: Values, voltage: float, span: Span) -> list[FloatArray]:
+        """Return the states (models,) that sweeps through the span leave, from either side."""
+        low, high = span
+        sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
+        start = np.zeros_like(column["d"])
+        return [self.trace(column, np.array(sweep), start)[1] for sweep in sweeps]
 
 
 def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:
@@ -170,6 +172,11 @@ def initial() -> Declaration:
         scope="record",
         aliases=("h0",),
     )
+
+
+def initial_anywhere() -> Declaration:
+    """Declare h at the first sample; without a ceiling that all paths have."""
+    return replace(initial(), bounds=None)
 
 
 def below_ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

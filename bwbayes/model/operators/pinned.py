@@ -166,18 +166,12 @@ class Pinned(OneState, Solver):
 
         No lag, as after small and smaller loops, lies between.
         """
-        low, high = super().reachable(column, voltage, span)
-        walls = self.walls(column)
-        ends = []
-        for fixed in (low, high):
+        walls, behind = self.walls(column), []
+        for fixed in self.swept(column, voltage, span):
             p = self.at_rest(walls, fixed, np.full_like(fixed, voltage))
             level, _ = self.curve((voltage + walls.coupling * p) / walls.field)
-            ends.append(np.clip(walls.saturation * level - fixed, -walls.lag, walls.lag))
-        return np.minimum(ends[1], 0.0), np.maximum(ends[0], 0.0)
-
-    def unbiased(self, column: Values, voltage: float) -> FloatArray:
-        """Return P_irr (models,) without hysteresis at a voltage, um."""
-        return self.anhysteretic(column, voltage)
+            behind.append(np.clip(walls.saturation * level - fixed, -walls.lag, walls.lag))
+        return np.minimum(np.min(behind, axis=0), 0.0), np.maximum(np.max(behind, axis=0), 0.0)
 
     def _fixed(self, column: Values, voltage: float, behind: FloatArray) -> FloatArray:
         """Return P_irr (models,) of walls that lag ``behind`` P_an by so much (models,), um.

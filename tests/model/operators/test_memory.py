@@ -175,7 +175,7 @@ def test_densities_are_the_limit_of_many_relays(name: str, width: float) -> None
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, span=spans, cuts=st.lists(st.integers(0, 30), max_size=6))
 def test_pieces_do_not_matter(
     case: Case, voltage: FloatArray, span: Span | None, cuts: list[int]
@@ -194,7 +194,7 @@ def test_small_expressions_do_not_matter(case: Case, monkeypatch: pytest.MonkeyP
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, span=spans)
 def test_a_model_does_not_feel_its_neighbours(
     case: Case, voltage: FloatArray, span: Span | None
@@ -214,7 +214,7 @@ def test_advancing_leaves_the_memory_as_it_was(case: Case) -> None:
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, span=spans, samples=st.integers(2, 5))
 def test_pace_does_not_matter(
     case: Case, voltage: FloatArray, span: Span | None, samples: int
@@ -229,7 +229,7 @@ def test_pace_does_not_matter(
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, inside=paths)
 def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: FloatArray) -> None:
     """A detour that stays between a record's end and its turn before leaves no trace."""
@@ -244,7 +244,7 @@ def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: Flo
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(first=paths, second=paths, low=voltages, high=voltages)
 def test_loops_between_the_same_voltages_are_congruent(
     case: Case, first: FloatArray, second: FloatArray, low: float, high: float
@@ -274,7 +274,7 @@ def test_loops_elsewhere_are_alike_only_for_plays(
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths)
 def test_from_rest_it_is_odd(case: Case, voltage: FloatArray) -> None:
     there = run(case.operator, case.column, voltage, None)
@@ -284,7 +284,7 @@ def test_from_rest_it_is_odd(case: Case, voltage: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("name", INVARIANT)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, travel=st.floats(0.1, 100))
 def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
     """From a turn at the largest voltage so far it is the first curve, twice as large."""
@@ -310,7 +310,7 @@ def test_the_first_curve_rises_and_rises_faster_than_a_branch_starts(case: Case)
 
 
 @every_case
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=paths, loop=paths)
 def test_a_closed_cycle_loses_energy(case: Case, voltage: FloatArray, loop: FloatArray) -> None:
     cycle = np.concatenate([loop, loop[:1]])
@@ -323,7 +323,7 @@ def test_a_closed_cycle_loses_energy(case: Case, voltage: FloatArray, loop: Floa
 
 
 @every_case
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(voltage=voltages, span=spans.filter(bool))
 def test_the_start_goes_from_the_ascending_to_the_descending_branch(
     case: Case, voltage: float, span: Span
@@ -439,6 +439,11 @@ def test_ramps_wider_than_ten_bells_are_refused() -> None:
 def test_thresholds_that_cannot_be_are_refused(kind: type[Plays], thresholds: object) -> None:
     with pytest.raises(InputError, match=r"^thresholds: "):
         kind(thresholds)  # type: ignore[arg-type]
+
+
+def test_thresholds_may_come_as_a_config_has_them() -> None:
+    assert Plays([1, 2]) == Plays((1.0, 2.0))  # type: ignore[arg-type]
+    assert len(Plays(7).parameters) == 10
 
 
 def test_ramps_of_no_width_are_relays() -> None:

@@ -1,0 +1,100 @@
+"""What is promised of every operator in the registry, and of one from outside the package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS, made
+from tests.inference.problems import decaying_sine, posterior_of
+
+every_operator = pytest.mark.parametrize("name", HYSTERESIS)
+
+
+def posterior(name: str, *, from_rest: bool = False, parts: bool = False) -> Posterior:
+    """Return a posterior of a short record with an operator."""
+    operator = made("hysteresis", name, HYSTERESIS, {})
+    voltage = decaying_sine(300)[60:]
+    gain = PolynomialGain() if parts else None
+    creep = Creep((0.1, 1.0), growing=True) if parts else None
+    actuator = Actuator("lag", "first", 0.01, operator, gain, creep, Span(-100.0, 100.0))
+    displacement = 0.6 * voltage + np.random.default_rng(1).normal(size=voltage.size)
+    return posterior_of(voltage, displacement, actuator, "discrepancy", {}, from_rest=from_rest)
+
+
+def drawn(of: Posterior, count: int) -> FloatArray:
+    return of.prior.theta(of.prior.draw(np.random.default_rng(2), count))
+
+
+@every_operator
+@pytest.mark.parametrize("from_rest", [True, False])
+@pytest.mark.parametrize("parts", [True, False])
+def test_engines_agree(name: str, from_rest: bool, parts: bool) -> None:
+    of = posterior(name, from_rest=from_rest, parts=parts)
+    theta = drawn(of, 40)
+    one = replace(of, engine="numpy").log_likelihood(theta)
+    other = replace(of, engine="numba").log_likelihood(theta)
+    assert np.isfinite(one).all()
+    size = of.voltage.size + np.abs(one)
+    assert np.max(np.abs(one - other) / size) < 1e-10
+
+
+@every_operator
+def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
+    of = posterior(name, parts=True)
+    actuator, theta = of.likelihood.actuator, of.table.actuator(drawn(of, 5))
+    whole = actuator.displacement(theta, of.voltage)
+    state, parts = None, []
+    for first, last in ((0, 1), (1, 2), (2, 77), (77, 240)):
+        part, state = actuator.advance(theta, of.voltage[first:last], state)
+        parts.append(part)
+    size = np.ptp(whole)
+    np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, atol=1e-9 * size)
+
+
+@every_operator
+def test_states_that_are_reachable_are_inside_the_prior(name: str) -> None:
+    of = posterior(name)
+    column = of.table.columns(drawn(of, 200))
+    (initial,) = (p for p in of.prior.free if p.name == "initial")
+    low, high = initial.limits(column)
+    least, most = of.actuator.hysteresis.reachable(
+        column, float(of.voltage[0]), Span(-100.0, 100.0)
+    )
+    assert (least <= most).all()
+    slack = 1e-9 * (np.abs(least) + np.abs(most))
+    assert (least >= low - slack).all()
+    assert (most <= high + slack).all()
+
+
+@every_operator
+def test_last_declared_is_the_initial_state(name: str) -> None:
+    declarations = made("hysteresis", name, HYSTERESIS, {}).parameters
+    assert [d.name for d in declarations if d.scope == "record"] == ["initial"]
+    assert "initial" == declarations[-1].name
+    assert any(d.loop for d in declarations)
+    for one in declarations:
+        assert one.label
+        assert one.description
+        assert one.unit
+
+
+def test_an_option_that_an_operator_does_not_take_is_refused() -> None:
+    with pytest.raises(InputError, match="hysteresis: 'preisach' has no option passive"):
+        made("hysteresis", "preisach", HYSTERESIS, {"passive": False})
+
+
+def test_an_unknown_operator_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(InputError, match="did you mean preisach"):
+        made("hysteresis", "presach", HYSTERESIS, {})
+    with pytest.raises(InputError, match="cannot import 'nowhere:Loop'"):
+        made("hysteresis", "nowhere:Loop", HYSTERESIS, {})
