@@ -110,6 +110,25 @@ def test_models_beyond_the_constraint_are_refused() -> None:
         operator.check(column)
 
 
+def test_h_stays_within_its_ceilings_and_gets_near_them() -> None:
+    operator = BoucWenAsymmetric()
+    column = prior_draws(operator, 4_000, 4)
+    holds = np.flatnonzero(operator.holds(column))
+    column = {name: values[holds] for name, values in column.items()}
+    bounds = operator.parameters[-1].bounds
+    assert bounds is not None
+    low, high = (np.asarray(one) for one in bounds(column))
+    assert ((low <= column["initial"]) & (column["initial"] <= high)).all()
+    voltage = np.array([50.0, 300.0, -20.0, 1e5, 0.0, -1e5, 0.0, 1e5])
+    h = column["d"][:, np.newaxis] * voltage - w_of(operator, column, voltage)
+    slack = 1e-12 * column["d"] * 1e5 + 1e-9 * (high - low)
+    assert (h >= (low - slack)[:, np.newaxis]).all()
+    assert (h <= (high + slack)[:, np.newaxis]).all()
+    # Where the rates are such that 1e5 V lead there.
+    assert (np.max(h, axis=1) > 0.99 * high)[high < 1e4 * column["alpha"]].all()
+    assert (np.min(h, axis=1) < 0.99 * low)[-low < 1e4 * column["alpha"]].all()
+
+
 def test_an_asymmetric_loop_is_not_symmetric() -> None:
     voltage = 60 * np.sin(np.linspace(0, 20 * np.pi, 4001))
     model = {**PLAIN, **NO_TERMS, "gamma": 0.0, "b5": 0.4}

@@ -33,7 +33,7 @@ ODD = ("backlash-like", "duhem", "bouc-wen-asymmetric by the voltage", "jiles-at
 NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
 
 every = pytest.mark.parametrize("name", OPERATORS)
-few = settings(deadline=None, max_examples=6)
+few = settings(deadline=None, max_examples=10)
 corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=5)
 
 
