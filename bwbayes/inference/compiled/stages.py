@@ -17,19 +17,29 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.compiled import bells, bouc_wen, exponential, lines
+from bwbayes.inference.compiled import (
+    bells,
+    bouc_wen,
+    bouc_wen_asymmetric,
+    duhem,
+    exponential,
+    lines,
+)
 from bwbayes.inference.compiled.extrema import Plan
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
+from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 
 __all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
 
-GIVEN, BOUC_WEN, EXPONENTIAL, LINES, BELLS = range(5)
+GIVEN, BOUC_WEN, BOUC_WEN_ASYMMETRIC, DUHEM, EXPONENTIAL, LINES, BELLS = range(7)
 
 
 class Stage(NamedTuple):
@@ -84,12 +94,39 @@ def _bells(operator: Operator, column: Values, voltage: FloatArray, memory: Any)
     return Stage(BELLS, able, memory.displacement, own, plan.rows)
 
 
+def _backlash_like(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models: Bouc-Wen hysteresis with n = 1 and γ = 0."""
+    nothing = np.zeros_like(column["beta"])
+    values = {**column, "gamma": nothing, "exponent": nothing + 1}
+    return _bouc_wen(operator, values, voltage, memory)
+
+
+def _bouc_wen_asymmetric(
+    operator: Operator, column: Values, voltage: FloatArray, memory: Any
+) -> Stage:
+    del operator
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen_asymmetric.rows(column, memory.state, rest)
+    able = np.ones(rest.size, dtype=bool)
+    return Stage(BOUC_WEN_ASYMMETRIC, able, rest, own, np.empty((0, 0)))
+
+
+def _duhem(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    assert isinstance(operator, Duhem)
+    rest = operator.polynomial(column, voltage[:1])[:, 0] - memory.state
+    own = duhem.rows(column, memory.state, rest)
+    return Stage(DUHEM, np.ones(rest.size, dtype=bool), rest, own, np.empty((0, 0)))
+
+
 STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
     BoucWen: _bouc_wen,
     PrandtlIshlinskii: _exponential,
     Plays: _lines,
     MaxwellSlip: _lines,
     Preisach: _bells,
+    BacklashLike: _backlash_like,
+    BoucWenAsymmetric: _bouc_wen_asymmetric,
+    Duhem: _duhem,
 }
 
 
@@ -112,6 +149,10 @@ def drive_of(
         lines.lines(own, plan, voltage, first, last, out)
     elif kind == BELLS:
         bells.bells(own, plan, voltage, first, last, out)
+    elif kind == BOUC_WEN_ASYMMETRIC:
+        bouc_wen_asymmetric.bouc_wen_asymmetric(own, voltage, first, last, out)
+    elif kind == DUHEM:
+        duhem.duhem(own, voltage, first, last, out)
     else:
         _given(own, plan, first, last, out)
 
