@@ -68,30 +68,6 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
     return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
 
 
-def _backlash_like(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
-    """Take all models: Bouc-Wen hysteresis with n = 1 and γ = 0."""
-    nothing = np.zeros_like(column["beta"])
-    values = {**column, "gamma": nothing, "exponent": nothing + 1}
-    return _bouc_wen(operator, values, voltage, memory)
-
-
-def _bouc_wen_asymmetric(
-    operator: Operator, column: Values, voltage: FloatArray, memory: Any
-) -> Stage:
-    del operator
-    rest = column["d"] * voltage[0] - memory.state
-    own = bouc_wen_asymmetric.rows(column, memory.state, rest)
-    able = np.ones(rest.size, dtype=bool)
-    return Stage(BOUC_WEN_ASYMMETRIC, able, rest, own, np.empty((0, 0)))
-
-
-def _duhem(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
-    assert isinstance(operator, Duhem)
-    rest = operator.polynomial(column, voltage[:1])[:, 0] - memory.state
-    own = duhem.rows(column, memory.state, rest)
-    return Stage(DUHEM, np.ones(rest.size, dtype=bool), rest, own, np.empty((0, 0)))
-
-
 def _exponential(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
     """Take all models."""
     del operator
@@ -121,15 +97,39 @@ def _bells(operator: Operator, column: Values, voltage: FloatArray, memory: Any)
     return Stage(BELLS, able, memory.displacement, own, plan.rows)
 
 
+def _backlash_like(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models: Bouc-Wen hysteresis with n = 1 and γ = 0."""
+    nothing = np.zeros_like(column["beta"])
+    values = {**column, "gamma": nothing, "exponent": nothing + 1}
+    return _bouc_wen(operator, values, voltage, memory)
+
+
+def _bouc_wen_asymmetric(
+    operator: Operator, column: Values, voltage: FloatArray, memory: Any
+) -> Stage:
+    del operator
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen_asymmetric.rows(column, memory.state, rest)
+    able = np.ones(rest.size, dtype=bool)
+    return Stage(BOUC_WEN_ASYMMETRIC, able, rest, own, np.empty((0, 0)))
+
+
+def _duhem(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    assert isinstance(operator, Duhem)
+    rest = operator.polynomial(column, voltage[:1])[:, 0] - memory.state
+    own = duhem.rows(column, memory.state, rest)
+    return Stage(DUHEM, np.ones(rest.size, dtype=bool), rest, own, np.empty((0, 0)))
+
+
 STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
     BoucWen: _bouc_wen,
-    BacklashLike: _backlash_like,
-    BoucWenAsymmetric: _bouc_wen_asymmetric,
-    Duhem: _duhem,
     PrandtlIshlinskii: _exponential,
     Plays: _lines,
     MaxwellSlip: _lines,
     Preisach: _bells,
+    BacklashLike: _backlash_like,
+    BoucWenAsymmetric: _bouc_wen_asymmetric,
+    Duhem: _duhem,
 }
 
 # What makes the drive of a whole record at once, (models, samples), as the operator does.
@@ -152,16 +152,16 @@ def drive_of(
     """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
     if kind == BOUC_WEN:
         bouc_wen.bouc_wen(own, voltage, first, last, out)
-    elif kind == BOUC_WEN_ASYMMETRIC:
-        bouc_wen_asymmetric.bouc_wen_asymmetric(own, voltage, first, last, out)
-    elif kind == DUHEM:
-        duhem.duhem(own, voltage, first, last, out)
     elif kind == EXPONENTIAL:
         exponential.exponential(own, plan, voltage, first, last, out)
     elif kind == LINES:
         lines.lines(own, plan, voltage, first, last, out)
     elif kind == BELLS:
         bells.bells(own, plan, voltage, first, last, out)
+    elif kind == BOUC_WEN_ASYMMETRIC:
+        bouc_wen_asymmetric.bouc_wen_asymmetric(own, voltage, first, last, out)
+    elif kind == DUHEM:
+        duhem.duhem(own, voltage, first, last, out)
     else:
         _given(own, plan, first, last, out)
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
@@ -422,8 +423,6 @@ def test_what_cannot_be_is_refused_by_name(case: Case) -> None:
 
 def test_springs_that_hold_back_more_than_all_are_refused() -> None:
     column = rows(d=[1.3, 0.5], **SLIPPING, initial=0.0)
-    assert MaxwellSlip(VOLTS).holds(column).tolist() == [True, False]
-    assert MaxwellSlip(VOLTS).holds({"alpha_1": column["alpha_1"]}).all()
     with pytest.raises(InputError, match=r"^d: 0.5 in model 1; must not be less"):
         MaxwellSlip(VOLTS).check(column)
 
@@ -478,3 +477,21 @@ def test_ramps_keep_their_digits(saturation: float, ratio: float) -> None:
         moved = saturation * math.sinh((v - u) / saturation) / split
         expected = float(parts @ moved**2) / 4
         assert branch(u, np.array([v]))[0, 0] == pytest.approx(expected, rel=1e-10, abs=1e-300)
+
+
+@pytest.mark.parametrize("fixed", [{}, {"alpha_3": 0.4, "width": 0.3}, {"d": 1.0}])
+@pytest.mark.parametrize("operator", [MaxwellSlip(5), KrasnoselskiiPokrovskii()])
+def test_bounds_leave_only_what_the_domain_allows(
+    operator: RemembersExtrema, fixed: dict[str, float]
+) -> None:
+    """A point fit may go anywhere that the coordinates lead."""
+    known = Context(Ranges(1.0, 1.0, 0.0, 1.0))
+    parameters = []
+    for declared in operator.parameters:
+        default = fixed.get(declared.name, declared.default(known))
+        assert default is not None
+        parameters.append(Parameter.of(declared, default))
+    prior = JointPrior(parameters, operator.holds)
+    far = np.random.default_rng(3).normal(0, 4, (2000, prior.dimensions))
+    free, _ = prior.constrain(far)
+    operator.check(dict(zip(prior.names, prior.theta(free).T, strict=True)))
