@@ -157,7 +157,28 @@ def verdicts() -> str:
     )
 
 
-@pytest.mark.parametrize("finding", [coverage, calibration, kills, hostile, steady, verdicts])
+def moving() -> str:
+    every = [one for name, one in found().items() if name.startswith("moving, ")]
+    kinds, records = sum(one["cases"] for one in every), every[0]["records of each case"]
+    cells = [cell for one in every for cell in one["coverage and t"].values()]
+    parts = [100 * cell["95"][0] for cell in cells]
+    worst = max(one["largest t"] for one in every)
+    return (
+        f"{kinds} kinds of {records} records: 95 % bands cover {min(parts):.1f} to "
+        f"{max(parts):.1f} %, none of the {3 * len(cells)} bands of 50, 90 and 95 % is off by more "
+        f"than {worst:.1f} standard errors"
+    )
+
+
+def defects() -> str:
+    one = found()["defects"]
+    return f"{one['planted']} planted, {one['caught']} caught"
+
+
+FINDINGS = [coverage, calibration, kills, hostile, steady, verdicts, moving, defects]
+
+
+@pytest.mark.parametrize("finding", FINDINGS)
 def test_the_quoted_findings_are_those_of_the_last_full_run(finding: Callable[[], str]) -> None:
     assert f"| {finding()} |" in README
 

@@ -150,6 +150,6 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
     assert 0.9 < min(ratios)
     assert max(ratios) < 1.1
     tail = FALSE_ALARM / 2 / (len(inside) * len(TRUTH))
-    for level, counts in inside.items():
-        assert stats.binom.ppf(tail, RECORDS, level / 100) <= min(counts.values()), inside
-        assert stats.binom.isf(tail, RECORDS, level / 100) >= max(counts.values()), inside
+    for level, held in inside.items():
+        assert stats.binom.ppf(tail, RECORDS, level / 100) <= min(held.values()), inside
+        assert stats.binom.isf(tail, RECORDS, level / 100) >= max(held.values()), inside

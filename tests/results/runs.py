@@ -51,8 +51,9 @@ __all__ = [
 # What is enough for a test.
 CONVERGED = "\n[sampling]\ness = 400\n"
 
-# Draws around the point fit, to which a mixture is fitted; draws of the mixture; those that stay.
-PILOT, DRAWS, KEPT = 2000, 8000, 250
+# Draws of each round, to which the mixture of the next one is fitted; draws of the last; those that
+# stay. Three rounds find a tail that is several times as long as the point fit's sd says.
+PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250
 
 # No draw of the pilot weighs more than so many times the mean.
 HEAVIEST = 10.0
@@ -128,23 +129,26 @@ def weighted_draws(
     """Fit, and return draws (draws, free) in the parameters' own units and weights (draws,)."""
     point = pointfit.fit(posterior, source)
     random = np.random.RandomState(source.bit_generator)
-    around = StudentProposal(point.mode, np.linalg.cholesky(point.covariance))
-    places, ratio = _tried(posterior, around, random, PILOT)
-    if not np.isfinite(ratio).any():
-        # A fit at the edge of what is possible, as a reversed record's: the point itself.
-        places, ratio = point.mode[np.newaxis], np.zeros(1)
-    weights = np.exp(np.clip(ratio - np.max(ratio), -30, 0)) * np.isfinite(ratio)
-    weights = np.minimum(weights, HEAVIEST * np.mean(weights))
-    weights /= np.sum(weights)
-    try:
-        mixture = StudentMixture.fitted(places[source.choice(len(places), PILOT // 2, p=weights)])
-    except np.linalg.LinAlgError:
-        # The weight is all on a few draws: at such an edge too.
-        return posterior.prior.constrain(places)[0], weights
-    places, ratio = _tried(posterior, mixture, random, DRAWS)
+    proposal: StudentProposal | StudentMixture
+    proposal = StudentProposal(point.mode, np.linalg.cholesky(point.covariance))
+    for _ in range(ROUNDS):
+        places, ratio = _tried(posterior, proposal, random, PILOT)
+        if not np.isfinite(ratio).any():
+            # A fit at the edge of what is possible, as a reversed record's: the point itself.
+            places, ratio = point.mode[np.newaxis], np.zeros(1)
+        weights = np.exp(np.clip(ratio - np.max(ratio), -30, 0)) * np.isfinite(ratio)
+        weights = np.minimum(weights, HEAVIEST * np.mean(weights))
+        weights /= np.sum(weights)
+        chosen = places[source.choice(len(places), PILOT, p=weights)]
+        try:
+            proposal = StudentMixture.fitted(chosen)
+        except np.linalg.LinAlgError:
+            # The weight is all on a few draws: at such an edge too.
+            return posterior.prior.constrain(places)[0], weights
+    places, ratio = _tried(posterior, proposal, random, DRAWS)
     # A place that is not possible has a weight of next to none; arviz takes finite ones alone.
     lowest = np.min(ratio, where=np.isfinite(ratio), initial=0.0) - 100.0
-    smoothed, _ = array_stats.psislw(-np.maximum(ratio, lowest))
+    smoothed, _ = array_stats.psislw(-np.maximum(ratio, lowest))  # type: ignore[no-untyped-call]
     weights = np.exp(smoothed - np.max(smoothed)) * np.isfinite(ratio)
     return posterior.prior.constrain(places)[0], weights / np.sum(weights)
 
