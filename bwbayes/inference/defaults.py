@@ -3,7 +3,7 @@
 With Y half the range of the displacement, U half the range of the voltage and T the typical time
 from one turning point of the drive to the next, every scale of the model is known to within a
 factor of a few: d is Y/U or twice that, α a part of it, β near 1/U, a lag some thousandths of T,
-the sensor's noise some thousandth of the range, and what the model leaves over anything from
+the sensor's noise some thousandth of the range, and what the model misses anything from
 nothing to a tenth of it, correlated over about half a stretch from turn to turn. The sampling rate
 does not enter: a record and its every k-th sample have the same priors.
 
