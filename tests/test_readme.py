@@ -145,15 +145,14 @@ def steady() -> str:
 
 
 def verdicts() -> str:
-    good, spoilt = found()["good runs hold"], found()["spoilt runs do not hold"]
-    runs = {
-        sum(v for k, v in kind.items() if k in ("seen", "missed", "right"))
-        for kind in spoilt.values()
-    }
-    missed = sum(kind.get("missed", 0) for kind in spoilt.values())
+    good, spoilt = found()["good runs hold"], found()["spoilt runs do not hold"].values()
+    answers = ("seen", "right", "unsure", "missed")
+    runs = {sum(kind.get(answer, 0) for answer in answers) for kind in spoilt}
+    missed, unsure = (sum(kind.get(n, 0) for kind in spoilt) for n in ("missed", "unsure"))
+    each = " to ".join(map(str, sorted({min(runs), max(runs)})))
     return (
-        f"{len(good['said no'])} false alarms in {good['runs']} good runs; {missed} missed of "
-        f"{len(spoilt)} kinds of spoilt ones, {runs.pop()} each"
+        f"{len(good['said no'])} false alarms in {good['runs']} good runs; {missed} missed and "
+        f"{unsure} left open of {len(spoilt)} kinds of spoilt ones, {each} each"
     )
 
 
