@@ -169,12 +169,25 @@ def moving() -> str:
     )
 
 
+def nested() -> str:
+    every = [one for name, one in found().items() if name.startswith("every k-th sample")]
+    counts = [text.split(" of ") for one in every for text in one["within one sd"].values()]
+    near, compared = (sum(int(pair[i]) for pair in counts) for i in (0, 1))
+    parts = [part["95"] for one in every for part in one["covered"].values()]
+    smallest, limit = min(one["smallest p"] for one in every), every[0]["p of the family"]
+    return (
+        f"means differ as those of nested data do (smallest p {smallest:.0e}, limit {limit:.0e}); "
+        f"{near:,} of {compared:,} are within one sd; 95 % bands cover {min(parts)} to "
+        f"{max(parts)} % at every rate"
+    )
+
+
 def defects() -> str:
     one = found()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
 
 
-FINDINGS = [coverage, calibration, kills, hostile, steady, verdicts, moving, defects]
+FINDINGS = [coverage, calibration, kills, hostile, steady, verdicts, moving, nested, defects]
 
 
 @pytest.mark.parametrize("finding", FINDINGS)
