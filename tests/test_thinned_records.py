@@ -136,16 +136,11 @@ def variances(lag: float, every: int) -> dict[str, float]:
     return of_simulation(lag, every / RATE) | of_noise(every / RATE)
 
 
-def of_simulation(lag: float, interval: float) -> dict[str, float]:
-    """Return variances of the simulation's parameters at the truth, and of the unknown start's.
-
-    The inverse of DᵀC⁻¹D, with the derivatives D and the noise's covariance C = σ²R + s²I, where
-    Q = R⁻¹ has three diagonals: C⁻¹ = Q (σ²I + s²Q)⁻¹.
-    """
+def slopes(lag: float, interval: float) -> dict[str, FloatArray]:
+    """Return the simulation's derivatives (samples,) at the truth, the unknown start's too."""
     time = interval * np.arange(round(FITTED / interval), dtype=float)
     voltage, actuator = drive(time), Actuator("lag", "first", interval)
     truth = TRUTH | {"lag": lag, "exponent": 1.0, "initial": 0.0}
-    free = [name for name in actuator.parameters if name != "exponent"]
 
     def simulated(name: str, step: float) -> FloatArray:
         moved = truth[name] + step if name in PLAIN else truth[name] * np.exp(step)
@@ -153,22 +148,33 @@ def of_simulation(lag: float, interval: float) -> dict[str, float]:
         displacement: FloatArray = actuator.displacement([theta], voltage)[0]
         return displacement
 
-    steps = dict.fromkeys(free, 1e-4) | {"gamma": 1e-6, "lag": 1e-2 * lag}
-    slopes = [(simulated(n, h) - simulated(n, -h)) / (2 * h) for n, h in steps.items()]
-    derivatives = np.column_stack([*slopes, np.exp(-time / lag)])
-    kept = np.exp(-interval / truth["discrepancy_time"])
-    beside = np.full(time.size, -kept / (1 - kept**2))
-    middle = np.full(time.size, (1 + kept**2) / (1 - kept**2))
+    steps = dict.fromkeys(actuator.parameters, 1e-4) | {"gamma": 1e-6, "lag": 1e-2 * lag}
+    del steps["exponent"]
+    central = {n: (simulated(n, h) - simulated(n, -h)) / (2 * h) for n, h in steps.items()}
+    return central | {"start": np.exp(-time / lag)}
+
+
+def of_simulation(lag: float, interval: float) -> dict[str, float]:
+    """Return variances of the simulation's parameters at the truth.
+
+    The inverse of DᵀC⁻¹D, with the derivatives D and the noise's covariance C = σ²R + s²I, where
+    Q = R⁻¹ has three diagonals: C⁻¹ = Q (σ²I + s²Q)⁻¹.
+    """
+    moves = slopes(lag, interval)
+    derivatives = np.column_stack(list(moves.values()))
+    kept = np.exp(-interval / TRUTH["discrepancy_time"])
+    beside = np.full(len(derivatives), -kept / (1 - kept**2))
+    middle = np.full(len(derivatives), (1 + kept**2) / (1 - kept**2))
     middle[[0, -1]] = 1 / (1 - kept**2)
-    both = np.stack([beside, middle, beside])
-    both = SENSOR**2 * both + truth["discrepancy_sd"] ** 2 * np.array([[0.0], [1.0], [0.0]])
+    both = SENSOR**2 * np.stack([beside, middle, beside])
+    both[1] += TRUTH["discrepancy_sd"] ** 2
     solved = linalg.solve_banded((1, 1), both, derivatives)
     precise = middle[:, np.newaxis] * solved
     precise[1:] += beside[0] * solved[:-1]
     precise[:-1] += beside[0] * solved[1:]
     told = derivatives.T @ precise
     told[-1, -1] += START_SD**-2
-    return dict(zip([*free, "start"], np.diag(linalg.inv(told)), strict=True))
+    return dict(zip(moves, np.diag(linalg.inv(told)), strict=True))
 
 
 def of_noise(interval: float) -> dict[str, float]:
@@ -189,8 +195,8 @@ def of_noise(interval: float) -> dict[str, float]:
 
     truth = np.log([SENSOR, TRUTH["discrepancy_sd"], TRUTH["discrepancy_time"]])
     steps = 1e-4 * np.eye(3)
-    slopes = np.stack([(log_spectrum(truth + h) - log_spectrum(truth - h)) / 2e-4 for h in steps])
-    told = slopes @ slopes.T / 2
+    moves = np.stack([(log_spectrum(truth + h) - log_spectrum(truth - h)) / 2e-4 for h in steps])
+    told = moves @ moves.T / 2
     told[2, 2] += TIME_SIGMA**-2
     names = ("sensor_sd", "discrepancy_sd", "discrepancy_time")
     return dict(zip(names, np.diag(linalg.inv(told)), strict=True))
@@ -224,6 +230,28 @@ def nested(
         p = min(float(stats.chi2.sf(square, seeds)), float(2 * stats.norm.sf(abs(along))))
         compared[name] = Nested(square / seeds, along, p)
     return compared
+
+
+def test_the_variances_to_compare_with_are_those_of_dense_covariances() -> None:
+    """Exactly for the simulation's parameters; Whittle's are a long record's."""
+    lag, interval = LAGS[1], EVERY[-1] / RATE
+    moves = slopes(lag, interval)
+    derivatives = np.column_stack(list(moves.values()))
+    time = interval * np.arange(len(derivatives))
+    away = np.abs(time[:, np.newaxis] - time)
+    memory = TRUTH["discrepancy_time"]
+    slow = TRUTH["discrepancy_sd"] ** 2 * np.exp(-away / memory)
+    white = SENSOR**2 * np.eye(time.size)
+    inverse = linalg.inv(slow + white)
+    told = derivatives.T @ inverse @ derivatives
+    told[-1, -1] += START_SD**-2
+    expected = np.diag(linalg.inv(told))
+    np.testing.assert_allclose(list(of_simulation(lag, interval).values()), expected, 1e-6)
+    changes = [inverse @ change for change in (2 * white, 2 * slow, slow * away / memory)]
+    told = np.array([[np.sum(one * other.T) / 2 for other in changes] for one in changes])
+    told[2, 2] += TIME_SIGMA**-2
+    expected = np.diag(linalg.inv(told))
+    np.testing.assert_allclose(list(of_noise(interval).values()), expected, 0.1)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
