@@ -182,12 +182,34 @@ def nested() -> str:
     )
 
 
+def spikes() -> str:
+    one = found()["spikes set aside"]
+    least, most = one["width over clean, least and most"]
+    covered = one["covered 95"].values()
+    return (
+        f"{one['found']:,} of {one['spikes']:,} spikes and {one['good readings set aside']} good "
+        f"readings; bands {least:.2f} to {most:.2f} as wide as without; 95 % intervals of nine "
+        f"parameters cover {min(covered)} to {max(covered)} of {one['records']}"
+    )
+
+
 def defects() -> str:
     one = found()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
 
 
-FINDINGS = [coverage, calibration, kills, hostile, steady, verdicts, moving, nested, defects]
+FINDINGS = [
+    coverage,
+    calibration,
+    kills,
+    hostile,
+    steady,
+    verdicts,
+    moving,
+    nested,
+    spikes,
+    defects,
+]
 
 
 @pytest.mark.parametrize("finding", FINDINGS)
