@@ -24,6 +24,7 @@ second order, a free exponent, and the lag with little noise.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data.files import write_record
 from bwbayes.data.record import Record
+from bwbayes.data.teststand import RingBender
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.calibration import Calibration, judge
@@ -100,16 +102,7 @@ VARIANTS = {
     ),
 }
 
-TRUE = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 0.0,
-    "lag": 0.02,
-    "offset": 0.0,
-}
+TRUE = asdict(RingBender()) | {"lag": 0.02}
 
 
 def typical(

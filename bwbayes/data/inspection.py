@@ -30,7 +30,7 @@ LEAST_A_TURN = 6  # samples from one turning point of the voltage to the next
 SAME_AMPLITUDE = 0.05  # the largest less the smallest swing of the voltage, over the usual one
 LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage must explain
 
-# A decay or a trend counts if it is as large, in sds of what the loops leave over and as a part of
+# A decay or a trend counts if it is as large, in sds of what the loops miss and as a part of
 # the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
 DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 12.0, 0.1, 3.0
 START_SDS, START_PART = 20.0, 0.24

@@ -2,7 +2,7 @@
 
 A displacement follows the voltage with a lag and along hysteresis loops. :func:`fit_loop` fits a
 sum of play operators of the lagged voltage (any loop that closes is one, nearly) by least squares:
-no physics to be had from it, but what it leaves over is what no actuator does by itself.
+no physics to be had from it, but what it misses is what no actuator does by itself.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LoopFit:
     rows : array (rows,)
         The samples that were looked at, all with readings.
     residual : array (rows,), um
-        What the loops, the decay and the trend leave over.
+        What the loops, the decay and the trend do not explain.
     gain : float, um/V
         Displacement per volt of a large, slow drive.
     lag : float, s

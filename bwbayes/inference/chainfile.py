@@ -383,7 +383,7 @@ def _told(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: mend "
+            f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: fix "
             "that, then go on with `bwbayes resume`"
         ) from None
 

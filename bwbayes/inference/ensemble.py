@@ -33,7 +33,7 @@ __all__ = [
     "start",
 ]
 
-# Mersenne twister: 624 words, position, whether a normal number is left over, and that number.
+# Mersenne twister: 624 words, position, whether a normal number is kept, and that number.
 RANDOM_STATE_WORDS = 628
 
 # Starts lie this many posterior sds from an optimum, in a cluster of a fraction of one.

@@ -110,7 +110,7 @@ class _LeastSquares:
         rows = posterior.readings.rows
         self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
         self.target = posterior.displacement[self.rows]
-        # A hundredth of the range is about what a Bouc-Wen model leaves over.
+        # A hundredth of the range is about what a Bouc-Wen model misses.
         self.scale = 0.01 * float(np.ptp(self.target)) * np.sqrt(self.rows.size)
 
     def residuals(self, coordinates: FloatArray) -> FloatArray:

@@ -221,7 +221,7 @@ def _sampled(
 def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
-    Effective draws grow with the steps. Once there are enough by that, a fifth more may mend what
+    Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
     part = 1.0 if passed else FIRST_PART

@@ -392,6 +392,6 @@ def _hermite(
     b0, b1, b2, b3 = (p * d[:, 1:] for p, d in zip(powers, derivatives, strict=True))
     # What the cubic from the left end misses at the right end fixes the four upper coefficients.
     missed = (b0 - a0 - a1 - a2 - a3, b1 - a1 - 2 * a2 - 3 * a3, b2 - a2 - 3 * a3, b3 - a3)
-    mend = ((35, -15, 5, -1), (-84, 39, -14, 3), (70, -34, 13, -3), (-20, 10, -4, 1))
-    upper = (sum(m * r for m, r in zip(row, missed, strict=True)) for row in mend)
+    weights = ((35, -15, 5, -1), (-84, 39, -14, 3), (70, -34, 13, -3), (-20, 10, -4, 1))
+    upper = (sum(m * r for m, r in zip(row, missed, strict=True)) for row in weights)
     return np.stack((a0, a1, a2, a3, *upper))

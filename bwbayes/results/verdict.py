@@ -30,7 +30,7 @@ from bwbayes.results.refit import Moved
 __all__ = ["Background", "Verdict", "assess"]
 
 # A root mean square error, in parts of the range, above which a fit misses its readings: a
-# Bouc-Wen model leaves over one or two percent of an actuator's displacement.
+# Bouc-Wen model misses one or two percent of an actuator's displacement.
 POOR = 0.05
 
 # False alarms of each of the tests of coverage and size: some ten of them look at a record.

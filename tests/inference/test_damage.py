@@ -286,7 +286,7 @@ def test_full_disk_is_told_in_one_line_and_the_chain_goes_on_when_there_is_room(
 ) -> None:
     path = tmp_path / "chain.h5"
     says = (
-        ": cannot be written (File too large); no block of the chain is lost: mend that, then go "
+        ": cannot be written (File too large); no block of the chain is lost: fix that, then go "
         "on with `bwbayes resume`"
     )
     for size in (10_000, 50_000):  # not even the layout

@@ -18,7 +18,7 @@ are known to about 1.3 %, so one sd that is 5 % wrong is found six times in seve
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from types import MappingProxyType
 
@@ -28,6 +28,7 @@ from scipy import linalg, stats
 
 from bwbayes.app.workers import one_thread
 from bwbayes.arrays import FloatArray
+from bwbayes.data.teststand import RingBender
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import SamplingPlan, draws, first_chain, sample
@@ -50,17 +51,8 @@ LEVELS = (0.05, 0.5, 0.95)
 SAMPLES = 120
 WINDOWS = (slice(8, 60), slice(75, 120))
 
-TRUTH = MappingProxyType(
-    {
-        "d": 0.7,
-        "alpha": 0.3575,
-        "beta": 0.0272,
-        "gamma": 0.0172,
-        "exponent": 1.0,
-        "initial": 0.0,
-        "offset": 0.0,
-    }
-)
+TRUTH = MappingProxyType(asdict(RingBender()))
+
 # About as wide as the likelihood; the means are an sd off the truth.
 PRIOR_SDS: MappingProxyType[str, dict[str, float]] = MappingProxyType(
     {

@@ -7,7 +7,7 @@ so all that bands can get wrong is the start of the record.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
+from bwbayes.data.teststand import RingBender
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -33,20 +34,12 @@ KNOCK = 20.0
 # Draws of the start: they are spread evenly, so that few will do.
 DRAWS = 64
 
-TRUE = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 0.0,
-    "offset": 0.0,
+TRUE = asdict(RingBender()) | {
     "sensor_sd": 0.1,
     "discrepancy_time": 0.3,
     # Rings at 6 Hz, and dies out within a fifth of a second.
     "mass": 300.0,
     "damping": 3000.0,
-    "stiffness": 4.1e5,
 }
 
 

@@ -17,11 +17,11 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from tests.found import keep
+from tests.found import found, keep
 from tests.results.runs import Judged, Stand, covered, judge, problem_of
 
 RATE = 100.0
-GOOD, SPOILT = 200, 25
+GOOD, SPOILT = 400, 50
 
 # A record that holds is right where its 95 % band covers this much of it; a fit, where d and gamma
 # are so few sds from the truth.
@@ -144,8 +144,8 @@ def right(told: Judged, where: str) -> bool:
     """Tell whether the answer is right nevertheless."""
     if where != "training":
         return covered(told.bands[where]) >= COVERS
-    found = [(told.column(name), truth) for name, truth in (("d", 0.7), ("gamma", 0.0172))]
-    return all(abs(np.mean(x) - truth) < CLOSE * np.std(x) for x, truth in found)
+    columns = [(told.column(name), truth) for name, truth in (("d", 0.7), ("gamma", 0.0172))]
+    return all(abs(np.mean(x) - truth) < CLOSE * np.std(x) for x, truth in columns)
 
 
 def good_runs(seed: int, runs: int, folder: Path) -> tuple[Counter[str], list[str]]:
@@ -181,14 +181,19 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
     return counts
 
 
-@pytest.mark.parametrize(("seed", "kind"), [((2, 1), "sign"), ((20261122, 4), "transient")])
+HARDEST = [((2, 1), "sign"), ((20261122, 4), "transient"), ((20261122, 27), "transient")]
+
+
+@pytest.mark.parametrize(("seed", "kind"), HARDEST)
 def test_a_good_run_holds_and_a_spoilt_one_does_not(
     tmp_path: Path, seed: tuple[int, int], kind: str
 ) -> None:
-    """Two of the hardest: both were called good before.
+    """Three of the hardest: all were called good before.
 
     A lag of four seconds and a gain beyond all reason follow this reversed record to 4 % of its
-    range. This transient makes d 0.87 +- 0.02, and a second fit by itself is not sure enough.
+    range. The first transient makes d 0.87 +- 0.02, and a second fit by itself is not sure enough.
+    The other makes it 0.92 +- 0.02 in a record of one amplitude, which hardly tells d by itself:
+    the rest of it would have 0.698, and is six nats better off.
     """
     assert all(one.holds is not False for one in run(seed, tmp_path).verdicts.values())
     where, causes = SPOILT_KINDS[kind]
@@ -200,17 +205,18 @@ def test_a_good_run_holds_and_a_spoilt_one_does_not(
 
 @pytest.mark.slow
 def test_good_runs_hold(tmp_path: Path) -> None:
-    """At most 1 % of the verdicts of 200 good runs, three each, say no."""
+    """At most 1 % of the verdicts of 400 good runs, three each, say no."""
     counts, lines = good_runs(20261121, GOOD, tmp_path)
     keep("good runs hold", {"runs": GOOD, **counts, "said no": lines})
     assert len(lines) <= 0.01 * 3 * GOOD
 
 
 @pytest.mark.slow
-def test_no_spoilt_run_holds(tmp_path: Path) -> None:
-    """Of 25 of each kind none is missed; the cause is right in nine of ten of those seen."""
-    found = {kind: spoilt_runs(kind, 20261122, SPOILT, tmp_path) for kind in SPOILT_KINDS}
-    keep("spoilt runs do not hold", {kind: dict(counts) for kind, counts in found.items()})
-    for kind, counts in found.items():
-        assert not counts["missed"], kind
-        assert counts["right cause"] >= 0.9 * counts["seen"], kind
+@pytest.mark.parametrize("kind", SPOILT_KINDS)
+def test_no_spoilt_run_holds(tmp_path: Path, kind: str) -> None:
+    """Of 50 of each kind none is missed; the cause is right in nine of ten of those seen."""
+    counts = spoilt_runs(kind, 20261122, SPOILT, tmp_path)
+    every = found().get("spoilt runs do not hold", {})
+    keep("spoilt runs do not hold", every | {kind: dict(counts)})
+    assert not counts["missed"]
+    assert counts["right cause"] >= 0.9 * counts["seen"]
