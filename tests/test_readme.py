@@ -150,9 +150,8 @@ def verdicts() -> str:
     runs = {sum(kind.get(answer, 0) for answer in answers) for kind in spoilt}
     missed, unsure = (sum(kind.get(n, 0) for kind in spoilt) for n in ("missed", "unsure"))
     each = " to ".join(map(str, sorted({min(runs), max(runs)})))
-    alarms = len(good["said no"])
     return (
-        f"{alarms} false alarm{'s' * (alarms != 1)} in {good['runs']} good runs; {missed} missed and "
+        f"{len(good['said no'])} false alarms in {good['runs']} good runs; {missed} missed and "
         f"{unsure} left open of {len(spoilt)} kinds of spoilt ones, {each} each"
     )
 
