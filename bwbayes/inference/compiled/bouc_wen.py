@@ -19,6 +19,7 @@ C1, C2, C3, C4, C5, C6, C7 = -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040
 
 # Rows of what a model is and remembers; each name is where a row begins.
 REST, H, ALPHA, AGAINST, AHEAD, D, BEFORE, Z, PHI = (LANES * row for row in range(9))
+ROWS = 9
 
 
 def rows(column: Values, hysteretic: FloatArray, rest: FloatArray) -> FloatArray:

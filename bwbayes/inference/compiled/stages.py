@@ -17,15 +17,29 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.compiled import bouc_wen
+from bwbayes.inference.compiled import (
+    bells,
+    bouc_wen,
+    bouc_wen_asymmetric,
+    duhem,
+    exponential,
+    lines,
+)
+from bwbayes.inference.compiled.extrema import Plan
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
+from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
+from bwbayes.model.operators.preisach import Preisach
 
 __all__ = ["GIVEN", "STAGES", "Stage", "drive_of"]
 
-GIVEN, BOUC_WEN = range(2)
+GIVEN, BOUC_WEN, BOUC_WEN_ASYMMETRIC, DUHEM, EXPONENTIAL, LINES, BELLS = range(7)
 
 
 class Stage(NamedTuple):
@@ -51,8 +65,68 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
     return Stage(BOUC_WEN, able, rest, own, np.empty((0, 0)))
 
 
+def _exponential(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models."""
+    del operator
+    plan = Plan.of(voltage, memory)
+    own = exponential.rows(column, plan, memory)
+    able = np.ones(len(own), dtype=bool)
+    return Stage(EXPONENTIAL, able, memory.displacement, own, plan.rows)
+
+
+def _lines(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take models that share their thresholds."""
+    assert isinstance(operator, Plays | MaxwellSlip)
+    plan, of = Plan.of(voltage, memory), operator.lines(column)
+    own = lines.rows(of, plan, memory)
+    able = np.full(len(own), len(of.corners) == 1)
+    return Stage(LINES, able, memory.displacement, own, lines.planned(of, plan, voltage))
+
+
+def _bells(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take models whose saturation is not out of all proportion to the voltage."""
+    del operator
+    plan = Plan.of(voltage, memory)
+    own = bells.rows(column, plan, memory)
+    highest = float(np.max(np.abs(voltage)))
+    ratio = highest / column["saturation"]
+    able = (ratio > bells.FARTHEST) & (ratio < bells.NEAREST)
+    return Stage(BELLS, able, memory.displacement, own, plan.rows)
+
+
+def _backlash_like(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    """Take all models: Bouc-Wen hysteresis with n = 1 and γ = 0."""
+    nothing = np.zeros_like(column["beta"])
+    values = {**column, "gamma": nothing, "exponent": nothing + 1}
+    return _bouc_wen(operator, values, voltage, memory)
+
+
+def _bouc_wen_asymmetric(
+    operator: Operator, column: Values, voltage: FloatArray, memory: Any
+) -> Stage:
+    del operator
+    rest = column["d"] * voltage[0] - memory.state
+    own = bouc_wen_asymmetric.rows(column, memory.state, rest)
+    able = np.ones(rest.size, dtype=bool)
+    return Stage(BOUC_WEN_ASYMMETRIC, able, rest, own, np.empty((0, 0)))
+
+
+def _duhem(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
+    assert isinstance(operator, Duhem)
+    rest = operator.polynomial(column, voltage[:1])[:, 0] - memory.state
+    own = duhem.rows(column, memory.state, rest)
+    return Stage(DUHEM, np.ones(rest.size, dtype=bool), rest, own, np.empty((0, 0)))
+
+
 STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], Stage]] = {
     BoucWen: _bouc_wen,
+    PrandtlIshlinskii: _exponential,
+    Plays: _lines,
+    MaxwellSlip: _lines,
+    Preisach: _bells,
+    BacklashLike: _backlash_like,
+    BoucWenAsymmetric: _bouc_wen_asymmetric,
+    Duhem: _duhem,
 }
 
 
@@ -69,6 +143,16 @@ def drive_of(
     """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
     if kind == BOUC_WEN:
         bouc_wen.bouc_wen(own, voltage, first, last, out)
+    elif kind == EXPONENTIAL:
+        exponential.exponential(own, plan, voltage, first, last, out)
+    elif kind == LINES:
+        lines.lines(own, plan, voltage, first, last, out)
+    elif kind == BELLS:
+        bells.bells(own, plan, voltage, first, last, out)
+    elif kind == BOUC_WEN_ASYMMETRIC:
+        bouc_wen_asymmetric.bouc_wen_asymmetric(own, voltage, first, last, out)
+    elif kind == DUHEM:
+        duhem.duhem(own, voltage, first, last, out)
     else:
         _given(own, plan, first, last, out)
 

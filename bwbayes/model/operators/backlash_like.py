@@ -65,3 +65,7 @@ class BacklashLike(OneState):
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""
         return column["d"]
+
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return β U."""
+        return column["beta"] * half_range

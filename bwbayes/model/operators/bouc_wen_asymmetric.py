@@ -31,7 +31,7 @@ from bwbayes.model.operators.one_state import (
     refuse,
 )
 
-__all__ = ["BoucWenAsymmetric"]
+__all__ = ["SIGNS", "BoucWenAsymmetric", "rates"]
 
 # What each term depends on, in the order in which their bounds follow from each other.
 TERMS = {
@@ -105,7 +105,7 @@ class BoucWenAsymmetric(OneState):
             loop=True,
         )
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        return d(), alpha(), beta(0.15), gamma, *self._asymmetry(), initial_anywhere()
+        return d(), alpha(), beta(0.15, _beta_bounds), gamma, *self._asymmetry(), initial_anywhere()
 
     def _asymmetry(self) -> list[Declaration]:
         return [
@@ -158,6 +158,10 @@ class BoucWenAsymmetric(OneState):
         """Return d."""
         return column["d"]
 
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return β U."""
+        return column["beta"] * half_range
+
 
 def _follow(
     flows: dict[tuple[float, float], _LinearFlow], s: float, start: FloatArray, along: FloatArray
@@ -176,10 +180,16 @@ def _follow(
 
 def _flow(column: Values, s: float, x: float) -> _LinearFlow:
     """Return how g evolves where the voltage goes in direction s and has the sign x."""
+    slow, fast = rates(column, s, x)
+    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
+
+
+def rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
+    """Return β′ and γ′ (models,), 1/V, where the voltage goes in direction s and has the sign x."""
     slow, fast = _rates(column, s, x)
     slow = np.maximum(column["beta"] * slow, 0.0)
-    fast = np.clip(column["beta"] * fast + column["gamma"], -slow, slow)
-    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
+    # Rounding may have them beyond what is passive.
+    return slow, np.clip(column["beta"] * fast + column["gamma"], -slow, slow)
 
 
 def _rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
@@ -195,6 +205,10 @@ def _passive(column: Values) -> BoolArray:
         gamma = np.abs(column["gamma"] + column["beta"] * fast)
         inside &= gamma <= column["beta"] * (slow + SLACK)
     return inside
+
+
+def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    return np.abs(earlier.get("gamma", np.zeros(1))), np.inf
 
 
 def _within(top: ArrayLike) -> tuple[ArrayLike, ArrayLike]:

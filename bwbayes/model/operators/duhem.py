@@ -88,7 +88,7 @@ class Duhem(OneState):
             loop=True,
         )
         # The bounds of α₂ and α₁ cut the joint prior, which takes small β away.
-        first, last = (d(), gains, alpha(), beta(0.3), strengths), initial_anywhere()
+        first, last = (d(), gains, alpha(), beta(0.3, _beta_bounds), strengths), initial_anywhere()
         if self.odd:
             return *first, last
         even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient", 0.1)
@@ -149,7 +149,7 @@ class Duhem(OneState):
             step *= v
             np.add(start, step, out=h[:, first + 1 : last + 1])
         after = h[:, -1].copy()
-        np.subtract(self._gain(column, voltage), h, out=h)
+        np.subtract(self.polynomial(column, voltage), h, out=h)
         return h, after
 
     def _about(self, column: Values, u: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,7 +158,7 @@ class Duhem(OneState):
         alpha1 = 0.0 if self.odd else column["alpha1"]
         return alpha0 + u * (alpha1 + u * alpha2), alpha1 + 2 * u * alpha2, alpha2
 
-    def _gain(self, column: Values, voltage: FloatArray) -> FloatArray:
+    def polynomial(self, column: Values, voltage: FloatArray) -> FloatArray:
         """Return f (models, samples), um."""
         curve = column["d3"][:, np.newaxis] * voltage
         if not self.odd:
@@ -174,6 +174,10 @@ class Duhem(OneState):
         even = 0.0 if self.odd else column["d2"]
         mean = column["d"] + even * (low + high)
         return np.asarray(mean + column["d3"] * (low**2 + low * high + high**2))
+
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return β U."""
+        return column["beta"] * half_range
 
 
 def phi_functions(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -222,6 +226,12 @@ def _farthest(known: Context) -> float:
 def _growth(known: Context) -> Distribution:
     scale = 0.3 * known.ranges.gain / _farthest(known) ** 2
     return Distribution("halfnormal", {"scale": rounded(scale)})
+
+
+def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    if "alpha" not in earlier or "alpha2" not in earlier:
+        return 0.0, np.inf
+    return np.sqrt(np.maximum(earlier["alpha2"], 0.0) / (4 * earlier["alpha"])), np.inf
 
 
 def _alpha2_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -8,7 +8,7 @@ Everett function, is averaged over that shift: wider bells with the same corner 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,9 @@ __all__ = ["KrasnoselskiiPokrovskii"]
 # Ramps are at most this many times wider than the density's bell: wider ones are all alike, with
 # the ramp for a bell.
 WIDEST = 10.0
+
+# A width on its bound may exceed it by rounding.
+ROUNDED = 1 + 1e-9
 
 # Beyond this many bells no relays are left: tanh is one to machine precision.
 SATURATED = 20.0
@@ -67,19 +70,21 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
             default=lambda context: lognormal(0.2 * context.ranges.voltage, 1.0),
             floor=0.0,
             reaches_floor=True,
-            bounds=lambda values: (
-                0.0,
-                WIDEST * values["saturation"] if "saturation" in values else np.inf,
-            ),
+            bounds=lambda known: (0.0, WIDEST * known.get("saturation", np.array(np.inf))),
             stated_bounds=f"width <= {WIDEST:g} saturation",
             loop=True,
         )
-        return (SLOPE, *DENSITY, width, INITIAL)
+        rayleigh, saturation = DENSITY
+        # Of a width that is fixed.
+        saturation = replace(
+            saturation, bounds=lambda known: (known.get("width", np.array(0.0)) / WIDEST, np.inf)
+        )
+        return (SLOPE, rayleigh, saturation, width, INITIAL)
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         super().check(column)
-        wide = column["width"] > WIDEST * column["saturation"]
+        wide = column["width"] > WIDEST * ROUNDED * column["saturation"]
         refuse("width", wide, column["width"], f"must be at most {WIDEST:g} times saturation")
 
     def branch(self, column: Values) -> Branch:

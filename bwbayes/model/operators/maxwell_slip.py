@@ -8,21 +8,28 @@ and the work is done by :mod:`bwbayes.model.operators.prandtl_ishlinskii`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
 from bwbayes.model.operators.prandtl_ishlinskii import (
-    check_thresholds,
+    Lines,
+    checked_thresholds,
+    lines_branch,
     numbered,
     of_gain,
-    plays_branch,
+    plays_lines,
 )
 
 __all__ = ["MaxwellSlip"]
+
+ELEMENT = "alpha_"
+
+# The slope just after a turn may be below zero by rounding, in units of d.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ class MaxwellSlip(RemembersExtrema):
     thresholds: int | tuple[float, ...] = 10
 
     def __post_init__(self) -> None:
-        check_thresholds(self.thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -69,27 +76,45 @@ class MaxwellSlip(RemembersExtrema):
             description="displacement per volt of long sweeps, when all elements slip",
             default=of_gain(1.4, 0.5),
             floor=0.0,
+            bounds=lambda known: (_held(known), np.inf),
+            stated_bounds="the sum of all alpha <= d",
             loop=True,
         )
-        return (slope, *numbered(self.thresholds, "alpha", r"\alpha", "of element"), INITIAL)
+        elements = numbered(self.thresholds, "alpha", r"\alpha", "of element")
+        return (slope, *(_below_d(one) for one in elements), INITIAL)
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         super().check(column)
+        back = self._slope(column) < -ROUNDING * column["d"]
         demand = "must not be less than the sum of all alpha, or the displacement turns back"
-        refuse("d", ~self.holds(column), column["d"], demand)
-
-    def holds(self, column: Values) -> BoolArray:
-        """Tell where Σ α_j ≤ d: the displacement goes where the voltage goes."""
-        held: BoolArray = np.asarray(self._slope(column) >= 0)
-        return held
+        refuse("d", back, column["d"], demand)
 
     def branch(self, column: Values) -> Branch:
         """Return the Everett function of the plays."""
-        return plays_branch(self.thresholds, "alpha", self._slope(column), column)
+        return lines_branch(self.lines(column))
+
+    def lines(self, column: Values) -> Lines:
+        """Return the lines that E is made of."""
+        return plays_lines(self.thresholds, "alpha", self._slope(column), column)
 
     def _slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""
-        elements = [p.name for p in self.parameters if p.name.startswith("alpha_")]
-        held = sum(column.get(name, np.array(0.0)) for name in elements)
-        return np.asarray(column.get("d", np.array(np.inf)) - held)
+        return np.asarray(column["d"] - _held(column))
+
+
+def _below_d(element: Declaration) -> Declaration:
+    """Return a declaration that leaves room for the other elements; the threshold as it is."""
+    if not element.name.startswith(ELEMENT):
+        return element
+
+    def bounds(known: Values) -> tuple[ArrayLike, ArrayLike]:
+        others = {name: values for name, values in known.items() if name != element.name}
+        return 0.0, others.get("d", np.array(np.inf)) - _held(others)
+
+    return replace(element, bounds=bounds)
+
+
+def _held(known: Values) -> FloatArray:
+    """Return Σ α_j of those that are known."""
+    return np.asarray(sum(values for name, values in known.items() if name.startswith(ELEMENT)))

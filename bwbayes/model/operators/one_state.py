@@ -9,6 +9,7 @@ drives may have left then follow.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,6 +36,9 @@ __all__ = [
 
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
+
+
+Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 
 
 class Memory(NamedTuple):
@@ -143,7 +147,7 @@ def below_d(column: Values) -> BoolArray:
     return inside
 
 
-def beta(part: float = 1.0) -> Declaration:
+def beta(part: float = 1.0, bounds: Bounds | None = None) -> Declaration:
     """Declare β, near 1/U or a ``part`` of it, where other parameters' bounds favour a large β."""
     return Declaration(
         "beta",
@@ -152,6 +156,7 @@ def beta(part: float = 1.0) -> Declaration:
         "hysteresis loop shape",
         lambda known: lognormal(part / known.ranges.voltage, 2.3),
         floor=0.0,
+        bounds=bounds,
         loop=True,
     )
 

@@ -195,6 +195,10 @@ class Pinned(OneState):
         beyond = np.abs(column["initial"]) > column["saturation"]
         refuse(column, "initial", beyond, "must lie between -saturation and saturation")
 
+    def opening(self, column: Values, half_range: float) -> FloatArray:
+        """Return U/k."""
+        return half_range / column["pinning"]
+
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # at zero volts
         """Return d."""
         return column["d"]

@@ -8,8 +8,9 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,18 @@ from bwbayes.model.declaration import Context, Declaration, Values, lognormal, r
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
 
-__all__ = ["SLOPE", "Plays", "PrandtlIshlinskii", "numbered", "plays_branch", "threshold_volts"]
+__all__ = [
+    "SLOPE",
+    "Lines",
+    "Plays",
+    "PrandtlIshlinskii",
+    "checked_thresholds",
+    "lines_branch",
+    "numbered",
+    "of_gain",
+    "plays_lines",
+    "threshold_volts",
+]
 
 
 def of_gain(part: float, sigma: float) -> Callable[[Context], Distribution]:
@@ -133,7 +145,7 @@ class Plays(RemembersExtrema):
     thresholds: int | tuple[float, ...] = 10
 
     def __post_init__(self) -> None:
-        check_thresholds(self.thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -142,21 +154,26 @@ class Plays(RemembersExtrema):
 
     def branch(self, column: Values) -> Branch:
         """Return E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0)."""
-        return plays_branch(self.thresholds, "weight", column["d"], column)
+        return lines_branch(self.lines(column))
+
+    def lines(self, column: Values) -> Lines:
+        """Return the lines that E is made of."""
+        return plays_lines(self.thresholds, "weight", column["d"], column)
 
 
-def check_thresholds(thresholds: int | tuple[float, ...]) -> None:
-    """Raise an InputError where thresholds, or their number, cannot be."""
+def checked_thresholds(thresholds: int | Sequence[float]) -> int | tuple[float, ...]:
+    """Return thresholds, or their number; raise an InputError where they cannot be."""
     if isinstance(thresholds, int):
         if thresholds < 1:
             raise InputError(f"thresholds: {thresholds} is too few; give 1 or more")
-        return
-    volts = np.array(thresholds, dtype=np.float64)
-    rising = bool(np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all())
-    if volts.size == 0 or not rising:
+        return int(thresholds)
+    volts = tuple(float(threshold) for threshold in thresholds)
+    rising = np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all()
+    if not volts or not rising:
         raise InputError(
-            f"thresholds: {list(thresholds)}; give positive volts, each larger than the one before"
+            f"thresholds: {list(volts)}; give positive volts, each larger than the one before"
         )
+    return volts
 
 
 def numbered(
@@ -204,18 +221,35 @@ def threshold_volts(thresholds: int | tuple[float, ...], column: Values) -> Floa
     return last[:, np.newaxis] * (np.arange(1, thresholds + 1) / (thresholds + 1))
 
 
-def plays_branch(
-    thresholds: int | tuple[float, ...], name: str, slope: FloatArray, column: Values
-) -> Branch:
-    """Return d v + Σ w_j max(v − 2 r_j, 0) of v = |u − u_r|, for a ``slope`` d (models,), um/V.
+class Lines(NamedTuple):
+    """What a branch of plays is between two thresholds: a straight line in its length v.
 
-    Between two thresholds it is one straight line, whatever their number.
+    ``corners`` are 2 r_j, V, (models, plays), or (1, plays) if all are alike; from as many corners
+    on, the branch is ``steepness`` v + ``level``, um/V and um, both (models, plays + 1).
     """
+
+    corners: FloatArray
+    steepness: FloatArray
+    level: FloatArray
+
+
+def plays_lines(
+    thresholds: int | tuple[float, ...], name: str, slope: FloatArray, column: Values
+) -> Lines:
+    """Return the lines d v + Σ w_j max(v − 2 r_j, 0), for a ``slope`` d (models,), um/V."""
     corners = 2 * threshold_volts(thresholds, column)
     weights = np.stack([column[f"{name}_{j + 1}"] for j in range(corners.shape[1])], axis=1)
-    steepness = np.cumsum(np.column_stack([slope, weights]), axis=1)
-    level = np.cumsum(np.column_stack([np.zeros_like(slope), -weights * corners]), axis=1)
-    rows = np.arange(slope.size)[:, np.newaxis]
+    return Lines(
+        corners,
+        steepness=np.cumsum(np.column_stack([slope, weights]), axis=1),
+        level=np.cumsum(np.column_stack([np.zeros_like(slope), -weights * corners]), axis=1),
+    )
+
+
+def lines_branch(lines: Lines) -> Branch:
+    """Return the Everett function of lines; it costs the same whatever the number of plays."""
+    corners, steepness, level = lines
+    rows = np.arange(len(steepness))[:, np.newaxis]
 
     def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
         travel = np.atleast_2d(np.abs(voltage - start))

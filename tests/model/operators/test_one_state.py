@@ -41,9 +41,8 @@ def models(operator: OneState, size: int, seed: int) -> dict[str, FloatArray]:
     """Draw models that hold from the default priors; fewer where there is an integrator to run."""
     size = min(size, 2 if size < 20 else 50) if isinstance(operator, Pinned) else size
     column = prior_draws(operator, 2 * size + 20, seed)
-    return rows(
-        column, np.flatnonzero(np.broadcast_to(operator.holds(column), 2 * size + 20))[:size]
-    )
+    holds = np.broadcast_to(operator.holds(column), column["d"].shape)
+    return rows(column, np.flatnonzero(holds)[:size])
 
 
 def rows(column: Mapping[str, FloatArray], which: object) -> dict[str, FloatArray]:

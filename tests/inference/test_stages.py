@@ -1,0 +1,80 @@
+"""The compiled stages of operators against the operators themselves, on any path of the voltage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.inference.compiled.stages import STAGES, drive_of
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.backlash_like import BacklashLike
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
+from tests.model.operators.differential import SPAN, paths, prior_draws
+
+OPERATORS: dict[str, Operator] = {
+    "backlash-like": BacklashLike(),
+    "bouc-wen-asymmetric": BoucWenAsymmetric(),
+    "duhem": Duhem(),
+    "duhem with even terms": Duhem(odd=False),
+}
+
+every = pytest.mark.parametrize("name", OPERATORS)
+
+
+def models(operator: Operator, seed: int) -> dict[str, FloatArray]:
+    """Draw as many models as there are lanes from the default priors."""
+    column = prior_draws(operator, 200, seed)
+    holds = np.flatnonzero(np.broadcast_to(operator.holds(column), 200))[:LANES]
+    return {name: values[holds] for name, values in column.items()}
+
+
+def compiled(
+    operator: Operator, column: dict[str, FloatArray], voltage: FloatArray, piece: int
+) -> FloatArray:
+    """Return w (models, samples) of the stage, run in pieces of so many samples."""
+    memory = operator.begin(column, float(voltage[0]), SPAN, from_rest=False)
+    stage = STAGES[type(operator)](operator, column, voltage, memory)
+    assert stage.able.all()
+    own = np.ascontiguousarray(stage.own.T).ravel()
+    out, parts = np.empty(piece * LANES), []
+    for first in range(0, voltage.size, piece):
+        last = min(first + piece, voltage.size)
+        drive_of(stage.kind, own, stage.plan, voltage, first, last, out)
+        parts.append(out[: (last - first) * LANES].reshape(-1, LANES).T.copy())
+    return np.hstack(parts) + stage.rest[:, np.newaxis]
+
+
+def assert_alike(name: str, voltage: FloatArray, seed: int, piece: int) -> None:
+    operator = OPERATORS[name]
+    column = models(operator, seed)
+    memory = operator.begin(column, float(voltage[0]), SPAN, from_rest=False)
+    expected = operator.advance(column, voltage, memory)[0]
+    got = compiled(operator, column, voltage, piece)
+    size = np.abs(expected).max(axis=1, keepdims=True) + np.abs(column["initial"][:, np.newaxis])
+    assert (np.abs(got - expected) <= 2e-12 * size).all()
+
+
+@every
+@pytest.mark.parametrize("path", paths())
+def test_stages_agree_with_their_operators(name: str, path: str) -> None:
+    assert_alike(name, paths()[path], 1, 64)
+
+
+@every
+@given(
+    corners=st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=9),
+    seed=st.integers(0, 9),
+    piece=st.integers(1, 5),
+    samples=st.integers(1, 4),
+)
+@settings(deadline=None, max_examples=20)
+def test_stages_agree_on_any_path(
+    name: str, corners: list[float], seed: int, piece: int, samples: int
+) -> None:
+    place = np.linspace(0, len(corners) - 1, (len(corners) - 1) * samples + 1)
+    assert_alike(name, np.interp(place, np.arange(len(corners)), corners), seed, piece)
