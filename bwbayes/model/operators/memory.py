@@ -29,7 +29,7 @@ __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refus
 PIECE = 65_536
 
 # Ranges of earlier drives that are told apart. Fewer leave steps that show; more take longer.
-REACHES = 12
+REACHES = 24
 
 
 def _initial_prior(_: Context) -> Distribution:
