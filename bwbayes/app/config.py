@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,6 +29,7 @@ from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
     "LARGEST_SEED",
+    "ActuatorConfig",
     "Config",
     "ModelConfig",
     "ParameterConfig",
@@ -110,13 +112,6 @@ class SignalConfig(_Table):
     decay_from: Annotated[float, Field(ge=0)] = 0.0
 
 
-class StandConfig(_Table):
-    """The virtual test stand that signals are run on."""
-
-    discrepancy: Literal["none", "process", "structural"] = "process"
-    sample_rate: Positive = 1000.0
-
-
 class _Source(_Table):
     """Where samples come from: a file, or a signal on the virtual test stand."""
 
@@ -156,14 +151,12 @@ class RecordConfig(_Source):
         return self
 
 
-class ModelConfig(_Table):
-    """The model. ``hold = "auto"``: zero-order for a command, first-order for an output.
+class ActuatorConfig(_Table):
+    """The parts of an actuator.
 
-    ``hysteresis``, ``dynamics`` and ``noise`` are names of parts, or import paths of others.
-    ``gain`` adds "quadratic" and "cubic" terms of the voltage. ``creep = true`` adds creep with a
-    lag per decade of time, a list of times in s with lags of those; with ``creep_growth`` it grows
-    with the voltage. ``outliers``: readings far outside of what their neighbours predict are set
-    aside.
+    ``hysteresis`` and ``dynamics`` are names or import paths. ``gain`` adds "quadratic" and "cubic"
+    terms of the voltage. ``creep = true`` adds creep with a lag per decade of time, a list of times
+    in s with lags of those; with ``creep_growth`` it grows with the voltage.
 
     Some operators have options: ``passive`` (Bouc-Wen): |gamma| <= beta, and not only
     beta + gamma >= 0; ``thresholds`` (plays, Maxwell-slip): how many, or which, V; ``odd`` (Duhem):
@@ -175,13 +168,37 @@ class ModelConfig(_Table):
     creep: bool | list[float] = False
     creep_growth: bool = False
     dynamics: str = "lag"
-    hold: Literal["auto", "first", "zero"] = "auto"
-    noise: str = "discrepancy"
     passive: bool | None = None
     thresholds: int | list[float] | None = None
     odd: bool | None = None
     terms: list[str] | None = None
+
+
+class ModelConfig(ActuatorConfig):
+    """The model: an actuator, and what is read of it.
+
+    ``hold = "auto"``: zero-order for a command, first-order for an output. ``noise`` is a name or
+    import path. ``outliers``: readings far outside of what their neighbours predict are set aside.
+    """
+
+    hold: Literal["auto", "first", "zero"] = "auto"
+    noise: str = "discrepancy"
     outliers: bool = False
+
+
+class StandModelConfig(ActuatorConfig):
+    """The actuator on the stand, by default the paper's ring bender."""
+
+    dynamics: str = "second-order"
+
+
+class StandConfig(_Table):
+    """The virtual test stand that signals are run on; ``parameters`` are true values."""
+
+    discrepancy: Literal["none", "process", "structural"] = "process"
+    sample_rate: Positive = 1000.0
+    model: StandModelConfig = StandModelConfig()
+    parameters: dict[str, float] = Field(default_factory=dict)
 
 
 class ParameterConfig(_Table):
@@ -266,6 +283,17 @@ class Config(_Table):
         return found
 
 
+TABLES: Mapping[str, type[BaseModel]] = {
+    "record": RecordConfig,
+    "stand": StandConfig,
+    "model": ModelConfig,
+    "parameters": ParameterConfig,
+    "sampling": SamplingConfig,
+    "validation": ValidationConfig,
+    "signal": SignalConfig,
+}
+
+
 def load(path: str | Path) -> Config:
     """Read a config from a TOML file.
 
@@ -346,13 +374,8 @@ def _home(place: list[str]) -> str:
     key, table = place[-1], place[0] if len(place) > 1 else ""
     if key in Config.model_fields:
         return "it belongs above the first table, or is a table of its own"
-    homes: dict[str, type[BaseModel]] = {
-        "record": RecordConfig,
-        "model": ModelConfig,
-        "sampling": SamplingConfig,
-        "stand": StandConfig,
-    }
-    names = [name for name, one in homes.items() if key in one.model_fields and name != table]
+    homes = ("record", "model", "sampling", "stand")
+    names = [name for name in homes if key in TABLES[name].model_fields and name != table]
     return f"it belongs under [{names[0]}]" if names else ""
 
 
@@ -371,16 +394,7 @@ def _is_branch(part: str) -> bool:
 def _keys_at(place: list[str]) -> list[str]:
     """Return the keys that exist at a place of a config."""
     table: type[BaseModel] = Config
-    tables: dict[str, type[BaseModel]] = {
-        "record": RecordConfig,
-        "stand": StandConfig,
-        "model": ModelConfig,
-        "parameters": ParameterConfig,
-        "sampling": SamplingConfig,
-        "validation": ValidationConfig,
-        "signal": SignalConfig,
-    }
     named = place[:1] in (["parameters"], ["validation"])
     for part in place[:1] + place[1 + named :]:
-        table = tables.get(part, table)
+        table = TABLES.get(part, table)
     return list(table.model_fields)

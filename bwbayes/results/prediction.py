@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -23,6 +23,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import State
 from bwbayes.results import mixture
 from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
@@ -174,12 +175,10 @@ def _simulated(
     start: Started, voltage: FloatArray, window: slice
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
-    state = None
+    states: Sequence[State | None] = ()
     for first in range(0, window.stop, PIECE):
         piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, state = start.actuator.advance(
-            start.model, piece, state, start.unrest, from_rest=start.from_rest
-        )
+        simulated, states = start.advance(piece, states)
         skipped = max(window.start - first, 0)
         if skipped < piece.size:
             yield first + skipped, simulated[:, skipped:]
