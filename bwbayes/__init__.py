@@ -34,6 +34,7 @@ __all__ = [
     "InputError",
     "InputWarning",
     "JointPrior",
+    "Loops",
     "Outcome",
     "Parameter",
     "PointFit",
@@ -54,6 +55,7 @@ __all__ = [
     "inspect",
     "judge",
     "load_config",
+    "measure_loops",
     "noise_model",
     "parse_config",
     "point_fit",
@@ -93,6 +95,7 @@ if TYPE_CHECKING:
     from bwbayes.model.distributions import Distribution
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
+    from bwbayes.results.loops import Loops, measure_loops
     from bwbayes.results.prediction import thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
@@ -113,6 +116,7 @@ else:
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
+        "Loops": "results.loops",
         "Outcome": "inference.sampling",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
@@ -133,6 +137,7 @@ else:
         "inspect": "data.inspection",
         "judge": "results.calibration",
         "load_config": "app.config:load",
+        "measure_loops": "results.loops",
         "noise_model": "inference.noise",
         "parse_config": "app.config:parse",
         "point_fit": "inference.pointfit:fit",

@@ -35,6 +35,7 @@ PUBLIC = {
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
+    "bwbayes.results.loops": {"Loops", "measure_loops"},
     "bwbayes.results.prediction": {"thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
     "bwbayes.results.start": {"Start"},

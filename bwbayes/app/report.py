@@ -21,6 +21,7 @@ from bwbayes.app.figures.style import title, unit_text
 from bwbayes.inference.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
+from bwbayes.results.loops import MEASURES, Loop
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
 from bwbayes.results.verdict import Verdict
@@ -38,6 +39,12 @@ CAPTIONS = {
         "Hysteresis loop",
         "Displacement against voltage; below, the marked tip enlarged. The sensor band is where "
         "new readings lie, the parameter band where the model lies.",
+    ),
+    "loops": (
+        "Major loop, minor loop and initial curve",
+        "The model driven slowly, without dynamics, creep and offset. Left: displacement against "
+        "voltage. Right: the same less the straight line between the major loop's turns, where "
+        "the 95 % bands of the parameters can be seen.",
     ),
     "bands": (
         "Along time",
@@ -119,6 +126,7 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         truth_known=any(p.name in result.truth for p in result.free),
         assumed=list(_assumed(result.parameters)),
         validation=_validation(result) if result.outcome.converged and result.scores else None,
+        loops=_loops(result),
         pictures=[
             picture(png, name, *_caption(name))
             for name, png in pictures.items()
@@ -256,6 +264,35 @@ def _validation(result: Result) -> dict[str, Any]:
         for row in zip(*columns, strict=True)
     ]
     return {"titles": [title(bands) for bands in judged], "rows": rows}
+
+
+def _loops(result: Result) -> dict[str, Any] | None:
+    """Return the table of loops: a row for each measure, mean, sd and interval for each loop."""
+    if not result.outcome.converged or result.loops is None:
+        return None
+    both = result.loops.major, result.loops.minor
+    rows = [
+        {
+            "title": title,
+            "unit": unit_text(unit),
+            "texts": [text for loop in both for text in _measured(loop, name)],
+        }
+        for name, (title, unit) in MEASURES.items()
+    ]
+    titles = [
+        f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V"
+        for name, loop in zip(("Major", "Minor"), both, strict=True)
+    ]
+    return {"titles": titles, "rows": rows, "closed": all(loop.closed for loop in both)}
+
+
+def _measured(loop: Loop, name: str) -> tuple[str, str, str]:
+    """Return mean, sd and 95 % interval of what was measured of a loop, in words."""
+    one = loop.estimates[name]
+    if one is None:
+        return UNKNOWN, UNKNOWN, UNKNOWN
+    interval = f"{digits(one.lower, one.sd)} to {digits(one.upper, one.sd)}"
+    return digits(one.mean, one.sd), digits(one.sd, one.sd), interval
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:

@@ -42,6 +42,7 @@ from bwbayes.results.bands import Bands
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.loops import measure_loops
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.refit import Moved, without_start
 from bwbayes.results.result import Result, summary
@@ -301,6 +302,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         },
         verdicts=verdicts,
         innovations=found,
+        loops=measure_loops(posterior, thinned(flat, generator(problem.config.seed, "draws"))),
         remarks=(*result.remarks, *innovations.remarks(found)),
     )
 

@@ -16,9 +16,10 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
-from bwbayes.results import innovations
+from bwbayes.results import innovations, loops
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.loops import Loops
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.verdict import Verdict
 
@@ -51,6 +52,8 @@ class Result:
         Whether the bands hold, by their name, for those with a measurement.
     innovations
         What each fitted reading brings anew, at the most probable draw; None unless converged.
+    loops
+        The loops of the actuator, measured; None unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -69,6 +72,7 @@ class Result:
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     innovations: Innovations | None = None
+    loops: Loops | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -92,7 +96,8 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters`` and ``validation`` are None unless the sampling has converged.
+    ``parameters``, ``validation``, ``innovations`` and ``loops`` are None unless the sampling has
+    converged.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -111,6 +116,7 @@ def summary(result: Result) -> dict[str, object]:
         "parameters": None,
         "validation": None,
         "innovations": None,
+        "loops": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -120,6 +126,8 @@ def summary(result: Result) -> dict[str, object]:
         }
         if result.innovations is not None:
             known["innovations"] = innovations.numbers(result.innovations)
+        if result.loops is not None:
+            known["loops"] = loops.numbers(result.loops)
     return known
 
 
