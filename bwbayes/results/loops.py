@@ -21,6 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
+from bwbayes.model.operator import Span
 
 __all__ = [
     "MEASURES",
@@ -168,9 +169,8 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
         A voltage that does not change, or an even number of points.
     """
     actuator = posterior.actuator.within(posterior.voltage)
-    span = actuator.span
-    assert span is not None
     column = posterior.table.columns(posterior.prior.theta(draws))
+    span = Span(float(np.min(posterior.voltage)), float(np.max(posterior.voltage)))
     middle, half = span.middle, span.half
     voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
     return Loops(

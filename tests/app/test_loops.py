@@ -1,0 +1,66 @@
+"""Measured loops come into summary, report and picture, and only once a run has converged."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.app.figures import draw_all
+from bwbayes.app.report import render
+from bwbayes.model.actuator import Actuator
+from bwbayes.results.loops import MEASURES, Loops, measure_loops
+from bwbayes.results.result import Result, summary
+from tests.app import example
+from tests.app.test_report import rows
+from tests.inference.problems import decaying_sine, posterior_of
+
+
+@pytest.fixture(scope="module")
+def measured() -> Loops:
+    voltage = decaying_sine(200) + 130.0  # does not go through zero
+    actuator = Actuator("lag", "first", 0.01)
+    of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
+    return measure_loops(of, of.prior.draw(np.random.default_rng(1), 30))
+
+
+def with_loops(measured: Loops, *, converged: bool = True) -> Result:
+    return dataclasses.replace(example.run(converged), loops=measured)
+
+
+def test_table_is_the_summarys(measured: Loops) -> None:
+    run = with_loops(measured)
+    kept: Any = summary(run)["loops"]
+    table = rows(render(run, summary(run), {}), "loops")
+    for name, (title, unit) in MEASURES.items():
+        *texts, shown_unit = table[title]
+        assert unit.replace("um", "µm") == shown_unit
+        for loop, cells in (("major", texts[:3]), ("minor", texts[3:])):
+            one = kept[loop][name]
+            if one is None:
+                assert ["–"] * 3 == cells
+                continue
+            shown = [float(text) for text in (cells[0], cells[1], *cells[2].split(" to "))]
+            expected = [one[key] for key in ("mean", "sd", "lower_95", "upper_95")]
+            assert expected == pytest.approx(shown, abs=0.0503 * one["sd"], rel=0)
+    assert kept["major"]["opening_um"] is None
+
+
+def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
+    figures = draw_all(with_loops(measured))
+    assert ["loop", "loops"] == list(figures)[:2]
+    whole, less = figures["loops"].axes
+    assert ["major loop", "_nolegend_", "minor loop", "_nolegend_", "initial curve"] == [
+        line.get_label() for line in whole.lines
+    ]
+    ends = [less.lines[1].get_ydata()[0], less.lines[0].get_ydata()[-1]]
+    assert [0.0, 0.0] == pytest.approx(ends, abs=1e-9)
+
+
+def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
+    run = with_loops(measured, converged=False)
+    assert summary(run)["loops"] is None
+    assert 'id="loops"' not in render(run, summary(run), {"loops": b""})
+    assert "loops" not in draw_all(run)
