@@ -36,9 +36,10 @@ PUBLIC = {
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
     "bwbayes.results.loops": {"Loops", "measure_loops"},
-    "bwbayes.results.prediction": {"thinned"},
+    "bwbayes.results.prediction": {"forecast", "thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
     "bwbayes.results.start": {"Start"},
+    "bwbayes.results.steps": {"Step", "StepResponse", "measure_step"},
     "bwbayes.results.verdict": {"Background", "Verdict", "assess"},
 }
 HOMES = {

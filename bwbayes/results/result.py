@@ -16,11 +16,12 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
-from bwbayes.results import innovations, loops
+from bwbayes.results import innovations, loops, steps
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.loops import Loops
 from bwbayes.results.scores import Scores, as_summary
+from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
 
 __all__ = ["Result", "summary"]
@@ -54,6 +55,9 @@ class Result:
         What each fitted reading brings anew, at the most probable draw; None unless converged.
     loops
         The loops of the actuator, measured; None unless converged.
+    steps
+        The responses to the steps among the records that were predicted, by name; empty unless
+        converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -73,6 +77,7 @@ class Result:
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     innovations: Innovations | None = None
     loops: Loops | None = None
+    steps: Mapping[str, StepResponse] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -96,8 +101,8 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters``, ``validation``, ``innovations`` and ``loops`` are None unless the sampling has
-    converged.
+    ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
+    None unless the sampling has converged.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -117,6 +122,7 @@ def summary(result: Result) -> dict[str, object]:
         "validation": None,
         "innovations": None,
         "loops": None,
+        "step_responses": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -128,6 +134,7 @@ def summary(result: Result) -> dict[str, object]:
             known["innovations"] = innovations.numbers(result.innovations)
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
+        known["step_responses"] = steps.numbers(result.steps)
     return known
 
 

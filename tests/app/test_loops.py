@@ -55,7 +55,8 @@ def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
     assert ["major loop", "_nolegend_", "minor loop", "_nolegend_", "initial curve"] == [
         line.get_label() for line in whole.lines
     ]
-    ends = [less.lines[1].get_ydata()[0], less.lines[0].get_ydata()[-1]]
+    falling, rising = (np.asarray(less.lines[i].get_ydata()) for i in (1, 0))
+    ends = [float(falling[0]), float(rising[-1])]
     assert [0.0, 0.0] == pytest.approx(ends, abs=1e-9)
 
 

@@ -22,6 +22,7 @@ from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.loops import draw_loops
 from bwbayes.app.figures.series import draw_bands
+from bwbayes.app.figures.steps import draw_steps
 from bwbayes.app.figures.style import STYLE
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -32,7 +33,7 @@ __all__ = ["draw_all", "draw_alone", "save", "save_one"]
 def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
-    ``loop``, ``loops``, ``bands_NAME`` for each of the result's bands, ``coverage``,
+    ``loop``, ``loops``, ``steps``, ``bands_NAME`` for each of the result's bands, ``coverage``,
     ``innovations``, ``corner``, ``trace`` and ``ranks``. Without convergence only the last two;
     without bands or a measurement to hold them against, what needs them is left out.
     """
@@ -43,6 +44,8 @@ def draw_all(result: Result) -> dict[str, Figure]:
                 figures["loop"] = draw_loop(result.bands)
             if result.loops is not None:
                 figures["loops"] = draw_loops(result.loops)
+            if result.steps:
+                figures["steps"] = draw_steps(result.steps)
             figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
             if result.scores:
                 figures["coverage"] = draw_coverage(result.bands, result.scores)
