@@ -101,15 +101,29 @@ class _Table(BaseModel):
 
 
 class SignalConfig(_Table):
-    """A voltage to be drawn up: V, Hz, s. ``decay`` is the part of the amplitude lost a second."""
+    """A voltage to be drawn up: V, Hz, s. ``decay`` is the part of the amplitude lost a second.
 
-    shape: Literal["sine", "triangle"] = "sine"
-    amplitude: Positive
-    frequency: Positive
+    "steps" has ``levels`` of ``dwell`` s each, the last one up to the end.
+    """
+
+    shape: Literal["sine", "triangle", "steps"] = "sine"
+    amplitude: Positive | None = None
+    frequency: Positive | None = None
+    levels: Annotated[list[float], Field(min_length=1)] | None = None
+    dwell: Positive | None = None
     duration: Positive
     start: Annotated[float, Field(ge=0)] = 0.0
     decay: Annotated[float, Field(ge=0)] = 0.0
     decay_from: Annotated[float, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def _of_its_shape(self) -> SignalConfig:
+        own, other = (self.levels, self.dwell), (self.amplitude, self.frequency)
+        if self.shape != "steps":
+            own, other = other, own  # type: ignore[assignment]
+        if None in own or other != (None, None):
+            raise ValueError("give levels and dwell for steps, else amplitude and frequency")
+        return self
 
 
 class _Source(_Table):
@@ -388,7 +402,7 @@ def _shown(value: object) -> str:
 
 def _is_branch(part: str) -> bool:
     """Tell the names that pydantic gives to the branches of a union from keys."""
-    return part in ("str", "float", "SignalConfig")
+    return part in ("str", "float", "SignalConfig") or part.startswith("function-after")
 
 
 def _keys_at(place: list[str]) -> list[str]:

@@ -27,7 +27,15 @@ from bwbayes.data import Record, Split, read_record
 from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
+from bwbayes.data.waveforms import (
+    Carrier,
+    Decay,
+    Sine,
+    Staircase,
+    Triangle,
+    Waveform,
+    signal,
+)
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -79,6 +87,12 @@ class Problem:
         """All parameters of the model and the noise."""
         return self.posterior.prior.parameters
 
+    @property
+    def others(self) -> dict[str, Record]:
+        """The records that are predicted, by name, besides the one that is fitted."""
+        every = {name: one.record for name, one in self.validations.items()}
+        return {name: record for name, record in every.items() if record is not None}
+
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
     """Return the generator of one purpose of a run: each has a stream of its own."""
@@ -89,9 +103,14 @@ def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config draws up."""
     if isinstance(wanted, str):
         return signal(wanted)
-    shape = Sine if wanted.shape == "sine" else Triangle
+    carrier: Carrier
+    if wanted.shape == "steps":
+        carrier = Staircase(tuple(wanted.levels or ()), wanted.dwell or 0.0)
+    else:
+        shape = Sine if wanted.shape == "sine" else Triangle
+        carrier = shape(wanted.amplitude or 0.0, wanted.frequency or 0.0)
     return Waveform(
-        shape(wanted.amplitude, wanted.frequency),
+        carrier,
         wanted.duration,
         wanted.start,
         Decay(wanted.decay_from, wanted.decay),

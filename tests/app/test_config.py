@@ -133,6 +133,13 @@ def test_a_config_is_loaded_from_a_path_or_its_text(tmp_path: Path) -> None:
             "record.signal.amplitude",
         ),
         ("[record]\nsignal = {amplitude = 1.0, frequency = 1.0}", "record.signal.duration"),
+        ("[record]\nsignal = {amplitude = 1.0, duration = 1.0}", "record.signal"),
+        ("[record]\nsignal = {shape = 'steps', levels = [1.0], duration = 1.0}", "record.signal"),
+        (
+            "[record]\nsignal = {shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0, "
+            "duration = 1.0}",
+            "record.signal",
+        ),
         (RECORD + "[stand]\ndiscrepancy = 'some'", "stand.discrepancy"),
         (RECORD + "[stand]\nsample_rate = 0.0", "stand.sample_rate"),
         (RECORD + "[model]\nhold = 'second'", "model.hold"),
