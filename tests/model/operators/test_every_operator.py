@@ -119,3 +119,26 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
         *of.actuator.hysteresis.remarks(column, of.names),
     ]
     assert all(isinstance(text, str) and text for text in remarks)
+
+
+def assert_finite(name: str, draws: int) -> None:
+    """Every draw of the default priors has a likelihood, on both engines."""
+    of = posterior(name, parts=True)
+    voltage = of.voltage[::8].copy()
+    displacement = of.displacement[::8].copy()
+    of = replace(of, voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
+    theta = drawn(of, draws)
+    for engine in ("numpy", "numba"):
+        density = replace(of, engine=engine).log_likelihood(theta)
+        assert np.isfinite(density).all()
+
+
+@every_operator
+def test_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
+    assert_finite(name, 300 if name in ("jiles-atherton", "domain-wall") else 2000)
+
+
+@pytest.mark.slow
+@every_operator
+def test_100000_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
+    assert_finite(name, 100_000)
