@@ -62,8 +62,8 @@ class StepResponse:
     """What a posterior says of a step.
 
     ``time`` (times,), s since the step; ``response`` the displacement since then, um; ``crept`` its
-    growth from 0.1 s on, percent of what it was then, nan before, and None without creep. The names
-    in ``estimates`` are those of :func:`measure_step`; a number is None if the model has none.
+    growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
+    those of :func:`measure_step`; a number is None if the model has none.
     """
 
     step: Step
@@ -140,8 +140,9 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     crept = None
     if actuator.creep is not None and held >= 10 * CREEP_FROM:
         begun = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
-        grown = 100 * (creep - begun[:, np.newaxis]) / (settled + begun)[:, np.newaxis]
-        estimates["creep_percent"] = Estimate.of(grown[:, -1] / np.log10(held / CREEP_FROM))
+        grown = creep - begun[:, np.newaxis]
+        part = 100 * grown[:, -1] / (settled + begun)
+        estimates["creep_percent"] = Estimate.of(part / np.log10(held / CREEP_FROM))
         crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
     return StepResponse(step, time, Curve.of(response), crept, estimates)
 
