@@ -18,6 +18,7 @@ from bwbayes.data.record import Record
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
+from bwbayes.model.linear import Recursion
 from bwbayes.results.loops import Curve, Estimate
 
 __all__ = [
@@ -61,8 +62,8 @@ class StepResponse:
     """What a posterior says of a step.
 
     ``time`` (times,), s since the step; ``response`` the displacement since then, um; ``crept`` its
-    growth from 0.1 s on, percent of what it was then, nan before, and None without creep. The names
-    in ``estimates`` are those of :func:`measure_step`; a number is None if the model has none.
+    growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
+    those of :func:`measure_step`; a number is None if the model has none.
     """
 
     step: Step
@@ -122,16 +123,14 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     column = posterior.table.columns(posterior.prior.theta(draws))
     nothing = np.zeros(len(draws))
     column |= {"initial": nothing, "offset": nothing}
-    full = replace(posterior.actuator.within(posterior.voltage), hold="zero")
+    actuator = replace(posterior.actuator.within(posterior.voltage), hold="zero")
     held = max(step.held, 10 * FIRST)
     time = np.geomspace(FIRST, held, round(PER_DECADE * np.log10(held / FIRST)) + 1)
-    plain = replace(full, creep=None)
-    without = _responses(plain, column, step.height, time)
-    settled = _settled(plain, column, step.height)
-    response = without if full.creep is None else _responses(full, column, step.height, time)
+    settled, without, creep = _responses(actuator, column, step.height, time)
+    response = without + creep
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
     estimates["level_um"] = Estimate.of(settled)
-    if full.filter.parameters:
+    if actuator.filter.parameters:
         part = without / settled[:, np.newaxis]
         rise = _passes(time, part, 0.9) - _passes(time, part, 0.1)
         estimates["rise_s"] = Estimate.of(rise)
@@ -139,11 +138,11 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
             100 * np.maximum(np.max(part, axis=1) - 1, 0.0)
         )
     crept = None
-    if full.creep is not None and held >= 10 * CREEP_FROM:
-        creep = response - without
+    if actuator.creep is not None and held >= 10 * CREEP_FROM:
         begun = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
-        grown = 100 * (creep - begun[:, np.newaxis]) / (settled + begun)[:, np.newaxis]
-        estimates["creep_percent"] = Estimate.of(grown[:, -1] / np.log10(held / CREEP_FROM))
+        grown = creep - begun[:, np.newaxis]
+        part = 100 * grown[:, -1] / (settled + begun)
+        estimates["creep_percent"] = Estimate.of(part / np.log10(held / CREEP_FROM))
         crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
     return StepResponse(step, time, Curve.of(response), crept, estimates)
 
@@ -157,26 +156,39 @@ def numbers(responses: Mapping[str, StepResponse]) -> dict[str, object]:
     }
 
 
-def _responses(actuator: Actuator, column: Values, height: float, time: FloatArray) -> FloatArray:
-    """Return the displacement (models, times), um, since a step from zero volts."""
-    theta = np.stack([column[name] for name in actuator.parameters], axis=1)
-    voltage = np.array([0.0, height, height])
-    return np.stack(
-        [
-            replace(actuator, interval=float(t)).displacement(theta, voltage, from_rest=True)
-            @ np.array([-1.0, 0.0, 1.0])
-            for t in time
-        ],
-        axis=1,
-    )
+def _responses(
+    actuator: Actuator, column: Values, height: float, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what a step from zero volts brings, um.
 
-
-def _settled(actuator: Actuator, column: Values, height: float) -> FloatArray:
-    """Return where dynamics settle (models,), um: what the operator and the gain say."""
-    still = replace(actuator, dynamics="none", hold="first")
+    Where the dynamics settle (models,), and the displacement since the step (models, times):
+    without creep, and what creep adds to it.
+    """
+    voltage = np.array([0.0, height])
+    still = replace(actuator, dynamics="none", hold="first", creep=None)
     theta = np.stack([column[name] for name in still.parameters], axis=1)
-    moved = still.displacement(theta, np.array([0.0, height]), from_rest=True)
-    return np.asarray(moved[:, 1] - moved[:, 0])
+    drive = still.displacement(theta, voltage, from_rest=True)
+    settled = drive[:, 1] - drive[:, 0]
+    steps = [settled]
+    if actuator.creep is not None:
+        crept = actuator.creep.drive(column, drive, voltage)
+        steps += [crept[:, 1] - crept[:, 0]] * len(actuator.creep.times)
+    parts = np.empty((2, settled.size, time.size))
+    for i, t in enumerate(time.tolist()):
+        sections = replace(actuator, interval=t).sections(column)
+        moved = [
+            gain * _after_a_sample(one) * by
+            for one, gain, by in zip(sections.recursions, sections.gains, steps, strict=True)
+        ]
+        parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))
+    return settled, parts[0], parts[1]
+
+
+def _after_a_sample(one: Recursion) -> FloatArray:
+    """Return what a recursion makes of a unit that has been held for one sample, (models,)."""
+    now, before = one.numerator[:, 0], one.numerator[:, 1]
+    passed: FloatArray = now + before - one.denominator[:, 1] * now
+    return passed
 
 
 def _passes(time: FloatArray, part: FloatArray, level: float) -> FloatArray:

@@ -339,3 +339,9 @@ def test_numbers_and_texts_survive_to_the_last_digit(
         }
     )
     assert changed == parse(dump(changed), "")
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "runs").glob("*.toml")))
+def test_the_runs_that_come_with_the_package_can_be_read(path: Path) -> None:
+    config = load(path)
+    assert parse(dump(config), "again") == config

@@ -40,8 +40,10 @@ def draw_all(result: Result) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
         if result.outcome.converged:
-            if result.bands:
-                figures["loop"] = draw_loop(result.bands)
+            # A step has no loop.
+            looped = [bands for bands in result.bands if bands.name not in result.steps]
+            if looped:
+                figures["loop"] = draw_loop(looped)
             if result.loops is not None:
                 figures["loops"] = draw_loops(result.loops)
             if result.steps:

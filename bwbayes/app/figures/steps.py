@@ -27,7 +27,9 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
     for number, (name, one) in enumerate(responses.items()):
         colour, label = COLOURS[number % len(COLOURS)], plain(f"{name}, {one.step.height:g} V")
         begun = np.abs(one.response.mean) > BEGUN * abs(float(one.response.mean[-1]))
-        first = min(first, float(one.time[int(np.argmax(begun))]))
+        # Without dynamics there is no rise to be seen.
+        start = CREEP_FROM / 10 if begun[0] else float(one.time[int(np.argmax(begun))])
+        first = min(first, start)
         for panel, curve in zip(panels, (one.response, one.crept), strict=False):
             if curve is not None:
                 panel.fill_between(
@@ -43,7 +45,7 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
     panels[0].set_title("rise")
     if creeps:
         panels[1].set_xlim(CREEP_FROM, last)
-        panels[1].set_ylabel("growth since 0.1 s (%)")
+        panels[1].set_ylabel("growth since 0.1 s (µm)")
         panels[1].set_title("creep")
     handles, labels = panels[0].get_legend_handles_labels()
     handles.append(panels[0].fill_between([], [], fc="#888888", alpha=BAND_ALPHA, lw=0))
