@@ -61,14 +61,23 @@ def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
     return parts
 
 
+def edged(part: FloatArray) -> FloatArray:
+    """Return how far a state of one of many histories is on its way, for an even part of 0 to 1.
+
+    The last sweep of an earlier drive ends, as often as not, at the record's first voltage: a
+    quarter of the states are the lowest, a quarter the highest, and half lie evenly between.
+    """
+    return np.clip(2 * part - 0.5, 0.0, 1.0)
+
+
 class States:
     """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
 
     The highest and the lowest are those that an earlier drive within the range of voltages leaves.
     """
 
-    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
-        self.table, self.theta = likelihood.table, theta
+    def __init__(self, likelihood: Likelihood, theta: FloatArray, *, alone: bool) -> None:
+        self.table, self.theta, self.alone = likelihood.table, theta, alone
         if likelihood.from_rest:
             self.low = self.high = np.zeros(len(theta))
             return
@@ -90,7 +99,8 @@ class States:
 
     def at(self, part: FloatArray) -> FloatArray:
         """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
-        return self.table.replaced(self.theta, "initial", self.low + part * (self.high - self.low))
+        way = part if self.alone else edged(part)
+        return self.table.replaced(self.theta, "initial", self.low + way * (self.high - self.low))
 
 
 class _Grid(NamedTuple):
@@ -114,8 +124,9 @@ def chosen(
     highest.
     """
     draws = np.arange(len(theta))
-    states = [States(one, theta) for one in likelihoods]
-    if len(states) == 1 and not states[0].open:
+    alone = len(likelihoods) == 1
+    states = [States(one, theta, alone=alone) for one in likelihoods]
+    if alone and not states[0].open:
         return Histories(likelihoods, np.zeros_like(draws)), states[0].at(np.zeros(draws.size))
     grids = [_grid(*both) for both in zip(likelihoods, states, strict=True)]
     which = np.zeros_like(draws)
@@ -125,6 +136,7 @@ def chosen(
         which = np.sum(weight < uniform(generator, draws.size) * weight[-1], axis=0)
     parts, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
     part = _drawn(parts, density, uniform(generator, draws.size))
+    part = part if alone else edged(part)
     low, high = (np.stack([one.ends[i] for one in states])[which, draws] for i in range(2))
     begun = likelihoods[0].table.replaced(theta, "initial", low + part * (high - low))
     return Histories(likelihoods, which), begun
