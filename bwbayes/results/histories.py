@@ -30,6 +30,9 @@ IMPROBABLE = 10.0
 # The grid is fine enough when neighbours within two nats of the best node differ by less than this.
 FINE = 1.5
 
+# Draws that say which histories are possible at all: asking every draw about each takes long.
+FEW = 50
+
 # Points between two nodes that a state is chosen from.
 BETWEEN = 8
 
@@ -125,6 +128,7 @@ def chosen(
     """
     draws = np.arange(len(theta))
     alone = len(likelihoods) == 1
+    likelihoods = _possible(likelihoods, theta)
     states = [States(one, theta, alone=alone) for one in likelihoods]
     if alone and not states[0].open:
         return Histories(likelihoods, np.zeros_like(draws)), states[0].at(np.zeros(draws.size))
@@ -140,6 +144,16 @@ def chosen(
     low, high = (np.stack([one.ends[i] for one in states])[which, draws] for i in range(2))
     begun = likelihoods[0].table.replaced(theta, "initial", low + part * (high - low))
     return Histories(likelihoods, which), begun
+
+
+def _possible(likelihoods: tuple[Likelihood, ...], theta: FloatArray) -> tuple[Likelihood, ...]:
+    """Leave out the histories that the lead-in rules out with each of a few of the draws."""
+    few = theta[:: len(theta) // FEW] if len(theta) >= 2 * FEW else theta[:0]
+    if len(likelihoods) == 1 or not few.size:
+        return likelihoods
+    told = np.stack([_grid(one, States(one, few, alone=False)).evidence for one in likelihoods])
+    possible = np.any(told > np.max(told, axis=0) - IMPROBABLE, axis=1)
+    return tuple(one for one, able in zip(likelihoods, possible, strict=True) if able)
 
 
 def _grid(likelihood: Likelihood, states: States) -> _Grid:
