@@ -30,6 +30,9 @@ IMPROBABLE = 10.0
 # The grid is fine enough when neighbours within two nats of the best node differ by less than this.
 FINE = 1.5
 
+# Draws that say which histories are possible at all: asking every draw about each takes long.
+FEW = 50
+
 # Points between two nodes that a state is chosen from.
 BETWEEN = 8
 
@@ -61,14 +64,23 @@ def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
     return parts
 
 
+def edged(part: FloatArray) -> FloatArray:
+    """Return how far a state of one of many histories is on its way, for an even part of 0 to 1.
+
+    The last sweep of an earlier drive ends, as often as not, at the record's first voltage: a
+    quarter of the states are the lowest, a quarter the highest, and half lie evenly between.
+    """
+    return np.clip(2 * part - 0.5, 0.0, 1.0)
+
+
 class States:
     """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
 
     The highest and the lowest are those that an earlier drive within the range of voltages leaves.
     """
 
-    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
-        self.table, self.theta = likelihood.table, theta
+    def __init__(self, likelihood: Likelihood, theta: FloatArray, *, alone: bool) -> None:
+        self.table, self.theta, self.alone = likelihood.table, theta, alone
         if likelihood.from_rest:
             self.low = self.high = np.zeros(len(theta))
             return
@@ -90,7 +102,8 @@ class States:
 
     def at(self, part: FloatArray) -> FloatArray:
         """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
-        return self.table.replaced(self.theta, "initial", self.low + part * (self.high - self.low))
+        way = part if self.alone else edged(part)
+        return self.table.replaced(self.theta, "initial", self.low + way * (self.high - self.low))
 
 
 class _Grid(NamedTuple):
@@ -114,8 +127,10 @@ def chosen(
     highest.
     """
     draws = np.arange(len(theta))
-    states = [States(one, theta) for one in likelihoods]
-    if len(states) == 1 and not states[0].open:
+    alone = len(likelihoods) == 1
+    likelihoods = _possible(likelihoods, theta)
+    states = [States(one, theta, alone=alone) for one in likelihoods]
+    if alone and not states[0].open:
         return Histories(likelihoods, np.zeros_like(draws)), states[0].at(np.zeros(draws.size))
     grids = [_grid(*both) for both in zip(likelihoods, states, strict=True)]
     which = np.zeros_like(draws)
@@ -125,9 +140,20 @@ def chosen(
         which = np.sum(weight < uniform(generator, draws.size) * weight[-1], axis=0)
     parts, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
     part = _drawn(parts, density, uniform(generator, draws.size))
+    part = part if alone else edged(part)
     low, high = (np.stack([one.ends[i] for one in states])[which, draws] for i in range(2))
     begun = likelihoods[0].table.replaced(theta, "initial", low + part * (high - low))
     return Histories(likelihoods, which), begun
+
+
+def _possible(likelihoods: tuple[Likelihood, ...], theta: FloatArray) -> tuple[Likelihood, ...]:
+    """Leave out the histories that the lead-in rules out with each of a few of the draws."""
+    few = theta[:: len(theta) // FEW] if len(theta) >= 2 * FEW else theta[:0]
+    if len(likelihoods) == 1 or not few.size:
+        return likelihoods
+    told = np.stack([_grid(one, States(one, few, alone=False)).evidence for one in likelihoods])
+    possible = np.any(told > np.max(told, axis=0) - IMPROBABLE, axis=1)
+    return tuple(one for one, able in zip(likelihoods, possible, strict=True) if able)
 
 
 def _grid(likelihood: Likelihood, states: States) -> _Grid:

@@ -215,9 +215,11 @@ def _unseen(
     histories = Histories(likelihoods, which)
     (sd,) = histories.each(theta, lambda one, some: (one.start_sd(some),))
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    low, high = histories.each(theta, lambda one, some: States(one, some).ends)
     part = uniform(generator, draws)
-    begun = first.table.replaced(theta, "initial", low + part * (high - low))
+    (begun,) = histories.each(
+        np.column_stack([theta, part]),
+        lambda one, some: (States(one, some[:, :-1], alone=count == 1).at(some[:, -1]),),
+    )
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(one.actuator for one in likelihoods)
     return Started(actuators, which, model, unrest, none, first.from_rest)

@@ -28,8 +28,10 @@ __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refus
 # Elements (models x samples) that one array expression handles: small enough for the cache.
 PIECE = 65_536
 
-# Ranges of earlier drives that are told apart. Fewer leave steps that show; more take longer.
-REACHES = 24
+# Ranges of earlier drives that are told apart: how far down, and how much further up they went.
+# Fewer leave steps that show; more take longer.
+REACHES = 16
+FURTHER = (0.8, 1.0, 1.25)
 
 
 def _initial_prior(_: Context) -> Distribution:
@@ -186,8 +188,19 @@ class RemembersExtrema(Operator):
 
     def earlier(self, span: Span) -> tuple[Span, ...]:
         """Return ranges about the span's middle, evenly from next to nothing to all of it."""
-        reaches = (span.half * count / REACHES for count in range(1, REACHES + 1))
-        return tuple(Span(span.middle - reach, span.middle + reach) for reach in reaches)
+        low, middle, half = span.low, span.middle, span.half
+        if not half > 0:
+            return (span,)
+        ends = [
+            (down / REACHES, min(further * down / REACHES, 1.0))
+            for down in range(1, REACHES + 1)
+            for further in FURTHER
+        ]
+        return tuple(
+            dict.fromkeys(
+                Span(max(middle - down * half, low), middle + up * half) for down, up in ends
+            )
+        )
 
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return the mean slope from the span's lowest to its highest voltage (models,), um/V."""
