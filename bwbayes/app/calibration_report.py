@@ -10,6 +10,7 @@ from itertools import product
 from typing import Any
 
 from bwbayes.app.figures.style import unit_text
+from bwbayes.app.model import in_words
 from bwbayes.app.problem import Problem
 from bwbayes.app.report import picture, symbol, template
 from bwbayes.results.bands import KINDS, LEVELS
@@ -128,7 +129,7 @@ def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]
     return [
         ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
         ("fitted, held out", f"{fitted} samples, {judged} samples"),
-        ("model", f"Bouc-Wen, dynamics {model.dynamics}, {model.hold}-order hold"),
+        ("model", in_words(model)),
         ("noise", model.noise),
         (
             "sampling",

@@ -16,7 +16,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.registry import HYSTERESIS, made
 
-__all__ = ["actuator_of", "explicit_model"]
+__all__ = ["actuator_of", "explicit_model", "in_words"]
 
 # What a config may say of a hysteresis operator beside its name.
 OPTIONS = ("passive", "thresholds", "odd", "terms")
@@ -74,3 +74,13 @@ def _chosen(operator: Operator) -> dict[str, Any]:
     """Return the options that an operator has, by name, as a config has them."""
     chosen = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in chosen.items()}
+
+
+def in_words(model: ModelConfig) -> str:
+    """Return which parts a model has, in a line."""
+    parts = [model.hysteresis]
+    if model.gain:
+        parts.append(f"{' and '.join(model.gain)} gain")
+    if model.creep:
+        parts.append("creep that grows with the voltage" if model.creep_growth else "creep")
+    return f"{', '.join(parts)}, dynamics {model.dynamics}, {model.hold} hold"

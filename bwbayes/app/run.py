@@ -25,6 +25,7 @@ from bwbayes.app.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
+from bwbayes.app.model import in_words
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
@@ -348,7 +349,7 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     return {
         "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
         "fitted": windows,
-        "model": f"Bouc-Wen, dynamics {config.model.dynamics}, {config.model.hold}-order hold",
+        "model": in_words(config.model),
         "noise": config.model.noise,
         "sampling": (
             f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
