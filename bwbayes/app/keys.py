@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 
 from bwbayes.errors import suggestion
 
-__all__ = ["Key", "described", "keys", "one_line"]
+__all__ = ["ANY", "MEANINGS", "Key", "described", "keys", "one_line"]
 
 # What people call a key of a config, and its name here.
 MEANINGS = {

@@ -219,26 +219,26 @@ class ModelConfig(Table):
     passive: Annotated[
         bool | None,
         described(
-            "bouc-wen: whether |gamma| <= beta (the default), not only beta + gamma >= 0.",
+            "For bouc-wen: whether |gamma| <= beta (the default), not only beta + gamma >= 0.",
             example="false",
         ),
     ] = None
     thresholds: Annotated[
         int | list[float] | None,
         described(
-            "plays, maxwell-slip: how many thresholds (default: 10), or which.",
+            "For plays and maxwell-slip: how many thresholds (default: 10), or which.",
             unit="V if a list",
             example="[5.0, 20.0, 60.0]",
         ),
     ] = None
     odd: Annotated[
         bool | None,
-        described("duhem: whether there are no even terms (default: false).", example="true"),
+        described("For duhem: whether there are no even terms (default: false).", example="true"),
     ] = None
     terms: Annotated[
         list[str] | None,
         described(
-            "bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all).",
+            "For bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all).",
             example='["b4", "b5"]',
         ),
     ] = None

@@ -19,7 +19,17 @@ from bwbayes.data import read_record, write_record
 from tests.app import small
 from tests.data.spoilt import looping
 
-COMMANDS = ("run", "resume", "check", "simulate", "predict", "report", "calibrate")
+COMMANDS = (
+    "run",
+    "resume",
+    "check",
+    "simulate",
+    "predict",
+    "report",
+    "calibrate",
+    "config",
+    "models",
+)
 
 
 @dataclass(frozen=True)
