@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -47,6 +47,7 @@ class SteadyState(NamedTuple):
     rate: FloatArray
 
 
+@runtime_checkable
 class Noise(Protocol):
     """A Gaussian model of the residual between a reading and the forward model."""
 
@@ -95,7 +96,7 @@ def noise_model(kind: str, interval: float) -> Noise:
     InputError
         No noise goes by that name.
     """
-    return made("noise", kind, NOISES, {"interval": interval})
+    return made("noise", kind, NOISES, {"interval": interval}, Noise)
 
 
 SENSOR_SD = Declaration(
