@@ -34,6 +34,7 @@ __all__ = [
     "InputError",
     "InputWarning",
     "JointPrior",
+    "Loops",
     "Outcome",
     "Parameter",
     "PointFit",
@@ -44,16 +45,21 @@ __all__ = [
     "SamplingPlan",
     "Scores",
     "Start",
+    "Step",
+    "StepResponse",
     "Verdict",
     "VirtualTestStand",
     "Waveform",
     "assess",
     "draws",
     "first_chain",
+    "forecast",
     "hysteresis",
     "inspect",
     "judge",
     "load_config",
+    "measure_loops",
+    "measure_step",
     "noise_model",
     "parse_config",
     "point_fit",
@@ -93,10 +99,12 @@ if TYPE_CHECKING:
     from bwbayes.model.distributions import Distribution
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
-    from bwbayes.results.prediction import thinned
+    from bwbayes.results.loops import Loops, measure_loops
+    from bwbayes.results.prediction import forecast, thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
     from bwbayes.results.start import Start
+    from bwbayes.results.steps import Step, StepResponse, measure_step
     from bwbayes.results.verdict import Background, Verdict, assess
 else:
     # The module of each name, and what it is called there if not the same.
@@ -113,6 +121,7 @@ else:
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
+        "Loops": "results.loops",
         "Outcome": "inference.sampling",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
@@ -123,16 +132,21 @@ else:
         "SamplingPlan": "inference.sampling",
         "Scores": "results.scores",
         "Start": "results.start",
+        "Step": "results.steps",
+        "StepResponse": "results.steps",
         "Verdict": "results.verdict",
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",
         "assess": "results.verdict",
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
+        "forecast": "results.prediction",
         "hysteresis": "model.boucwen",
         "inspect": "data.inspection",
         "judge": "results.calibration",
         "load_config": "app.config:load",
+        "measure_loops": "results.loops",
+        "measure_step": "results.steps",
         "noise_model": "inference.noise",
         "parse_config": "app.config:parse",
         "point_fit": "inference.pointfit:fit",

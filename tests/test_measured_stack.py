@@ -88,6 +88,23 @@ def test_white_noise_scores_worse_and_its_parameters_look_too_sure(honest: Any, 
 
 
 @pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Run the config with another operator and a gain, with default priors alone."""
+    return run(tmp_path_factory.mktemp("parts") / "out", ROOT / "runs/measured_stack_parts.toml")
+
+
+def test_parts_halve_the_error_and_the_bands(honest: Any, parts: Any) -> None:
+    """NRMSE at most 0.42 %, every sensor band within two errors, a third narrower or more."""
+    assert parts["converged"]
+    held_out = parts["validation"]["held_out"]
+    assert held_out["nrmse"] <= 0.0042
+    for level, covered in held_out["coverage"]["sensor"].items():
+        error = held_out["coverage_error"]["sensor"][level]
+        assert abs(covered - int(level) / 100) <= 2 * error, level
+    assert held_out["width_95_um"] <= 0.65 * honest["validation"]["held_out"]["width_95_um"]
+
+
+@pytest.fixture(scope="module")
 def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]

@@ -35,9 +35,11 @@ PUBLIC = {
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
-    "bwbayes.results.prediction": {"thinned"},
+    "bwbayes.results.loops": {"Loops", "measure_loops"},
+    "bwbayes.results.prediction": {"forecast", "thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
     "bwbayes.results.start": {"Start"},
+    "bwbayes.results.steps": {"Step", "StepResponse", "measure_step"},
     "bwbayes.results.verdict": {"Background", "Verdict", "assess"},
 }
 HOMES = {

@@ -35,6 +35,14 @@ FREE_TO_CHANGE = (
 )
 NAMES_FOR_PEOPLE = ("label", "description")
 
+# What chains were sampled with before a config could say it.
+UNSAID: Mapping[str, object] = {
+    "model.hysteresis": "bouc-wen",
+    "model.gain": [],
+    "model.creep": False,
+    "model.creep_growth": False,
+}
+
 
 def fingerprint(config: Config) -> str:
     """Return what a chain notes of a resolved config: its keys and values, as JSON."""
@@ -63,7 +71,7 @@ def require_same(noted: object, config: Config, chain: Path) -> None:
             f"{chain}: does not say which priors and settings it was sampled with, as chains of "
             "earlier versions did not, so nothing can be read from it safely; start a new run"
         )
-    before: dict[str, object] = json.loads(str(noted))
+    before: dict[str, object] = {**UNSAID, **json.loads(str(noted))}
     # As JSON gives them back: no tuples.
     now: dict[str, object] = json.loads(fingerprint(config))
     differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]

@@ -42,10 +42,12 @@ from bwbayes.results.bands import Bands
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.loops import measure_loops
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.refit import Moved, without_start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
+from bwbayes.results.steps import measure_steps
 from bwbayes.results.verdict import Background, Verdict, assess
 
 __all__ = [
@@ -278,6 +280,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     )
     if not outcome.converged:
         return result
+    chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
     found = innovations.innovations(posterior, best, problem.record.start)
@@ -301,6 +304,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         },
         verdicts=verdicts,
         innovations=found,
+        loops=measure_loops(posterior, chosen),
+        steps=measure_steps(posterior, chosen, problem.others),
         remarks=(*result.remarks, *innovations.remarks(found)),
     )
 
@@ -381,13 +386,8 @@ def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) 
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
-    record = problem.record
-    write_posterior(
-        folder.path / "posterior.nc",
-        result,
-        log_likelihood(problem.posterior, result),
-        record,
-    )
+    density = log_likelihood(problem.posterior, result)
+    write_posterior(folder.path / "posterior.nc", result, density, problem.record)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)

@@ -12,7 +12,7 @@ import pytest
 
 from bwbayes.app import run as module
 from bwbayes.app.config import Config, dump, load, parse
-from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
+from bwbayes.app.fingerprint import UNSAID, fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.predict import predict
 from bwbayes.app.problem import resolve
@@ -201,3 +201,14 @@ def test_other_versions_do_not_stop_a_report(
     monkeypatch.setattr(module, "versions", lambda _: installed | {"numpy": "99"})
     (remark,) = [text for text in redraw(copy).remarks if "other versions" in text]
     assert remark.endswith(", now 99")
+
+
+def test_a_chain_from_before_models_had_parts_goes_on_with_todays_default(copy: RunFolder) -> None:
+    config = load(copy.config)
+    noted = json.loads(fingerprint(config))
+    earlier = {k: v for k, v in noted.items() if k not in UNSAID}
+    assert len(noted) == len(earlier) + len(UNSAID)
+    require_same(json.dumps(earlier), config, copy.chain)
+    model = config.model.model_copy(update={"gain": ["quadratic"]})
+    with pytest.raises(InputError, match=r"model\.gain was \[\] when the chain was sampled"):
+        require_same(json.dumps(earlier), config.model_copy(update={"model": model}), copy.chain)
