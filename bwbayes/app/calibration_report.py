@@ -1,4 +1,4 @@
-"""The calibration's page: verdict, what was tested and how sharply, numbers and pictures.
+"""The page of a simulation-based calibration: verdict, tests and their power, numbers, pictures.
 
 One HTML file that needs nothing else, as the report of a run.
 """
@@ -109,10 +109,14 @@ def _bands(calibration: Calibration) -> list[dict[str, Any]]:
     """Return a row for each kind of band of held-out windows and of other records, if any."""
     rows = []
     for other, kind in product(calibration.predicted, KINDS):
-        found = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
+        coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
         of = other or "held-out samples"
         rows.append(
-            {"kind": kind, "of": of, "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in found]}
+            {
+                "kind": kind,
+                "of": of,
+                "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in coverages],
+            }
         )
     return rows
 

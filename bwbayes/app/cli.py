@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, get_args
 import click
 from rich.console import Console
 
+from bwbayes.app import lookup
 from bwbayes.app.config import LARGEST_SEED, load
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
@@ -77,8 +78,7 @@ def run(
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
-    from bwbayes.app.config import load  # noqa: PLC0415  # --help need not wait for scipy
-    from bwbayes.app.run import load_run, start  # noqa: PLC0415
+    from bwbayes.app.run import load_run, start  # noqa: PLC0415  # --help need not wait for scipy
     from bwbayes.app.screen import show_priors  # noqa: PLC0415
 
     wanted = load(config)
@@ -99,11 +99,7 @@ def run(
 @click.argument("folder", type=FILE)
 @click.option("--ess", type=click.FloatRange(1), help="A new target of effective draws.")
 @click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
-@click.option(
-    "--engine",
-    type=click.Choice(get_args(Engine)),
-    help="Go on with this engine, whatever the chain was begun with.",
-)
+@click.option("--engine", type=click.Choice(get_args(Engine)), help="Go on with this engine.")
 @workers_option
 @quiet_option
 def resume(
@@ -276,7 +272,7 @@ def calibrate(
     workers: int | None,
     quiet: bool,
 ) -> int:
-    """Calibrate the posterior of a CONFIG: fit simulated records whose truth is known.
+    """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
 
     Each replicate draws parameters from the config's prior, simulates its record anew and fits it
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
@@ -300,6 +296,10 @@ def calibrate(
     where = out or Path("results") / f"{config.stem}-calibration"
     folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
     return _calibrate(folder, None, workers, quiet)
+
+
+cli.add_command(lookup.config)
+cli.add_command(lookup.models)
 
 
 def _calibrate(

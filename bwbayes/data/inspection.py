@@ -74,6 +74,13 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     Findings are "wrong units", "no relation", "reversed sign", "swapped columns", "few readings",
     "coarse sampling", "one amplitude", "held readings", "repeated samples", "clipping", "spikes",
     "switch-on transient" and "drift". A planned voltage is looked at for its own sake alone.
+
+    Examples
+    --------
+    >>> time = np.arange(0, 6, 0.01)
+    >>> voltage = 100 * np.exp(-0.2 * time) * np.sin(2 * np.pi * time)
+    >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
+    ['reversed sign']
     """
     findings = [*_units(record), *_sampling(record), *_amplitude(record)]
     if record.displacement is None:
@@ -162,8 +169,8 @@ def _outliers(record: Record) -> IntArray:
     levels = np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    found = spikes(displacement, drive, max(SPIKE_PART * extent, 6 * resolution))
-    return rows[found] if found.size <= MOST_SPIKES * rows.size else rows[:0]
+    isolated = spikes(displacement, drive, max(SPIKE_PART * extent, 6 * resolution))
+    return rows[isolated] if isolated.size <= MOST_SPIKES * rows.size else rows[:0]
 
 
 def _spikes(record: Record, outliers: IntArray) -> Iterator[Finding]:

@@ -68,6 +68,12 @@ class Record:
     InputError
         If an array is not a vector of finite numbers (of the displacement one is enough), lengths
         differ, the interval is not a positive number, or `voltage_is` is unknown.
+
+    Examples
+    --------
+    >>> record = Record([0.0, 5.0, 10.0], [0.0, np.nan, 6.1], interval=0.01)
+    >>> record.samples, record.readings, record.duration
+    (3, 2, 0.03)
     """
 
     voltage: FloatArray
