@@ -23,8 +23,8 @@ from bwbayes.app.config import (
 from bwbayes.app.model import actuator_of, explicit_model
 from bwbayes.app.parameters import as_config, context_of, parameters_of
 from bwbayes.data import Record, Split, read_record
-from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
