@@ -31,13 +31,16 @@ __all__ = [
     "Distribution",
     "Experiment",
     "Finding",
+    "Fit",
     "InputError",
     "InputWarning",
     "JointPrior",
+    "NotConvergedError",
     "Outcome",
     "Parameter",
     "PointFit",
     "Posterior",
+    "Prediction",
     "Problem",
     "Record",
     "Replicate",
@@ -50,11 +53,13 @@ __all__ = [
     "assess",
     "draws",
     "first_chain",
+    "fit",
     "hysteresis",
     "inspect",
     "judge",
     "load_config",
     "noise_model",
+    "open_run",
     "parse_config",
     "point_fit",
     "predict_record",
@@ -62,6 +67,7 @@ __all__ = [
     "read_record",
     "replicates",
     "resolve",
+    "resume_run",
     "sample",
     "score",
     "signal",
@@ -70,17 +76,19 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from bwbayes.app.aloud import predict_record, predict_windows, resolve
+    from bwbayes.app.calls import fit, open_run, resume_run
     from bwbayes.app.config import Config
     from bwbayes.app.config import load as load_config
     from bwbayes.app.config import parse as parse_config
-    from bwbayes.app.problem import Problem
+    from bwbayes.app.fitted import Fit
+    from bwbayes.app.predictions import Prediction
+    from bwbayes.app.problem import Problem, resolve
     from bwbayes.data.files import read_record, write_record
     from bwbayes.data.inspection import Finding, inspect
     from bwbayes.data.record import Record
     from bwbayes.data.teststand import VirtualTestStand
     from bwbayes.data.waveforms import Waveform, signal
-    from bwbayes.errors import InputError, InputWarning
+    from bwbayes.errors import InputError, InputWarning, NotConvergedError
     from bwbayes.inference.chain import Chain
     from bwbayes.inference.noise import noise_model
     from bwbayes.inference.parameters import JointPrior, Parameter
@@ -93,7 +101,7 @@ if TYPE_CHECKING:
     from bwbayes.model.distributions import Distribution
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
-    from bwbayes.results.prediction import thinned
+    from bwbayes.results.prediction import predict_record, predict_windows, thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
     from bwbayes.results.start import Start
@@ -110,13 +118,16 @@ else:
         "Distribution": "model.distributions",
         "Experiment": "results.replicates",
         "Finding": "data.inspection",
+        "Fit": "app.fitted",
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
+        "NotConvergedError": "errors",
         "Outcome": "inference.sampling",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
         "Posterior": "inference.posterior",
+        "Prediction": "app.predictions",
         "Problem": "app.problem",
         "Record": "data.record",
         "Replicate": "results.replicates",
@@ -129,18 +140,21 @@ else:
         "assess": "results.verdict",
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
+        "fit": "app.calls",
         "hysteresis": "model.boucwen",
         "inspect": "data.inspection",
         "judge": "results.calibration",
         "load_config": "app.config:load",
         "noise_model": "inference.noise",
+        "open_run": "app.calls",
         "parse_config": "app.config:parse",
         "point_fit": "inference.pointfit:fit",
-        "predict_record": "app.aloud",
-        "predict_windows": "app.aloud",
+        "predict_record": "results.prediction",
+        "predict_windows": "results.prediction",
         "read_record": "data.files",
         "replicates": "results.replicates",
-        "resolve": "app.aloud",
+        "resolve": "app.problem",
+        "resume_run": "app.calls",
         "sample": "inference.sampling",
         "score": "results.scores",
         "signal": "data.waveforms",

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tomlkit
 from pydantic import (
@@ -23,17 +24,20 @@ from pydantic import (
     model_validator,
 )
 
-from bwbayes.errors import InputError, suggestion
+from bwbayes.app.wording import in_words
+from bwbayes.errors import InputError
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
     "LARGEST_SEED",
+    "TABLES",
     "Config",
     "ModelConfig",
     "ParameterConfig",
     "RecordConfig",
     "SignalConfig",
     "ValidationConfig",
+    "checked",
     "dump",
     "load",
     "parse",
@@ -45,48 +49,6 @@ LARGEST_SEED = 2**63 - 1
 # Python's TOML reader takes time and memory by the square of what it reads, or worse.
 LARGEST_FILE = 1_000_000  # bytes
 MOST_KEY_PARTS = 100
-
-# What people call a key of a config, and its name here.
-MEANINGS = {
-    "draws": "ess",
-    "samples": "ess",
-    "chains": "ensembles",
-    "iterations": "steps",
-    "budget": "steps",
-    "warmup": "pilot_steps",
-    "burn_in": "pilot_steps",
-    "path": "file",
-    "data": "file",
-    "filename": "file",
-    "fit": "train",
-    "training": "train",
-    "windows": "train",
-    "begin": "start",
-    "end": "stop",
-    "thin": "decimate",
-    "downsample": "decimate",
-    "skip": "exclude",
-    "mask": "exclude",
-    "ignore": "exclude",
-    "value": "fixed",
-    "constant": "fixed",
-    "min": "lower",
-    "minimum": "lower",
-    "max": "upper",
-    "maximum": "upper",
-    "units": "unit",
-    "symbol": "label",
-    "rate": "sample_rate",
-    "sampling_rate": "sample_rate",
-    "random_seed": "seed",
-    "rng": "seed",
-    "priors": "parameters",
-    "holdout": "validation",
-    "test": "validation",
-    "waveform": "signal",
-    "freq": "frequency",
-    "length": "duration",
-}
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
@@ -123,6 +85,17 @@ class _Source(_Table):
     file: str | None = None
     signal: str | SignalConfig | None = None
     voltage_is: Literal["command", "output"] | None = None
+    columns: dict[str, str] | None = None
+    units: dict[str, str] | None = None
+
+    @model_validator(mode="after")
+    def _naming(self) -> Self:
+        from bwbayes.data.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
+
+        Naming(self.columns or {}, self.units or {})
+        if self.file is None and (self.columns or self.units):
+            raise ValueError("columns and units are a file's; give file with them")
+        return self
 
 
 class RecordConfig(_Source):
@@ -266,6 +239,18 @@ class Config(_Table):
         return found
 
 
+# The tables of a config by their names.
+TABLES: dict[str, type[BaseModel]] = {
+    "record": RecordConfig,
+    "stand": StandConfig,
+    "model": ModelConfig,
+    "parameters": ParameterConfig,
+    "sampling": SamplingConfig,
+    "validation": ValidationConfig,
+    "signal": SignalConfig,
+}
+
+
 def load(path: str | Path) -> Config:
     """Read a config from a TOML file.
 
@@ -295,10 +280,15 @@ def parse(text: str, where: str) -> Config:
     except (ValueError, RecursionError) as error:
         # Besides its own error, a ValueError for a whole number that is too long for Python.
         raise InputError(f"{where}: is not TOML: {error}; correct the config") from None
+    return checked(table, where)
+
+
+def checked(table: Mapping[str, object], where: str) -> Config:
+    """Return the config of tables and their keys, with errors as in :func:`load`."""
     try:
         return Config.model_validate(table)
     except ValidationError as error:
-        raise InputError(_one_line(where, error)) from None
+        raise InputError(in_words(where, error, Config, TABLES)) from None
 
 
 def _check_keys(text: str) -> None:
@@ -311,76 +301,3 @@ def _check_keys(text: str) -> None:
 def dump(config: Config) -> str:
     """Write a config as TOML."""
     return tomlkit.dumps(config.model_dump(exclude_none=True))
-
-
-def _one_line(where: str, error: ValidationError) -> str:
-    """Say the first thing that is wrong: where, what, what to do."""
-    found = error.errors()
-    # Unknown keys first: a misspelt key is often why another one seems to be missing. Then the
-    # deepest place: the branch of a union that the user meant.
-    first = min(found, key=lambda e: (e["type"] != "extra_forbidden", -len(e["loc"])))
-    place = [str(part) for part in first["loc"] if not _is_branch(str(part))]
-    path = ".".join(place) or "config"
-    if first["type"] == "extra_forbidden":
-        hint = _home(place) or suggestion(place[-1], _keys_at(place[:-1]), MEANINGS)
-        return f"{where}: {path}: unknown key; {hint}"
-    message = first["msg"].removeprefix("Value error, ")
-    if place[-1:] == ["prior"]:
-        message = 'write a table like { distribution = "normal", mean = 1.0, sd = 0.1 }'
-    elif place[-1:] == ["signal"]:
-        message = (
-            "write a signal's name or a table like { amplitude = 100.0, frequency = 1.0, ... }"
-        )
-    elif first["type"] == "dict_type":
-        message = f"is not a table; write [{path}.NAME] and its keys below"
-    elif first["type"] == "model_type":
-        message = f"is not a table; known keys are {', '.join(_keys_at(place))}"
-    elif first["type"] == "missing":
-        message = "is missing"
-    got = "" if isinstance(first["input"], dict) else f", got {_shown(first['input'])}"
-    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
-
-
-def _home(place: list[str]) -> str:
-    """Say where a key belongs that is known, but in another table; nothing if it is not."""
-    key, table = place[-1], place[0] if len(place) > 1 else ""
-    if key in Config.model_fields:
-        return "it belongs above the first table, or is a table of its own"
-    homes: dict[str, type[BaseModel]] = {
-        "record": RecordConfig,
-        "model": ModelConfig,
-        "sampling": SamplingConfig,
-        "stand": StandConfig,
-    }
-    names = [name for name, one in homes.items() if key in one.model_fields and name != table]
-    return f"it belongs under [{names[0]}]" if names else ""
-
-
-def _shown(value: object) -> str:
-    try:
-        return f"{value!r:.60}"
-    except ValueError:  # Python writes no whole number of more than 4300 digits
-        return "a very long number"
-
-
-def _is_branch(part: str) -> bool:
-    """Tell the names that pydantic gives to the branches of a union from keys."""
-    return part in ("str", "float", "SignalConfig")
-
-
-def _keys_at(place: list[str]) -> list[str]:
-    """Return the keys that exist at a place of a config."""
-    table: type[BaseModel] = Config
-    tables: dict[str, type[BaseModel]] = {
-        "record": RecordConfig,
-        "stand": StandConfig,
-        "model": ModelConfig,
-        "parameters": ParameterConfig,
-        "sampling": SamplingConfig,
-        "validation": ValidationConfig,
-        "signal": SignalConfig,
-    }
-    named = place[:1] in (["parameters"], ["validation"])
-    for part in place[:1] + place[1 + named :]:
-        table = tables.get(part, table)
-    return list(table.model_fields)

@@ -122,8 +122,8 @@ class Record:
             What cannot be used, as of a file: too few samples, a voltage that does not move.
         """
         # The record makes arrays of what it gets, or says that it cannot.
-        arrays: Any = (voltage, displacement)
-        made = cls(*arrays, interval, start, voltage_is, origin)
+        given: Any = {"voltage": voltage, "displacement": displacement}
+        made = cls(**given, interval=interval, start=start, voltage_is=voltage_is, origin=origin)
         require_readable(made, origin)
         return made
 
