@@ -14,15 +14,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from bwbayes.app.config import (
-    Config,
-    ModelConfig,
-    RecordConfig,
-    SamplingConfig,
-    ValidationConfig,
-    checked,
-)
-from bwbayes.app.wording import MEANINGS
+from bwbayes.app.config import Config, checked
+from bwbayes.app.keys import MEANINGS
+from bwbayes.app.settings import ModelConfig, RecordConfig, SamplingConfig, ValidationConfig
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
 

@@ -37,7 +37,7 @@ def actuator_of(model: ModelConfig, record: Record) -> Actuator:
         model.dynamics,
         hold,
         record.interval,
-        made("model.hysteresis", model.hysteresis, HYSTERESIS, _options(model)),
+        made("model.hysteresis", model.hysteresis, HYSTERESIS, _options(model), Operator),
         PolynomialGain(tuple(model.gain), span) if model.gain else None,
         _creep(model, record, span),
         span,

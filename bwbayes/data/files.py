@@ -15,13 +15,13 @@ import numpy as np
 
 from bwbayes.data.checks import Table, VoltageIs, checked, require_voltage_is
 from bwbayes.data.columns import Naming
-from bwbayes.data.csvfile import read_csv, write_csv
+from bwbayes.data.csvfile import header_names, read_csv, write_csv
 from bwbayes.data.hdf5file import read_hdf5, write_hdf5
 from bwbayes.data.matfile import MatVersion, read_mat, write_mat
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
-__all__ = ["read_record", "write_record"]
+__all__ = ["SUFFIXES", "column_names", "read_record", "write_record"]
 
 _TEXT = (".csv", ".txt")
 _READERS: dict[str, Callable[[Path, Naming], Table]] = {
@@ -31,6 +31,7 @@ _READERS: dict[str, Callable[[Path, Naming], Table]] = {
     ".hdf5": read_hdf5,
     ".mat": read_mat,
 }
+SUFFIXES = tuple(_READERS)
 
 
 def read_record(
@@ -81,6 +82,20 @@ def read_record(
     return record
 
 
+def column_names(path: str | Path) -> list[str]:
+    """Return the names of all columns or arrays that a record's file has.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has no header.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _TEXT:
+        return list(_opened(path, lambda path, _: header_names(path), Naming()))
+    return list(_read_table(path, Naming()).names)
+
+
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
     """Write a record so that reading it gives the same numbers.
 
@@ -115,10 +130,14 @@ def _known_suffix(path: Path) -> str:
 
 
 def _read_table(path: Path, naming: Naming) -> Table:
+    return _opened(path, _READERS[_known_suffix(path)], naming)
+
+
+def _opened[T](path: Path, reader: Callable[[Path, Naming], T], naming: Naming) -> T:
+    """Return what a reader makes of a file, and say what keeps it from being opened."""
     try:
         if path.is_dir():
             raise InputError(f"{path}: is a directory; give the file in it")
-        reader = _READERS[_known_suffix(path)]
         if not path.exists():
             raise InputError(f"{path}: does not exist; check the path")
         if not path.is_file():

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -47,6 +47,7 @@ class SteadyState(NamedTuple):
     rate: FloatArray
 
 
+@runtime_checkable
 class Noise(Protocol):
     """A Gaussian model of the residual between a reading and the forward model."""
 
@@ -95,7 +96,7 @@ def noise_model(kind: str, interval: float) -> Noise:
     InputError
         No noise goes by that name.
     """
-    return made("noise", kind, NOISES, {"interval": interval})
+    return made("noise", kind, NOISES, {"interval": interval}, Noise)
 
 
 SENSOR_SD = Declaration(
@@ -138,7 +139,7 @@ def _log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class WhiteNoise:
-    """Sensor noise alone: independent normal errors. Right only if the model is."""
+    """Sensor noise alone, independent normal errors of sd s. Right only if the model is."""
 
     interval: float = 1.0
 
@@ -190,9 +191,11 @@ class WhiteNoise:
 class DiscrepancyNoise:
     """Ornstein-Uhlenbeck discrepancy plus white sensor noise, exact in O(readings).
 
-    With φ = exp(−Δ/τ), q = σ² (1 − φ²): the predicted variance of x in the long run is the positive
-    root p of p² + p (1 − φ²)(s² − σ²) = q s², an innovation has variance S = p + s², and errors of
-    the prediction die out by a = φ s²/S a reading. The variance at hand is p + D, with
+    The discrepancy x has sd σ, and a correlation of exp(−t/τ) between readings t apart; the
+    sensor's noise has sd s. With φ = exp(−Δ/τ), q = σ² (1 − φ²): the predicted variance of x in
+    the long run is the positive root p of p² + p (1 − φ²)(s² − σ²) = q s², an innovation has
+    variance S = p + s², and errors of the prediction die out by a = φ s²/S a reading. The variance
+    at hand is p + D, with
 
         D → a² D S / (S + D)           after a reading,
         D → ρ² D + (1 − ρ²)(σ² − p)    over missing ones, ρ = φ to the power of their number,
@@ -210,6 +213,13 @@ class DiscrepancyNoise:
     ----------
     interval
         Interval Δ between readings, s.
+
+    Notes
+    -----
+    G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion, Physical Review 36,
+    823-841 (1930), doi:10.1103/PhysRev.36.823; the recursion is a Kalman filter, R. E. Kalman, A
+    new approach to linear filtering and prediction problems, Journal of Basic Engineering 82,
+    35-45 (1960), doi:10.1115/1.3662552.
     """
 
     interval: float

@@ -96,7 +96,7 @@ class Actuator:
     span: Span | None = None
 
     def __post_init__(self) -> None:
-        made("dynamics", self.dynamics, DYNAMICS, {})
+        made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
         if self.hold not in get_args(Hold):
             known = ", ".join(get_args(Hold))
             raise InputError(f"hold: {self.hold!r} is unknown; write one of {known}")
@@ -106,7 +106,7 @@ class Actuator:
     @cached_property
     def filter(self) -> Filter:
         """The linear dynamics."""
-        return made("dynamics", self.dynamics, DYNAMICS, {})
+        return made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
 
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:

@@ -42,7 +42,13 @@ SHORTEST, LONGEST = 10.0, 3.0
 
 @dataclass(frozen=True)
 class Creep:
-    """Creep with lags of given times.
+    """Creep: slow lags beside the dynamics, one for each of the given times.
+
+    To what the dynamics make of the drive w in um, creep adds
+
+        x_creep = Σ cᵢ Lᵢ,   Tᵢ Lᵢ′ + Lᵢ = w (1 + κ |u| / U),
+
+    with strengths cᵢ and κ without unit, times Tᵢ in s, and U the largest voltage.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def _refuse(name: str, values: FloatArray, allowed: np.ndarray, demand: str) -> 
 
 @dataclass(frozen=True)
 class NoDynamics(Filter):
-    """x = w: the displacement follows at once, or with the hold."""
+    """No dynamics, x = w: the displacement follows the drive at once, or with the hold."""
 
     parameters: tuple[Declaration, ...] = ()
 

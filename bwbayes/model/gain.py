@@ -35,7 +35,7 @@ TERMS = {"quadratic": Term(2, r"q_2", 0.15), "cubic": Term(3, r"q_3", 0.1)}
 
 @dataclass(frozen=True)
 class PolynomialGain:
-    """Displacement q₂ x² + q₃ x³ in um, with x = (u − m)/U.
+    """Polynomial gain: displacement q₂ x² + q₃ x³ in um, with x = (u − m)/U.
 
     m and U are the middle and half of the range of the voltage u, V; q₂ and q₃ are in um.
 

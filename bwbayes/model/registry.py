@@ -65,11 +65,14 @@ def choose[Part](
         raise InputError(f"{place}: {name!r} is unknown; {suggestion(name, registry)}")
     try:
         maker: Callable[..., Part] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:  # a module from outside may raise anything
+        reason = f"{type(error).__name__}: {error}"
         raise InputError(
-            f"{place}: cannot import {name!r} ({error}); write module:Class, and make sure that "
-            "Python can import the module"
+            f"{place}: cannot import {name!r} ({reason}); write module:Class, and make sure that "
+            f"`python -c 'import {module}'` works where you run this"
         ) from None
+    if not callable(maker):
+        raise InputError(f"{place}: {name!r} is no class; write module:Class")
     return maker
 
 
@@ -78,13 +81,15 @@ def made[Part](
     name: str,
     registry: Mapping[str, Callable[..., Part]],
     options: Mapping[str, Any],
+    kind: type | None = None,
 ) -> Part:
     """Return the part of that name, with those ``options`` that are not None.
 
     Raises
     ------
     InputError
-        As :func:`choose`; or the part does not take an option.
+        As :func:`choose`; or the part does not take an option, cannot be made, or is not of the
+        ``kind`` that is asked for.
     """
     maker = choose(place, name, registry)
     given = {key: value for key, value in options.items() if value is not None}
@@ -92,4 +97,29 @@ def made[Part](
     for key in given:
         if key not in takes:
             raise InputError(f"{place}: {name!r} has no option {key}; remove it")
-    return maker(**given)
+    if name in registry:
+        return maker(**given)
+    try:
+        part = maker(**given)
+    except TypeError as error:  # an abstract method is missing, or an argument has no default
+        raise InputError(f"{place}: {name!r} cannot be made: {error}; complete it") from None
+    if kind is not None and not isinstance(part, kind):
+        raise InputError(
+            f"{place}: {name!r} makes a {type(part).__name__}, which is not a "
+            f"{kind.__module__}.{kind.__name__}; derive it from that"
+        )
+    if isinstance(part, Operator):
+        _check_parameters(place, name, part)
+    return part
+
+
+def _check_parameters(place: str, name: str, operator: Operator) -> None:
+    """Refuse an operator from outside whose state before a record has no place."""
+    names = [declared.name for declared in operator.parameters]
+    if len(set(names)) < len(names):
+        raise InputError(f"{place}: {name!r} declares a parameter twice: {', '.join(names)}")
+    if names[-1:] != ["initial"] or operator.parameters[-1].scope != "record":
+        raise InputError(
+            f'{place}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
+            'scope = "record": the state before a record'
+        )

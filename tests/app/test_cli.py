@@ -19,7 +19,17 @@ from bwbayes.data import read_record, write_record
 from tests.app import small
 from tests.data.spoilt import looping
 
-COMMANDS = ("run", "resume", "check", "simulate", "predict", "report", "calibrate")
+COMMANDS = (
+    "run",
+    "resume",
+    "check",
+    "simulate",
+    "predict",
+    "report",
+    "calibrate",
+    "config",
+    "models",
+)
 
 
 @dataclass(frozen=True)
@@ -188,8 +198,8 @@ def test_malformed_record_is_one_line_and_leaves_nothing(
     ("text", "part"),
     [
         ("", "record: is missing"),
-        ("[record", "is not TOML"),
-        ("seed = 1\nseed = 2\n", "is not TOML"),
+        ("[record", "invalid TOML"),
+        ("seed = 1\nseed = 2\n", "invalid TOML"),
         ('[record]\nfil = "record.csv"', "record.fil: unknown key; did you mean file?"),
         (RECORD + "[sampling]\ness = nan", "sampling.ess: "),
         (RECORD + "[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),

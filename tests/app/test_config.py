@@ -233,7 +233,7 @@ def test_seed_is_a_number_that_files_can_hold(seed: str) -> None:
     ],
 )
 def test_text_that_is_no_toml_is_refused(text: str) -> None:
-    assert refused(text).startswith("is not TOML")
+    assert refused(text).startswith("invalid TOML")
 
 
 def test_number_too_long_to_be_written_is_refused_by_its_place() -> None:

@@ -54,7 +54,11 @@ NOT_PASSIVE = "this actuator may need a gamma beyond it: give passive = false un
 class BoucWen(OneState):
     """Bouc-Wen hysteresis, w = d u − h, for any n ≥ 1.
 
-    dh = α du − β |du| h |h|^(n−1) − γ du |h|^n, rate-independent and exact
+    The hysteretic displacement h in um follows the voltage u in V by
+
+        dh = α du − β |du| h |h|^(n−1) − γ du |h|^n,
+
+    equation (6) of the paper, rate-independent and exact
     (:func:`~bwbayes.model.boucwen.hysteresis`).
 
     Parameters
@@ -63,6 +67,13 @@ class BoucWen(OneState):
         Whether |γ| ≤ β: then the hysteresis takes no energy from nowhere on any path. Some
         published actuators have a larger γ; without the constraint only β + γ ≥ 0 holds, beyond
         which h runs away.
+
+    Notes
+    -----
+    Y. K. Wen, Method for random vibration of hysteretic systems, Journal of the Engineering
+    Mechanics Division 102, 249-263 (1976), doi:10.1061/JMCEA3.0002106; T. S. Low, W. Guo, Modeling
+    of a three-layer piezoelectric bimorph beam with hysteresis, Journal of
+    Microelectromechanical Systems 4, 230-237 (1995).
     """
 
     passive: bool = True

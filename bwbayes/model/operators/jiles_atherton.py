@@ -38,7 +38,7 @@ class JilesAtherton(Pinned):
     Notes
     -----
     D. C. Jiles, D. L. Atherton, Theory of ferromagnetic hysteresis, Journal of Magnetism and
-    Magnetic Materials 61, 48-60 (1986).
+    Magnetic Materials 61, 48-60 (1986), doi:10.1016/0304-8853(86)90066-1.
     """
 
     @property
