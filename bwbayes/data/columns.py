@@ -166,8 +166,8 @@ def _own(name: str, units: Mapping[str, str]) -> tuple[str, int]:
     if known is None:
         common = [COMMON_NAMES[key] for key in ("time", "voltage", "displacement")]
         near = difflib.get_close_matches(name.strip(), common, 1, 0.4)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(common)}"
-        raise ValueError(f"unknown column; {hint}")
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(common)};"
+        raise ValueError(f"unknown column; {hint} `columns` maps other names")
     if unit not in known:
         raise ValueError(f"unknown unit {unit!r}; write one of {', '.join(known)}")
     return quantity.lower(), known[unit]
