@@ -123,8 +123,8 @@ class Fit:
 
         Its attribute ``converged`` is 1 or 0.
         """
-        found = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, found, self.problem.record)
+        density = log_likelihood(self.problem.posterior, self.result)
+        return posterior_tree(self.result, density, self.problem.record)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -298,7 +298,7 @@ class Fit:
 
     def __repr__(self) -> str:
         said = StringIO()
-        console = Console(file=said, width=110, force_jupyter=False)
+        console = Console(file=said, width=110, force_jupyter=False, color_system=None)
         console.print(self._title, highlight=False, markup=False, soft_wrap=True)
         show_result(self.result, None, console)
         return said.getvalue().rstrip()

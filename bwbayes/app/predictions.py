@@ -101,7 +101,7 @@ class Prediction(Bands):
 
     def __repr__(self) -> str:
         said = StringIO()
-        console = Console(file=said, width=100, force_jupyter=False)
+        console = Console(file=said, width=100, force_jupyter=False, color_system=None)
         console.print(self._title, highlight=False, markup=False, soft_wrap=True)
         if self.scores is not None and self.verdict is not None:
             show_verdicts([self.verdict], console)

@@ -92,7 +92,7 @@ def column_names(path: str | Path) -> list[str]:
     """
     path = Path(path)
     if path.suffix.lower() in _TEXT:
-        return list(_opened(path, lambda path, _: header_names(path), Naming()))
+        return _opened(path, lambda: header_names(path))
     return list(_read_table(path, Naming()).names)
 
 
@@ -130,21 +130,22 @@ def _known_suffix(path: Path) -> str:
 
 
 def _read_table(path: Path, naming: Naming) -> Table:
-    return _opened(path, _READERS[_known_suffix(path)], naming)
+    return _opened(path, lambda: _READERS[path.suffix.lower()](path, naming))
 
 
-def _opened[T](path: Path, reader: Callable[[Path, Naming], T], naming: Naming) -> T:
-    """Return what a reader makes of a file, and say what keeps it from being opened."""
+def _opened[T](path: Path, read: Callable[[], T]) -> T:
+    """Return what is read from a file, and say what keeps it from being opened."""
     try:
         if path.is_dir():
             raise InputError(f"{path}: is a directory; give the file in it")
+        _known_suffix(path)
         if not path.exists():
             raise InputError(f"{path}: does not exist; check the path")
         if not path.is_file():
             raise InputError(f"{path}: is not a regular file; give one")
         with path.open("rb"):  # so that a file without permission says so in every format
             pass
-        return reader(path, naming)
+        return read()
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
