@@ -262,8 +262,13 @@ def test_run_without_a_config_runs_the_proposed_one(
     write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = write(FOREIGN.replace("pos", "pos_nm"), (1e3, 1e3, 1e3))
-    ran = []
-    monkeypatch.setattr(cli, "_finish", lambda folder, *_: ran.append(folder) or 0)
+    ran: list[Path] = []
+
+    def finish(folder: Path, *_: object) -> int:
+        ran.append(folder)
+        return 0
+
+    monkeypatch.setattr(cli, "_finish", finish)
     done = command("run", path, "--out", tmp_path / "out", "--quiet")
     assert 0 == done.return_value
     assert "" == done.output

@@ -21,7 +21,7 @@ from bwbayes.errors import InputError, InputWarning
 TIME = np.arange(200) / 100
 VOLTAGE = 50 * np.sin(6 * TIME)
 DISPLACEMENT = 0.7 * VOLTAGE
-COLUMNS = {"time": "t [ms]", "voltage": "U_mV", "displacement": "pos"}
+COLUMNS: dict[str, Any] = {"time": "t [ms]", "voltage": "U_mV", "displacement": "pos"}
 UNIT = {"displacement": "nm"}
 VALUES = {"t [ms]": 1e3 * TIME, "U_mV": 1e3 * VOLTAGE, "pos": 1e3 * DISPLACEMENT}
 
