@@ -1,9 +1,11 @@
 """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
 A record of voltage and displacement becomes a posterior of the actuator's parameters, and the
-posterior becomes bands in which the displacement will be, for any voltage. A :class:`Problem`
-holds record, model and priors; :func:`sample` draws until its chain has converged, and only then
-is there anything to predict. The forward model alone is there too, for a batch of parameters::
+posterior becomes bands in which the displacement will be, for any voltage:
+``fit = bwbayes.fit(record)`` samples until the chain has converged, and then there is
+``fit.predict(new_record)``. What :func:`fit` is made of is here too: a :class:`Problem` holds
+record, model and priors, :func:`sample` draws. So is the forward model alone, for a batch of
+parameters::
 
     import numpy as np
     import bwbayes

@@ -122,7 +122,14 @@ def load(path: str | Path) -> Config:
 
 
 def parse(text: str, where: str) -> Config:
-    """Read a config from TOML text; ``where`` names it in errors, which are as in :func:`load`."""
+    r"""Read a config from TOML text; ``where`` names it in errors, which are as in :func:`load`.
+
+    Examples
+    --------
+    >>> config = parse('[record]\nfile = "my_record.csv"', "my config")
+    >>> config.model.hysteresis, config.model.dynamics
+    ('bouc-wen', 'lag')
+    """
     try:
         _check_keys(text)
         table = tomllib.loads(text)

@@ -74,6 +74,13 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     Findings are "wrong units", "no relation", "reversed sign", "swapped columns", "few readings",
     "coarse sampling", "one amplitude", "held readings", "repeated samples", "clipping", "spikes",
     "switch-on transient" and "drift". A planned voltage is looked at for its own sake alone.
+
+    Examples
+    --------
+    >>> time = np.arange(0, 6, 0.01)
+    >>> voltage = 100 * np.exp(-0.2 * time) * np.sin(2 * np.pi * time)
+    >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
+    ['reversed sign']
     """
     findings = [*_units(record), *_sampling(record), *_amplitude(record)]
     if record.displacement is None:

@@ -22,6 +22,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.data.checks import Column, Table, VoltageIs, checked, require_voltage_is
 from bwbayes.data.columns import COMMON_NAMES, Naming
+from bwbayes.data.frames import frame_table
 from bwbayes.errors import InputError, InputWarning, one_line
 
 __all__ = ["Record", "Split", "Window", "require_readable"]
@@ -69,6 +70,12 @@ class Record:
     InputError
         If an array is not a vector of finite numbers (of the displacement one is enough), lengths
         differ, the interval is not a positive number, or `voltage_is` is unknown.
+
+    Examples
+    --------
+    >>> record = Record([0.0, 5.0, 10.0], [0.0, np.nan, 6.1], interval=0.01)
+    >>> record.samples, record.readings, record.duration
+    (3, 2, 0.03)
     """
 
     voltage: FloatArray
@@ -166,7 +173,7 @@ class Record:
         """
         given = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in given.items() if name is not None}
-        table = _frame_table(frame, Naming(columns, units or {}), origin)
+        table = frame_table(frame, Naming(columns, units or {}), origin)
         need = displacement is not None
         return cls(**checked(table, voltage_is=voltage_is, need_displacement=need))
 
@@ -333,37 +340,6 @@ def require_readable(record: Record, where: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         checked(table, need_displacement=record.displacement is not None)
-
-
-def _frame_table(frame: Any, naming: Naming, origin: str) -> Table:
-    """Return the columns of a pandas table that count."""
-    names = [str(name) for name in frame.columns]
-    columns: dict[str, Column] = {}
-    problems = []
-    try:
-        naming.require_in(names)
-    except ValueError as error:
-        raise InputError(f"{origin}: {error}") from None
-    for name, label in zip(names, frame.columns, strict=True):
-        try:
-            quantity, power, sign = naming.of(name)
-        except ValueError as error:
-            problems.append(f"{origin}: {name}: {error}")
-            continue
-        if quantity in columns:
-            raise InputError(f"{origin}: {name}: second {quantity} column; remove one")
-        values = frame[label].to_numpy()
-        if quantity == "time" and values.dtype.kind in "mM":
-            # Dates and durations have their unit in themselves.
-            values, power = (values - values[0]) / np.timedelta64(1, "ns") / 1e9, 0
-        try:
-            columns[quantity] = Column(name, np.asarray(values, dtype=np.float64), power, sign)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{origin}: {name}: not numbers ({error}); convert them") from None
-    # An unknown name is most likely the missing one, misspelt.
-    if problems and {"time", "voltage"} - set(columns):
-        raise InputError(problems[0])
-    return Table(Path(origin), columns, {"origin": origin}, names=tuple(names))
 
 
 def _offset(record: Record, time: float) -> float:

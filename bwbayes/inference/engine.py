@@ -1,8 +1,9 @@
 """Engines: what computes the likelihood.
 
 ``"numpy"`` is the reference, always there and meant to be read. ``"numba"`` compiles the same
-computation, ten times faster, and is there if numba is (``pip install bwbayes[fast]``). Both give
-the same log density to rounding; ``"auto"`` takes the faster one that is there.
+computation, ten times faster, and is there if numba is: it comes with bwbayes where there is a
+numba for that Python. Both give the same log density to rounding; ``"auto"`` takes the faster one
+that is there.
 """
 
 from __future__ import annotations
@@ -18,25 +19,24 @@ Engine = Literal["numpy", "numba"]
 EngineChoice = Literal["auto", "numpy", "numba"]
 
 
-def choose(wanted: EngineChoice = "auto") -> Engine:
+def choose(choice: EngineChoice = "auto") -> Engine:
     """Return the engine to use.
 
     Raises
     ------
     InputError
-        ``wanted`` is no engine, or is ``"numba"`` where numba is not installed.
+        ``choice`` is no engine, or is ``"numba"`` where numba is not installed.
     """
-    there = find_spec("numba") is not None
-    match wanted:
+    installed = find_spec("numba") is not None
+    match choice:
         case "auto":
-            return "numba" if there else "numpy"
+            return "numba" if installed else "numpy"
         case "numpy":
             return "numpy"
         case "numba":
-            if not there:
+            if not installed:
                 raise InputError(
-                    'engine: numba is not installed; pip install "bwbayes[fast]", or take the '
-                    "numpy engine"
+                    "engine: numba is not installed; pip install numba, or take the numpy engine"
                 )
             return "numba"
-    raise InputError(f"engine: {wanted!r} is unknown; write one of auto, numpy, numba")
+    raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")

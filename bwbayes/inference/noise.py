@@ -95,6 +95,11 @@ def noise_model(kind: str, interval: float) -> Noise:
     ------
     InputError
         No noise goes by that name.
+
+    Examples
+    --------
+    >>> [declared.name for declared in noise_model("discrepancy", 1e-3).declarations]
+    ['sensor_sd', 'discrepancy_sd', 'discrepancy_time']
     """
     return made("noise", kind, NOISES, {"interval": interval}, Noise)
 

@@ -104,6 +104,13 @@ def hysteresis(
     -----
     Equations (5) and (6) of the paper; its equation (8) prints the last term as γ u |dh|, which
     is a misprint: read so it would define dh by itself, with two solutions or none.
+
+    Examples
+    --------
+    >>> h = hysteresis([0.0, 100.0, -100.0], alpha=[0.3, 0.36], beta=0.027, gamma=0.017)
+    >>> h.round(2)
+    array([[ 0.  ,  6.73, -6.82],
+           [ 0.  ,  8.08, -8.18]])
     """
     path = np.asarray(voltage, dtype=np.float64)
     if path.ndim != 1 or path.size == 0 or not np.isfinite(path).all():

@@ -43,6 +43,11 @@ class Distribution:
     ------
     InputError
         Unknown name, wrong arguments, or arguments outside the distribution's domain.
+
+    Examples
+    --------
+    >>> print(Distribution("lognormal", {"median": 0.7, "sigma": 0.5}))
+    lognormal(median = 0.7, sigma = 0.5)
     """
 
     name: str
