@@ -1,9 +1,11 @@
 """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
 A record of voltage and displacement becomes a posterior of the actuator's parameters, and the
-posterior becomes bands in which the displacement will be, for any voltage. A :class:`Problem`
-holds record, model and priors; :func:`sample` draws until its chain has converged, and only then
-is there anything to predict. The forward model alone is there too, for a batch of parameters::
+posterior becomes bands in which the displacement will be, for any voltage:
+``fit = bwbayes.fit(record)`` samples until the chain has converged, and then there is
+``fit.predict(new_record)``. What :func:`fit` is made of is here too: a :class:`Problem` holds
+record, model and priors, :func:`sample` draws. So is the forward model alone, for a batch of
+parameters::
 
     import numpy as np
     import bwbayes
@@ -31,14 +33,17 @@ __all__ = [
     "Distribution",
     "Experiment",
     "Finding",
+    "Fit",
     "InputError",
     "InputWarning",
     "JointPrior",
     "Loops",
+    "NotConvergedError",
     "Outcome",
     "Parameter",
     "PointFit",
     "Posterior",
+    "Prediction",
     "Problem",
     "Record",
     "Replicate",
@@ -53,6 +58,7 @@ __all__ = [
     "assess",
     "draws",
     "first_chain",
+    "fit",
     "forecast",
     "hysteresis",
     "inspect",
@@ -61,6 +67,7 @@ __all__ = [
     "measure_loops",
     "measure_step",
     "noise_model",
+    "open_run",
     "parse_config",
     "point_fit",
     "predict_record",
@@ -68,6 +75,7 @@ __all__ = [
     "read_record",
     "replicates",
     "resolve",
+    "resume_run",
     "sample",
     "score",
     "signal",
@@ -76,17 +84,19 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from bwbayes.app.aloud import predict_record, predict_windows, resolve
+    from bwbayes.app.calls import fit, open_run, resume_run
     from bwbayes.app.config import Config
     from bwbayes.app.config import load as load_config
     from bwbayes.app.config import parse as parse_config
-    from bwbayes.app.problem import Problem
+    from bwbayes.app.fitted import Fit
+    from bwbayes.app.predictions import Prediction
+    from bwbayes.app.problem import Problem, resolve
     from bwbayes.data.files import read_record, write_record
     from bwbayes.data.inspection import Finding, inspect
     from bwbayes.data.record import Record
     from bwbayes.data.teststand import VirtualTestStand
     from bwbayes.data.waveforms import Waveform, signal
-    from bwbayes.errors import InputError, InputWarning
+    from bwbayes.errors import InputError, InputWarning, NotConvergedError
     from bwbayes.inference.chain import Chain
     from bwbayes.inference.noise import noise_model
     from bwbayes.inference.parameters import JointPrior, Parameter
@@ -100,7 +110,7 @@ if TYPE_CHECKING:
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
     from bwbayes.results.loops import Loops, measure_loops
-    from bwbayes.results.prediction import forecast, thinned
+    from bwbayes.results.prediction import forecast, predict_record, predict_windows, thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
     from bwbayes.results.start import Start
@@ -118,14 +128,17 @@ else:
         "Distribution": "model.distributions",
         "Experiment": "results.replicates",
         "Finding": "data.inspection",
+        "Fit": "app.fitted",
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
         "Loops": "results.loops",
+        "NotConvergedError": "errors",
         "Outcome": "inference.sampling",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
         "Posterior": "inference.posterior",
+        "Prediction": "app.predictions",
         "Problem": "app.problem",
         "Record": "data.record",
         "Replicate": "results.replicates",
@@ -141,6 +154,7 @@ else:
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
         "forecast": "results.prediction",
+        "fit": "app.calls",
         "hysteresis": "model.boucwen",
         "inspect": "data.inspection",
         "judge": "results.calibration",
@@ -148,13 +162,15 @@ else:
         "measure_loops": "results.loops",
         "measure_step": "results.steps",
         "noise_model": "inference.noise",
+        "open_run": "app.calls",
         "parse_config": "app.config:parse",
         "point_fit": "inference.pointfit:fit",
-        "predict_record": "app.aloud",
-        "predict_windows": "app.aloud",
+        "predict_record": "results.prediction",
+        "predict_windows": "results.prediction",
         "read_record": "data.files",
         "replicates": "results.replicates",
-        "resolve": "app.aloud",
+        "resolve": "app.problem",
+        "resume_run": "app.calls",
         "sample": "inference.sampling",
         "score": "results.scores",
         "signal": "data.waveforms",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 
-__all__ = ["InputError", "InputWarning", "one_line", "suggestion"]
+__all__ = ["InputError", "InputWarning", "NotConvergedError", "one_line", "suggestion"]
 
 # How alike two words must be, from 0 to 1, for one to be a misspelling of the other.
 ALIKE = 0.6
@@ -27,6 +27,10 @@ class InputError(ValueError):
         if len(line) > LONGEST:
             line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
         super().__init__(line)
+
+
+class NotConvergedError(InputError):
+    """An interval was asked of a sampling that has not converged; the text says how to go on."""
 
 
 def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | None = None) -> str:

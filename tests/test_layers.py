@@ -33,7 +33,7 @@ KEEPERS = {
     "arviz": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_stats": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "matplotlib": ("bwbayes.app.figures*",),
+    "matplotlib": ("bwbayes.app.figures*", "bwbayes.app.plots", "bwbayes.app.predictions"),
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),

@@ -13,7 +13,7 @@ Which test keeps which:
 | ``start`` forgot the history; so did ``train`` | here, ``app/test_problem.py`` |
 | a record at 5 kHz and its every 20th sample | here, ``inference/test_rates.py`` |
 | a steady sine | ``test_steady_sine.py``, ``inference/test_untold.py`` |
-| displacement reversed | here, ``app/test_predict.py``, ``app/test_aloud.py`` |
+| displacement reversed | here, ``app/test_predict.py``, ``app/test_fitted.py`` |
 | priors in wrong units, on a bound, contradicted | ``inference/test_conflict.py``, \
 ``inference/test_default_units.py``, ``app/test_remarks.py`` |
 

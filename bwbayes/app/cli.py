@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, get_args
 import click
 from rich.console import Console
 
-from bwbayes.app import lookup
+from bwbayes.app import beginning, lookup
 from bwbayes.app.config import LARGEST_SEED, load
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
@@ -74,14 +74,14 @@ def run(
     workers: int | None,
     quiet: bool,
 ) -> int:
-    """Sample a posterior and predict, from a CONFIG in TOML.
+    """Sample a posterior and predict, from a CONFIG in TOML, or from a record without one.
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     from bwbayes.app.run import load_run, start  # noqa: PLC0415  # --help need not wait for scipy
     from bwbayes.app.screen import show_priors  # noqa: PLC0415
 
-    wanted = load(config)
+    wanted = beginning.config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
         source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
         wanted = wanted.model_copy(update={"record": source})
@@ -128,7 +128,7 @@ def check(config: Path, record: Path | None, out: Path | None) -> int:
     """
     from bwbayes.app.check import check as look  # noqa: PLC0415
 
-    wanted = load(config)
+    wanted = beginning.config_or_proposal(config, Console())
     if record is not None:
         source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
         wanted = wanted.model_copy(update={"record": source})
@@ -298,6 +298,7 @@ def calibrate(
     return _calibrate(folder, None, workers, quiet)
 
 
+cli.add_command(beginning.init)
 cli.add_command(lookup.config)
 cli.add_command(lookup.models)
 

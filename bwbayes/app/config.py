@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +37,7 @@ __all__ = [
     "RecordConfig",
     "SignalConfig",
     "ValidationConfig",
+    "checked",
     "dump",
     "load",
     "parse",
@@ -133,6 +135,11 @@ def parse(text: str, where: str) -> Config:
     except (ValueError, RecursionError) as error:
         # Besides its own error, a ValueError for a whole number that is too long for Python.
         raise InputError(f"{where}: invalid TOML: {error}; correct the config") from None
+    return checked(table, where)
+
+
+def checked(table: Mapping[str, object], where: str) -> Config:
+    """Return the config of tables and their keys, with errors as in :func:`load`."""
     try:
         return Config.model_validate(table)
     except ValidationError as error:

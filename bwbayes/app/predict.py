@@ -6,27 +6,23 @@ verdict (JSON) and a picture (PNG). No file is replaced unless that is asked for
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import click
 from rich.console import Console
 
-from bwbayes.app.figures import draw_alone, save_one
+from bwbayes.app.figures import save_one
 from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import Problem, generator
-from bwbayes.app.run import finished, scoring
+from bwbayes.app.predictions import predict_another
+from bwbayes.app.problem import Problem
+from bwbayes.app.run import finished
 from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.data import Record, read_record
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
-from bwbayes.results.bands import Bands
-from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_summary
-from bwbayes.results.prediction import Start, predict_record, thinned
-from bwbayes.results.scores import Scores, as_summary, score
-from bwbayes.results.verdict import Background, Verdict, assess
+from bwbayes.results.prediction import Start
 
 __all__ = ["DOES_NOT_HOLD", "predict"]
 
@@ -68,23 +64,18 @@ def predict(
         )
         return NOT_CONVERGED
     other = _record(problem, record, waveform)
-    posterior, seed = problem.posterior, problem.config.seed
-    flat = draws(posterior, chain).reshape(-1, len(posterior.names))
-    chosen = thinned(flat, generator(seed, "draws"))
-    remarks = list(beyond_training(posterior, other.voltage, other.interval))
-    source = generator(seed, f"predict {other.sha256}")
-    bands = predict_record(posterior, chosen, other, start, source, name, window)
-    verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
-    scores = None if verdict is None else score(bands, scoring(seed, bands))
+    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    bands = predict_another(problem, flat, other, start, name, window)
+    scores, verdict = bands.scores, bands.verdict
     if verdict is not None:
         show_verdicts([verdict], console)
-    for remark in remarks:
+    for remark in bands.remarks:
         click.echo(f"bwbayes: {name}: {remark}", err=True)
     try:
         table.parent.mkdir(parents=True, exist_ok=True)
         write_bands(table, [bands])
-        write_summary(numbers, _numbers(bands, scores, verdict, remarks))
-        save_one(draw_alone(bands), picture)
+        write_summary(numbers, bands.numbers())
+        save_one(bands.plot(), picture)
     except OSError as error:
         raise InputError(f"{table}: {error.strerror}; choose another place with --out") from None
     if scores is not None and verdict is not None:
@@ -105,21 +96,3 @@ def _record(problem: Problem, path: Path | None, waveform: str | None) -> Record
     interval = problem.record.interval
     _, voltage = signal(waveform).sample(1 / interval)
     return Record(voltage, None, interval, origin=f"{waveform} signal")
-
-
-def _numbers(
-    bands: Bands, scores: Scores | None, verdict: Verdict | None, remarks: list[str]
-) -> dict[str, object]:
-    """Return what the JSON file holds; ``scores`` are null without a measurement."""
-    lead = bands.lead_in
-    judged = {"holds": None} if verdict is None else verdict.summary
-    return {
-        "name": bands.name,
-        "from_s": float(bands.time[0]),
-        "to_s": float(bands.time[-1] + bands.interval),
-        "samples": bands.time.size,
-        "remarks": remarks,
-        "lead_in": None if lead is None else asdict(lead),
-        "scores": None if scores is None else as_summary(scores),
-        **judged,
-    }

@@ -19,13 +19,14 @@ from bwbayes.app.config import (
     Config,
     RecordConfig,
     SignalConfig,
+    ValidationConfig,
 )
 from bwbayes.app.model import actuator_of, explicit_model
 from bwbayes.app.parameters import as_config, context_of, parameters_of
 from bwbayes.app.stand import planned, recoverable, stand_of
 from bwbayes.data import Record, Split, read_record
-from bwbayes.data.checks import require_readable
 from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import (
     Carrier,
@@ -117,8 +118,11 @@ def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
     )
 
 
-def resolve(config: Config, folder: Path) -> Problem:
+def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
     """Make a problem of a config whose files are relative to ``folder``.
+
+    ``records`` are those that are not read from the config's files because they are in memory:
+    "record", the training record, and others by the names of their validations.
 
     Raises
     ------
@@ -127,10 +131,11 @@ def resolve(config: Config, folder: Path) -> Problem:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        record, stand = _training_record(config, folder)
+        given = records or {}
+        record, stand = _training_record(config, folder, given.get("record"))
         split = _split(config, record)
         others = {
-            name: _other_record(config, name, folder, record)
+            name: _other_record(config, name, folder, record, given.get(name))
             for name, validation in config.validation.items()
             if validation.another
         }
@@ -221,11 +226,26 @@ def _unlike(config: Config, name: str, record: Record) -> Iterator[str]:
             yield f"{name}: {one}"
 
 
-def _training_record(config: Config, folder: Path) -> tuple[Record, VirtualTestStand | None]:
+def _read(source: RecordConfig | ValidationConfig, folder: Path, given: Record | None) -> Record:
+    """Return the record that is given, or else read the source's file."""
+    if given is not None:
+        return replace(given, voltage_is=source.voltage_is or given.voltage_is)
+    assert source.file is not None
+    return read_record(
+        folder / source.file,
+        voltage_is=source.voltage_is,
+        columns=source.columns,
+        units=source.units,
+    )
+
+
+def _training_record(
+    config: Config, folder: Path, given: Record | None
+) -> tuple[Record, VirtualTestStand | None]:
     """Return the record, and the stand that made it, if one did."""
     source, stand = config.record, None
     if source.file is not None:
-        record = read_record(folder / source.file, voltage_is=source.voltage_is)
+        record = _read(source, folder, given)
     else:
         assert source.signal is not None
         waveform = sampled_waveform(source.signal)
@@ -242,10 +262,14 @@ def _training_record(config: Config, folder: Path) -> tuple[Record, VirtualTestS
     return record, stand
 
 
-def _other_record(config: Config, name: str, folder: Path, training: Record) -> Record:
+def _other_record(
+    config: Config, name: str, folder: Path, training: Record, given: Record | None
+) -> Record:
     source = config.validation[name]
     if source.file is not None:
-        record = read_record(folder / source.file, voltage_is=source.voltage_is)
+        record = _read(source, folder, given)
+        if given is not None:
+            require_readable(record, f"validation.{name}")
     else:
         assert source.signal is not None
         waveform = sampled_waveform(source.signal)
@@ -348,7 +372,10 @@ def _explicit(
     prior = posterior.prior
     validation = {
         name: v.model_copy(
-            update={"file": f"records/{name}.h5", "signal": None, "voltage_is": None}
+            update={
+                "file": f"records/{name}.h5",
+                **dict.fromkeys(("signal", "voltage_is", "columns", "units")),
+            }
         )
         if v.another
         else v

@@ -7,16 +7,16 @@ the next one needs, so it does not matter in how many pieces a run is done.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -26,6 +26,7 @@ from bwbayes.app.figures import draw_all, save
 from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.model import in_words
+from bwbayes.app.predictions import judged, predictions, scoring
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
 from bwbayes.app.report import render
@@ -39,31 +40,44 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.results import innovations
-from bwbayes.results.bands import Bands
-from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.files import write_bands, write_posterior, write_summary
-from bwbayes.results.innovations import Innovations
 from bwbayes.results.loops import measure_loops
-from bwbayes.results.prediction import predict_record, predict_windows, thinned
-from bwbayes.results.refit import Moved, without_start
+from bwbayes.results.prediction import thinned
+from bwbayes.results.refit import without_start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
-from bwbayes.results.verdict import Background, Verdict, assess
+from bwbayes.results.verdict import Background
 
 __all__ = [
+    "Run",
     "assemble",
     "carry_on",
     "finished",
+    "go_on",
+    "judged",
     "load_run",
     "predictions",
     "redraw",
-    "scoring",
     "start",
     "versions",
+    "write_files",
 ]
 
 PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
+
+
+class Run(NamedTuple):
+    """A run whose sampling has come to an end: its problem, chain and outcome.
+
+    ``seconds`` is the wall time that it took, and ``result`` what came of it.
+    """
+
+    problem: Problem
+    chain: ChainFile
+    outcome: Outcome
+    result: Result
+    seconds: float
 
 
 def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
@@ -91,7 +105,21 @@ def carry_on(
     steps: int | None = None,
     engine: Engine | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files.
+    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
+    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+
+
+def go_on(
+    folder: RunFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    ess: float | None = None,
+    steps: int | None = None,
+    engine: Engine | None = None,
+    files: bool = True,
+) -> Run:
+    """Do what is left of a run.
 
     Parameters
     ----------
@@ -106,6 +134,8 @@ def carry_on(
     engine
         Go on with this engine, whatever the chain was begun with: the same posterior, but from
         here on not the same bits.
+    files
+        Write what a run leaves besides its config, records and chain.
 
     Raises
     ------
@@ -125,10 +155,12 @@ def carry_on(
             # It is written last, as the sign that all is there; now something is to come.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
-        console.print("predicting and drawing ...", highlight=False)
+        console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
         result = assemble(problem, chain, outcome)
-        _write(folder, problem, result, time.monotonic() - begun)
-    return result
+        seconds = time.monotonic() - begun
+        if files:
+            write_files(folder, problem, result, seconds)
+    return Run(problem, chain, outcome, result, seconds)
 
 
 def redraw(folder: RunFolder) -> Result:
@@ -147,7 +179,7 @@ def redraw(folder: RunFolder) -> Result:
         seconds = json.loads(folder.summary.read_text(encoding="utf-8"))["wall_s"]
         problem, chain, outcome = finished(folder)
         result = assemble(problem, chain, outcome)
-        _write(folder, problem, result, seconds)
+        write_files(folder, problem, result, seconds)
     return result
 
 
@@ -173,30 +205,6 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
     """Return the versions of what computed a result."""
     packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
-
-
-def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
-    """Predict the training windows and everything held out."""
-    posterior, seed = problem.posterior, problem.config.seed
-    chosen = thinned(result.flat_draws, generator(seed, "draws"))
-    training = posterior.training
-    windows = {
-        "training" if len(training) == 1 else f"training-{i + 1}": window
-        for i, window in enumerate(training)
-    }
-    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    # By content: the same record under another name gets the same bands.
-    source = generator(seed, f"predict {problem.record.sha256}")
-    bands = predict_windows(posterior, chosen, problem.record, windows, source)
-    for name, other in problem.validations.items():
-        if other.record is not None:
-            source = generator(seed, f"predict {other.record.sha256}")
-            bands.append(
-                predict_record(
-                    posterior, chosen, other.record, other.start, source, name, other.judged
-                )
-            )
-    return tuple(bands)
 
 
 def _chain(
@@ -311,30 +319,6 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     )
 
 
-def judged(
-    problem: Problem,
-    bands: Iterable[Bands],
-    background: Background,
-    found: Innovations,
-    moved: Moved | None,
-) -> dict[str, Verdict]:
-    """Judge all bands that have readings, by name."""
-    start = innovations.odd_start(found)
-    verdicts = {}
-    for one in bands:
-        # Of several training windows the first one holds the start.
-        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
-        far = beyond_training(problem.posterior, one.voltage, one.interval)
-        verdict = (
-            assess(one, background, start=start, moved=moved, beyond=far)
-            if at_start
-            else assess(one, background, beyond=far)
-        )
-        if verdict is not None:
-            verdicts[one.name] = verdict
-    return verdicts
-
-
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
     record, config = problem.record, problem.config
     windows = ", ".join(
@@ -372,13 +356,7 @@ def going_on(path: Path, problem: Problem) -> str:
     return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
-def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it hangs on the readings, not on a name."""
-    assert bands.measured is not None
-    return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")
-
-
-def _write(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
     """Write everything that a run leaves; the summary last, as the sign that all is there."""
     numbers = summary(result) | {
         "seed": problem.config.seed,

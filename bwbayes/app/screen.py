@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 
 from rich.console import Console
@@ -21,6 +21,10 @@ from bwbayes.results.scores import Scores
 from bwbayes.results.verdict import Verdict
 
 __all__ = [
+    "PARAMETER_COLUMNS",
+    "SCORE_COLUMNS",
+    "parameter_rows",
+    "score_texts",
     "show_calibration",
     "show_loops",
     "show_priors",
@@ -33,24 +37,21 @@ __all__ = [
 # Probability by which constraints must move a quantile to be shown: more than draws do.
 CHANGED = 0.03
 
+PARAMETER_COLUMNS = ("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
+SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
 
-def show_result(result: Result, folder: RunFolder, console: Console) -> None:
-    """Show a finished run; without intervals, if it has not converged."""
+
+def show_result(result: Result, folder: RunFolder | None, console: Console) -> None:
+    """Show a finished run; without intervals, if it has not converged.
+
+    The folder, if given, is where its report lies.
+    """
     show_verdicts(result.verdicts.values(), console)
-    numbers = summary(result)["parameters"]
-    if isinstance(numbers, Mapping):
-        table = Table("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
-        for name, row in numbers.items():
-            ess = min(row["ess_bulk"], row["ess_tail"])
-            table.add_row(
-                name,
-                f"{row['mean']:.5g}",
-                f"{row['sd']:.2g}",
-                f"{row['lower_95']:.5g} to {row['upper_95']:.5g}",
-                escape(row["unit"]),
-                f"{ess:.0f}",
-                f"{row['rhat']:.3f}",
-            )
+    rows = list(parameter_rows(result))
+    if rows:
+        table = Table(*PARAMETER_COLUMNS)
+        for row in rows:
+            table.add_row(*map(escape, row))
         console.print(table)
         show_scores(result.scores, console, result.verdicts)
         if result.loops is not None:
@@ -58,7 +59,26 @@ def show_result(result: Result, folder: RunFolder, console: Console) -> None:
     console.print(_sampling(result), highlight=False, soft_wrap=True)
     for remark in result.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
-    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+    if folder is not None:
+        console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
+    """Yield the free parameters' estimates as texts, one for each of ``PARAMETER_COLUMNS``.
+
+    None without convergence.
+    """
+    numbers = summary(result)["parameters"]
+    for name, row in numbers.items() if isinstance(numbers, Mapping) else ():
+        yield (
+            name,
+            f"{row['mean']:.5g}",
+            f"{row['sd']:.2g}",
+            f"{row['lower_95']:.5g} to {row['upper_95']:.5g}",
+            row["unit"],
+            f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
+            f"{row['rhat']:.3f}",
+        )
 
 
 def show_verdicts(verdicts: Iterable[Verdict], console: Console) -> None:
@@ -81,28 +101,10 @@ def show_scores(
     scores: Mapping[str, Scores], console: Console, verdicts: Mapping[str, Verdict] | None = None
 ) -> None:
     """Show how predictions turned out."""
-    table = Table(
-        "prediction",
-        *(["holds"] if verdicts else []),
-        "NRMSE",
-        "max error",
-        "CRPS",
-        "95 % width",
-        "sensor band covers",
-    )
+    table = Table("prediction", *(["holds"] if verdicts else []), *SCORE_COLUMNS)
     for name, one in scores.items():
-        covered = one.coverage["sensor"] or {}
-        error = one.coverage_error["sensor"] or {}
         held = [_held(verdicts[name])] if verdicts else []
-        table.add_row(
-            name,
-            *held,
-            f"{one.nrmse:.2%}",
-            f"{one.max_error_um:.2f} um",
-            f"{one.crps_um:.3f} um",
-            f"{one.width_um[95]:.2f} um",
-            ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
-        )
+        table.add_row(name, *held, *score_texts(one))
     console.print(table)
 
 
@@ -116,6 +118,19 @@ def show_loops(loops: Loops, console: Console) -> None:
         cells = ("-" if e is None else f"{e.lower:.4g} to {e.upper:.4g}" for e in estimates)
         table.add_row(title.lower(), *cells, unit)
     console.print(table)
+
+
+def score_texts(scores: Scores) -> tuple[str, ...]:
+    """Return scores as texts, one for each of ``SCORE_COLUMNS``."""
+    covered = scores.coverage["sensor"] or {}
+    error = scores.coverage_error["sensor"] or {}
+    return (
+        f"{scores.nrmse:.2%}",
+        f"{scores.max_error_um:.2f} um",
+        f"{scores.crps_um:.3f} um",
+        f"{scores.width_um[95]:.2f} um",
+        ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
+    )
 
 
 def _held(verdict: Verdict) -> str:

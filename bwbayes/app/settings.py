@@ -7,7 +7,7 @@ A key is a field here and nowhere else: its type is what is checked, its :func:`
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
@@ -102,6 +102,27 @@ class _Source(Table):
             example='"command"',
         ),
     ] = None
+    columns: Annotated[
+        dict[str, str] | None,
+        described(
+            "The file's columns by quantity, where their names are not like voltage_V.",
+            example='{ time = "t [ms]", voltage = "U_mV", displacement = "pos" }',
+        ),
+    ] = None
+    units: Annotated[
+        dict[str, str] | None,
+        described(
+            "Units by quantity, where the columns' names lack them; a minus turns the sign.",
+            example='{ displacement = "nm" }',
+        ),
+    ] = None
+
+    @model_validator(mode="after")
+    def _naming(self) -> Self:
+        from bwbayes.data.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
+
+        Naming(self.columns or {}, self.units or {})
+        return self
 
 
 class RecordConfig(_Source):

@@ -1,7 +1,7 @@
 """From the columns of a file to a record that can be trusted.
 
-Every reader turns its file into a :class:`Table`: columns as they stand in the file, with the
-units in their names. :func:`build_record` converts the units and checks what all formats share:
+Every reader turns its file into a :class:`Table`: columns as they stand in the file, and their
+units. :func:`checked` converts the units and checks what all formats share:
 lengths, finite numbers, a uniform time grid, a voltage and a displacement that move. A displacement
 may be missing here and there (nan), and so may whole samples where the voltage is a command, which
 is held. A problem is one line, ``file:line: column: problem; what to do``; files without lines name
@@ -13,44 +13,37 @@ from __future__ import annotations
 import difflib
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.data.record import Record, VoltageIs, require_voltage_is
+from bwbayes.data.columns import COMMON_NAMES, Naming
 from bwbayes.errors import InputError, InputWarning
 
 __all__ = [
     "AT_EVERY_SAMPLE",
     "MAXIMUM_SAMPLES",
     "MINIMUM_SAMPLES",
+    "Checked",
     "Column",
     "Table",
-    "build_record",
+    "VoltageIs",
+    "checked",
     "named_columns",
-    "parse_name",
-    "require_readable",
+    "require_voltage_is",
 ]
+
+VoltageIs = Literal["command", "output"]
+"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
 
 MINIMUM_SAMPLES = 10
 MAXIMUM_SAMPLES = 10**8
 
-# Powers of ten that lead from a column's unit to s, V and um. Both micro signs of Unicode count.
-_TIME = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
-_VOLTAGE = {"V": 0, "mV": -3, "kV": 3, "uV": -6, "µV": -6, "μV": -6}
-_LENGTH = {"um": 0, "µm": 0, "μm": 0, "nm": -3, "mm": 3, "m": 6}
-_UNITS = {"time": _TIME, "voltage": _VOLTAGE, "displacement": _LENGTH, "truth": _LENGTH}
-_NAMES = {
-    "time": "time_s",
-    "voltage": "voltage_V",
-    "displacement": "displacement_um",
-    "truth": "truth_um",
-}
 _SHORTEST = 1e-12  # s
 _LATEST = 1e12  # s
 _LARGEST = 1e9  # V or um: beyond it a unit is wrong, whatever the actuator
@@ -60,11 +53,12 @@ AT_EVERY_SAMPLE = "give one at every sample (only a displacement may be missing:
 
 @dataclass(frozen=True)
 class Column:
-    """One column as it stands in a file: its name there, its values, its power of ten."""
+    """One column as it stands in a file: its name, values, power of ten, and sign (1 or -1)."""
 
     name: str
     values: NDArray[Any]
     power: int
+    sign: int = 1
 
 
 @dataclass(frozen=True)
@@ -91,52 +85,60 @@ class Table:
         if quantity in self.columns:
             where += f": {self.columns[quantity].name}"
         elif quantity:
-            where += f": {_NAMES[quantity]}"
+            where += f": {COMMON_NAMES[quantity]}"
         return InputError(f"{where}: {problem}")
 
 
-def parse_name(name: str) -> tuple[str, int]:
-    """Return quantity and power of ten of a column's name, such as ``voltage_mV``.
+class Checked(TypedDict):
+    """What a record is made of, in the package's units and with their checks behind them."""
 
-    Raises
-    ------
-    ValueError
-        With the text ``problem; what to do`` if the name is none that is known.
-    """
-    quantity, _, unit = name.strip().rpartition("_")
-    units = _UNITS.get(quantity.lower())
-    if units is None and name.strip().lower() in _UNITS:
-        raise ValueError(f"no unit in the name; write {_NAMES[name.strip().lower()]}")
-    if units is None:
-        known = [_NAMES[key] for key in ("time", "voltage", "displacement")]
-        near = difflib.get_close_matches(name.strip(), known, 1, 0.4)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        raise ValueError(f"unknown column; {hint}")
-    if unit not in units:
-        raise ValueError(f"unknown unit {unit!r}; write one of {', '.join(units)}")
-    return quantity.lower(), units[unit]
+    voltage: FloatArray
+    displacement: FloatArray | None
+    interval: float
+    start: float
+    voltage_is: VoltageIs
+    origin: str
+    truth: FloatArray | None
+
+
+def require_voltage_is(text: str) -> VoltageIs:
+    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
+    for known in get_args(VoltageIs):
+        if text == known:
+            return known  # type: ignore[no-any-return]
+    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
 
 
 def named_columns(
-    path: Path, names: Iterable[str], size: Callable[[str], int], load: Callable[[str], Any]
+    path: Path,
+    names: Collection[str],
+    naming: Naming,
+    size: Callable[[str], int],
+    load: Callable[[str], Any],
 ) -> dict[str, Column]:
     """Return the columns among the named arrays of a binary file; other arrays are passed over.
 
-    `size` gives the number of values of an array before `load` reads it, so that a damaged file
-    cannot ask for all memory.
+    `naming` says which arrays are meant. `size` gives the number of values of an array before
+    `load` reads it, so that a damaged file cannot ask for all memory.
     """
     columns: dict[str, Column] = {}
+    try:
+        naming.require_in(names)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
     for name in names:
         try:
-            quantity, power = parse_name(name)
-        except ValueError:
+            quantity, power, sign = naming.of(name)
+        except ValueError as error:
+            if name in naming.columns.values():
+                raise InputError(f"{path}: {name}: {error}") from None
             continue
         if quantity in columns:
             problem = f"{name}: {quantity} is also in {columns[quantity].name}; remove one"
             raise InputError(f"{path}: {problem}")
         if size(name) > MAXIMUM_SAMPLES:
             raise InputError(f"{path}: {name}: {size(name)} values; give at most {MAXIMUM_SAMPLES}")
-        columns[quantity] = Column(name, _real_vector(path, name, load(name)), power)
+        columns[quantity] = Column(name, _real_vector(path, name, load(name)), power, sign)
     return columns
 
 
@@ -151,10 +153,10 @@ def _real_vector(path: Path, name: str, values: Any) -> NDArray[Any]:
     return array.ravel()
 
 
-def build_record(
+def checked(
     table: Table, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
-) -> Record:
-    """Return the record of a table after all checks that do not depend on the format.
+) -> Checked:
+    """Return what a table's record is made of, after all checks that do not depend on the format.
 
     Parameters
     ----------
@@ -192,43 +194,22 @@ def build_record(
     if rows is not None:
         values = {name: _filled(column, rows, name) for name, column in values.items()}
     origin = table.notes.get("origin") or table.path.name
-    return Record(
-        values["voltage"],
-        values.get("displacement"),
-        interval,
-        start,
-        kind,
-        origin,
-        values.get("truth"),
+    return Checked(
+        voltage=values["voltage"],
+        displacement=values.get("displacement"),
+        interval=interval,
+        start=start,
+        voltage_is=kind,
+        origin=origin,
+        truth=values.get("truth"),
     )
-
-
-def require_readable(record: Record, where: str) -> None:
-    """Refuse a record that could be written to a file and not be read back.
-
-    Raises
-    ------
-    InputError
-        As for a file that is called ``where``.
-    """
-    arrays = {
-        "time": record.time,
-        "voltage": record.voltage,
-        "displacement": record.displacement,
-        "truth": record.truth,
-    }
-    columns = {q: Column(_NAMES[q], v, 0) for q, v in arrays.items() if v is not None}
-    table = Table(Path(where), columns, {"interval_s": repr(record.interval)})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        build_record(table, need_displacement=record.displacement is not None)
 
 
 def _check_lengths(table: Table, needed: Iterable[str]) -> None:
     for quantity in needed:
         if quantity not in table.columns:
             names = [name for name in table.names if name]
-            near = difflib.get_close_matches(_NAMES[quantity], names, 1)
+            near = difflib.get_close_matches(COMMON_NAMES[quantity], names, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"found: {', '.join(names[:10])}"
             header = None if table.first_line is None else -1  # the line above the first sample
             raise table.error(f"missing; add it ({hint})", quantity, header)
@@ -246,7 +227,7 @@ def _converted(table: Table, quantity: str) -> FloatArray:
     column = table.columns[quantity]
     with np.errstate(all="ignore"):
         values = np.asarray(column.values, dtype=np.float64)
-        values = _scaled(values, column.power)
+        values = column.sign * _scaled(values, column.power)
         refused = ~(np.abs(values) <= (_LATEST if quantity == "time" else _LARGEST))
     if quantity == "displacement":
         refused &= ~np.isnan(values)

@@ -19,11 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.checks import AT_EVERY_SAMPLE, Column, Table, parse_name
+from bwbayes.data.checks import AT_EVERY_SAMPLE, Column, Table
+from bwbayes.data.columns import Naming
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["read_csv", "write_csv"]
+__all__ = ["header_names", "read_csv", "write_csv"]
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
@@ -32,15 +33,22 @@ _SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 
 class _Header(NamedTuple):
-    """A column's name, its quantity ("" if it is none that counts), and its power of ten."""
+    """A column's name, its quantity ("" if it is none that counts), power of ten, and sign."""
 
     name: str
     quantity: str
     power: int
+    sign: int
 
 
-def read_csv(path: Path) -> Table:
-    """Return the columns of a text file.
+def header_names(path: Path) -> list[str]:
+    """Return the names of a text file's columns; errors as of :func:`read_csv`."""
+    line, header, _, _ = _header_and_body(path, _decoded(path, path.read_bytes()))
+    return _cells(f"{path}:{line}:", header)
+
+
+def read_csv(path: Path, naming: Naming) -> Table:
+    """Return the columns of a text file that ``naming`` says.
 
     Raises
     ------
@@ -50,7 +58,7 @@ def read_csv(path: Path) -> Table:
     """
     text = _decoded(path, path.read_bytes())
     header_line, header, body, notes = _header_and_body(path, text)
-    columns = _header_columns(path, header_line, header)
+    columns = _header_columns(path, header_line, header, naming)
     ended = body.endswith("\n")
     body = body.rstrip("\n ")
     if not body:
@@ -71,7 +79,7 @@ def read_csv(path: Path) -> Table:
     known = [column for column in columns if column.quantity]
     return Table(
         path,
-        {c.quantity: Column(c.name, values[:, i], c.power) for i, c in enumerate(known)},
+        {c.quantity: Column(c.name, values[:, i], c.power, c.sign) for i, c in enumerate(known)},
         notes,
         first_line=header_line + 1,
         names=tuple(column.name for column in columns),
@@ -132,31 +140,43 @@ def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, st
     raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
 
 
-def _header_columns(path: Path, line: int, header: str) -> list[_Header]:
-    """Return what stands in the header; columns of other quantities only beside all that count."""
-    where = f"{path}:{line}:"
+def _cells(where: str, header: str) -> list[str]:
+    """Return the names in a header."""
     for separator, words in _SEPARATORS.items():
         if separator in header:
             raise InputError(f"{where} {words} separate the columns; separate them by commas")
     if "," not in header and len(header.split()) > 1:
         raise InputError(f"{where} blanks separate the columns; separate them by commas")
-    names = [cell.strip() for cell in header.split(",")]
+    names = [cell.strip().strip('"') for cell in header.split(",")]
     if all(_NUMBER.fullmatch(name) for name in names):
         raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
+    return names
+
+
+def _header_columns(path: Path, line: int, header: str, naming: Naming) -> list[_Header]:
+    """Return what stands in the header; columns of other quantities only beside all that count."""
+    where = f"{path}:{line}:"
+    names = _cells(where, header)
+    try:
+        naming.require_in(names)
+    except ValueError as error:
+        raise InputError(f"{where} {error}") from None
     columns: list[_Header] = []
     unknown = ""
     for number, name in enumerate(names, start=1):
         shown = _quoted(name)[1:-1] or f"column {number}"
         try:
-            quantity, power = parse_name(name)
+            quantity, power, sign = naming.of(name)
         except ValueError as error:
+            if name in naming.columns.values():
+                raise InputError(f"{where} {shown}: {error}") from None
             unknown = unknown or f"{where} {shown}: {error}"
-            quantity, power = "", 0
+            quantity, power, sign = "", 0, 1
         if quantity == "truth":
             raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
         if quantity and quantity in [column.quantity for column in columns]:
             raise InputError(f"{where} {name}: second {quantity} column; remove one")
-        columns.append(_Header(name if quantity else shown, quantity, power))
+        columns.append(_Header(name if quantity else shown, quantity, power, sign))
     # An unknown name is most likely the missing one, misspelt.
     missing = {"time", "voltage", "displacement"} - {column.quantity for column in columns}
     if unknown and missing:

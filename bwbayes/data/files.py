@@ -7,33 +7,40 @@ The noise-free displacement of a simulated record travels with it: in a second t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from bwbayes.data.checks import Table, build_record
-from bwbayes.data.csvfile import read_csv, write_csv
+from bwbayes.data.checks import Table, VoltageIs, checked, require_voltage_is
+from bwbayes.data.columns import Naming
+from bwbayes.data.csvfile import header_names, read_csv, write_csv
 from bwbayes.data.hdf5file import read_hdf5, write_hdf5
 from bwbayes.data.matfile import MatVersion, read_mat, write_mat
-from bwbayes.data.record import Record, VoltageIs, require_voltage_is
+from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
-__all__ = ["read_record", "write_record"]
+__all__ = ["SUFFIXES", "column_names", "read_record", "write_record"]
 
 _TEXT = (".csv", ".txt")
-_READERS: dict[str, Callable[[Path], Table]] = {
+_READERS: dict[str, Callable[[Path, Naming], Table]] = {
     ".csv": read_csv,
     ".txt": read_csv,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
     ".mat": read_mat,
 }
+SUFFIXES = tuple(_READERS)
 
 
 def read_record(
-    path: str | Path, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
+    path: str | Path,
+    *,
+    voltage_is: VoltageIs | None = None,
+    need_displacement: bool = True,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -46,6 +53,12 @@ def read_record(
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
         False also accepts a planned voltage without a displacement.
+    columns : dict
+        Names of the columns in the file by quantity, where they are others than above:
+        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "pos"}``.
+    units : dict
+        Units by quantity, ``{"displacement": "nm"}``, where the names do not say them; ``"-nm"``
+        turns the sign.
 
     Raises
     ------
@@ -61,13 +74,26 @@ def read_record(
     path = Path(path)
     if voltage_is is not None:
         require_voltage_is(voltage_is)
-    record = build_record(
-        _read_table(path), voltage_is=voltage_is, need_displacement=need_displacement
-    )
+    table = _read_table(path, Naming(columns or {}, units or {}))
+    record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() in _TEXT and truth_path.exists():
         return _with_truth(record, truth_path)
     return record
+
+
+def column_names(path: str | Path) -> list[str]:
+    """Return the names of all columns or arrays that a record's file has.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has no header.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _TEXT:
+        return _opened(path, lambda: header_names(path))
+    return list(_read_table(path, Naming()).names)
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
@@ -103,18 +129,23 @@ def _known_suffix(path: Path) -> str:
     return suffix
 
 
-def _read_table(path: Path) -> Table:
+def _read_table(path: Path, naming: Naming) -> Table:
+    return _opened(path, lambda: _READERS[path.suffix.lower()](path, naming))
+
+
+def _opened[T](path: Path, read: Callable[[], T]) -> T:
+    """Return what is read from a file, and say what keeps it from being opened."""
     try:
         if path.is_dir():
             raise InputError(f"{path}: is a directory; give the file in it")
-        reader = _READERS[_known_suffix(path)]
+        _known_suffix(path)
         if not path.exists():
             raise InputError(f"{path}: does not exist; check the path")
         if not path.is_file():
             raise InputError(f"{path}: is not a regular file; give one")
         with path.open("rb"):  # so that a file without permission says so in every format
             pass
-        return reader(path)
+        return read()
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
@@ -126,7 +157,7 @@ def _truth_path(path: Path) -> Path:
 
 
 def _with_truth(record: Record, path: Path) -> Record:
-    truth = build_record(_read_table(path))
+    truth = Record(**checked(_read_table(path, Naming())))
     same = truth.samples == record.samples and np.allclose(
         truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
     )

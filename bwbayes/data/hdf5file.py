@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 
 from bwbayes.data.checks import Table, named_columns
+from bwbayes.data.columns import Naming
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
@@ -31,8 +32,8 @@ _NO_BLOCK = 1
 _NOTES = ("voltage_is", "origin", "interval_s")
 
 
-def read_hdf5(path: Path) -> Table:
-    """Return the columns of an HDF5 file.
+def read_hdf5(path: Path, naming: Naming) -> Table:
+    """Return the columns of an HDF5 file that ``naming`` says.
 
     Raises
     ------
@@ -46,18 +47,18 @@ def read_hdf5(path: Path) -> Table:
         with h5py.File(path, "r") as file:
             group = _group_of_columns(path, file)
             notes = {key: _text(group.attrs[key]) for key in _NOTES if key in group.attrs}
-            return group_table(path, group, notes)
+            return group_table(path, group, naming, notes)
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
         raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it anew") from error
 
 
-def group_table(path: Path, group: Any, notes: dict[str, str]) -> Table:
+def group_table(path: Path, group: Any, naming: Naming, notes: dict[str, str]) -> Table:
     """Return the columns among the datasets of an open HDF5 group."""
     names = tuple(datasets(group))
     columns = named_columns(
-        path, names, lambda name: int(group[name].size or 0), lambda name: group[name][()]
+        path, names, naming, lambda name: int(group[name].size or 0), lambda name: group[name][()]
     )
     return Table(path, columns, notes, names=names)
 

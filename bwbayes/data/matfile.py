@@ -22,6 +22,7 @@ import scipy.io
 from scipy.io.matlab import MatReadWarning, matfile_version
 
 from bwbayes.data.checks import MAXIMUM_SAMPLES, Table, named_columns
+from bwbayes.data.columns import Naming
 from bwbayes.data.hdf5file import check_lists, datasets, group_table, record_arrays
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
@@ -43,8 +44,8 @@ _PLAIN_CLASSES = {"double", "single", "char", "logical"} | {
 }
 
 
-def read_mat(path: Path) -> Table:
-    """Return the columns of a MATLAB file, version 5 or 7.3.
+def read_mat(path: Path, naming: Naming) -> Table:
+    """Return the columns of a MATLAB file, version 5 or 7.3, that ``naming`` says.
 
     Raises
     ------
@@ -52,7 +53,7 @@ def read_mat(path: Path) -> Table:
         If it is no MATLAB file, is damaged, or has variables that are no vectors of real numbers.
     """
     try:
-        return _read_7_3(path) if h5py.is_hdf5(path) else _read_5(path)
+        return _read_7_3(path, naming) if h5py.is_hdf5(path) else _read_5(path, naming)
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
@@ -71,7 +72,7 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
         _write_7_3(path, arrays, texts)
 
 
-def _read_5(path: Path) -> Table:
+def _read_5(path: Path, naming: Naming) -> Table:
     if matfile_version(path, appendmat=False)[0] != 1:
         raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
     _check_elements(path.read_bytes())
@@ -87,7 +88,7 @@ def _read_5(path: Path) -> Table:
                 raise InputError(f"{path}: {name}: is of class {classes[name]}; store real numbers")
             return scipy.io.loadmat(path, appendmat=False, variable_names=[name])[name]
 
-        columns = named_columns(path, shapes, lambda name: math.prod(shapes[name]), load)
+        columns = named_columns(path, shapes, naming, lambda name: math.prod(shapes[name]), load)
         notes = {}
         for key in ("voltage_is", "origin", "interval_s"):
             if math.prod(shapes.get(key, (0,))) > 0:
@@ -139,7 +140,7 @@ def _first(values: Any) -> str:
     return repr(float(value)) if np.asarray(value).dtype.kind in "iuf" else str(value)
 
 
-def _read_7_3(path: Path) -> Table:
+def _read_7_3(path: Path, naming: Naming) -> Table:
     check_lists(path)
     with h5py.File(path, "r") as file:
         names = set(datasets(file))
@@ -150,7 +151,7 @@ def _read_7_3(path: Path) -> Table:
                 notes[key] = codes.tobytes().decode("utf-16-le", errors="replace")
         if "interval_s" in names:
             notes["interval_s"] = _first(file["interval_s"][()])
-        return group_table(path, file, notes)
+        return group_table(path, file, naming, notes)
 
 
 def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> None:

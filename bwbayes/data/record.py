@@ -11,19 +11,21 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
-from bwbayes.errors import InputError, one_line
+from bwbayes.data.checks import Column, Table, VoltageIs, checked, require_voltage_is
+from bwbayes.data.columns import COMMON_NAMES, Naming
+from bwbayes.data.frames import frame_table
+from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["Record", "Split", "VoltageIs", "Window", "require_voltage_is"]
-
-VoltageIs = Literal["command", "output"]
-"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
+__all__ = ["Record", "Split", "Window", "require_readable"]
 
 Window = tuple[float, float]
 """A stretch of time in s: start <= time < stop."""
@@ -98,6 +100,82 @@ class Record:
         object.__setattr__(self, "start", float(self.start) + 0.0)  # turns -0.0 into 0.0
         object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
         object.__setattr__(self, "origin", one_line(self.origin))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        voltage: ArrayLike,
+        displacement: ArrayLike | None = None,
+        *,
+        interval: float,
+        start: float = 0.0,
+        voltage_is: VoltageIs = "output",
+        origin: str = "arrays",
+    ) -> Self:
+        """Return the record of a voltage in V and a displacement in um, checked as a file is.
+
+        Parameters
+        ----------
+        voltage, displacement : arrays (samples,), V and um
+            The displacement is nan where a reading is missing, and None for a planned voltage.
+        interval, start : float, s
+            Sampling interval, and time of the first sample.
+        voltage_is, origin
+            As of the record itself.
+
+        Raises
+        ------
+        InputError
+            What cannot be used, as of a file: too few samples, a voltage that does not move.
+        """
+        # The record makes arrays of what it gets, or says that it cannot.
+        given: Any = {"voltage": voltage, "displacement": displacement}
+        made = cls(**given, interval=interval, start=start, voltage_is=voltage_is, origin=origin)
+        require_readable(made, origin)
+        return made
+
+    @classmethod
+    def from_pandas(
+        cls,
+        frame: Any,
+        *,
+        time: str | None = None,
+        voltage: str | None = None,
+        displacement: str | None = None,
+        units: dict[str, str] | None = None,
+        voltage_is: VoltageIs = "output",
+        origin: str = "DataFrame",
+    ) -> Self:
+        """Return the record of a pandas table, whose time column gives the sampling interval.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+            A column each for time, voltage and displacement; without the last one it is a planned
+            voltage. A time of dates or durations counts from its first sample.
+        time, voltage, displacement : str
+            The columns' names, if they are not ``time_s``, ``voltage_mV`` and the like.
+        units : dict
+            Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
+        voltage_is, origin
+            As of the record itself.
+
+        Raises
+        ------
+        InputError
+            A column that is missing or without a unit, times that are not uniform, and all else
+            that a file is refused for.
+
+        Warns
+        -----
+        InputWarning
+            If samples are missing in which a commanded voltage was held.
+        """
+        given = {"time": time, "voltage": voltage, "displacement": displacement}
+        columns = {quantity: name for quantity, name in given.items() if name is not None}
+        table = frame_table(frame, Naming(columns, units or {}), origin)
+        need = displacement is not None
+        return cls(**checked(table, voltage_is=voltage_is, need_displacement=need))
 
     @property
     def samples(self) -> int:
@@ -243,12 +321,25 @@ class Record:
         )
 
 
-def require_voltage_is(text: str) -> VoltageIs:
-    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
-    for known in get_args(VoltageIs):
-        if text == known:
-            return known  # type: ignore[no-any-return]
-    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
+def require_readable(record: Record, where: str) -> None:
+    """Refuse a record that could be written to a file and not be read back.
+
+    Raises
+    ------
+    InputError
+        As for a file that is called ``where``.
+    """
+    arrays = {
+        "time": record.time,
+        "voltage": record.voltage,
+        "displacement": record.displacement,
+        "truth": record.truth,
+    }
+    columns = {q: Column(COMMON_NAMES[q], v, 0) for q, v in arrays.items() if v is not None}
+    table = Table(Path(where), columns, {"interval_s": repr(record.interval)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        checked(table, need_displacement=record.displacement is not None)
 
 
 def _offset(record: Record, time: float) -> float:

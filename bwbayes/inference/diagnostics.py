@@ -14,6 +14,7 @@ passes. This module alone knows arviz's statistics.
 
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -140,7 +141,8 @@ def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> C
         Of how many steps the draws are one.
     """
     free = draws.shape[-1]
-    with ThreadPoolExecutor(THREADS) as executor:
+    # Where threads silence warnings side by side, as arviz does, the last to end may leave them so.
+    with warnings.catch_warnings(), ThreadPoolExecutor(THREADS) as executor:
         each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
         rhat, bulk, tail, mean, autocorrelation, walker_rhat = np.array([*each]).T
     # A thinned series does not tell times below its own step.

@@ -202,7 +202,8 @@ def _units(posterior: Posterior, place: FloatArray, spread: FloatArray) -> Float
     steps = parts[:, np.newaxis, np.newaxis] * np.diag(spread)
     both = np.concatenate([place + steps, place - steps]).reshape(-1, place.size)
     forth, back = posterior.log_density(both).reshape(2, parts.size, place.size)
-    cost = posterior.log_density(place[np.newaxis]) - (forth + back) / 2
+    with np.errstate(invalid="ignore"):  # a density of zero here and there has no cost
+        cost = posterior.log_density(place[np.newaxis]) - (forth + back) / 2
     cheap = cost < 1
     cheap[-1] = True
     units: FloatArray = spread * parts[np.argmax(cheap, axis=0)]

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import arviz_base
 import numpy as np
@@ -19,11 +20,20 @@ from bwbayes.data.record import Record
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
 
-__all__ = ["write_bands", "write_posterior", "write_summary"]
+__all__ = ["posterior_tree", "write_bands", "write_posterior", "write_summary"]
 
 
 def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, record: Record) -> None:
-    """Write the draws as arviz groups, and whether they have converged.
+    """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
+    tree = posterior_tree(result, log_likelihood, record)
+    temporary = path.with_suffix(".partial")
+    # From memory: HDF5 does not survive a disk that is full.
+    temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
+    temporary.replace(path)
+
+
+def posterior_tree(result: Result, log_likelihood: FloatArray, record: Record) -> Any:
+    """Return the draws as arviz groups, an xarray.DataTree, and whether they have converged.
 
     Groups: posterior, sample_stats, log_likelihood (of all readings together), observed_data and
     constant_data. A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say
@@ -32,8 +42,6 @@ def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, reco
 
     Parameters
     ----------
-    path
-        The file.
     result
         The run.
     log_likelihood
@@ -78,10 +86,7 @@ def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, reco
     tree.attrs["converged"] = tree["posterior"].attrs["converged"] = int(result.outcome.converged)
     for parameter in result.free:
         tree["posterior"][parameter.name].attrs["units"] = parameter.unit
-    temporary = path.with_suffix(".partial")
-    # From memory: HDF5 does not survive a disk that is full.
-    temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
-    temporary.replace(path)
+    return tree
 
 
 def write_bands(path: Path, bands: Sequence[Bands]) -> None:

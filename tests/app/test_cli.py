@@ -20,6 +20,7 @@ from tests.app import small
 from tests.data.spoilt import looping
 
 COMMANDS = (
+    "init",
     "run",
     "resume",
     "check",

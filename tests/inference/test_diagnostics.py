@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in
 from emcee.moves import DEMove
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference import diagnostics
 from bwbayes.inference.diagnostics import (
     Check,
     as_chains,
@@ -418,3 +420,16 @@ def test_pareto_k_of_what_is_not_a_number_is_not_trusted() -> None:
     log_weights = np.random.default_rng(14).standard_normal(1000)
     log_weights[3] = np.nan
     assert not pareto_k(log_weights) < 0.7
+
+
+def test_a_check_leaves_the_warnings_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where its threads change them, as they do when two silence warnings side by side."""
+
+    def silencing(_: FloatArray) -> FloatArray:
+        warnings.simplefilter("ignore")
+        return np.ones(6)
+
+    monkeypatch.setattr(diagnostics, "_one_parameter", silencing)
+    before = list(warnings.filters)
+    check(good_draws(), moving(), BLOCK)
+    assert before == list(warnings.filters)

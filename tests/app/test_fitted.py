@@ -1,0 +1,349 @@
+"""From arrays to bands in five lines, by the folder and the functions of the command line."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bwbayes as bw
+from bwbayes.app import fitted, run
+from bwbayes.app.config import load
+from bwbayes.app.fitted import Fit
+from bwbayes.app.model_settings import StandConfig
+from bwbayes.app.predict import predict
+from bwbayes.data import Record, read_record
+from bwbayes.results.files import write_bands
+from bwbayes.results.prediction import Start
+from tests.app import small
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> Record:
+    return read_record(folder / "records/record.h5")
+
+
+@pytest.fixture(scope="module")
+def opened(folder: Path) -> Fit:
+    return bw.open_run(folder)
+
+
+@pytest.fixture(scope="module")
+def keys(folder: Path, opened: Fit) -> dict[str, Any]:
+    """Return tests/app/small.py's config as keyword arguments."""
+    return {
+        "name": "small",
+        "seed": 3,
+        "train": (0, 5),
+        "parameters": {"initial": {"fixed": 0.0}, "gamma": {"fixed": 0.0172}},
+        "ess": 200,
+        "block": 25,
+        "walkers": 18,
+        "validation": {
+            "held-out": (5, 6),
+            "sine": {"record": read_record(folder / "records/sine.h5"), "from_rest": True},
+        },
+        "truth": opened.problem.config.truth,
+        "workers": 1,
+        "progress": False,
+    }
+
+
+@pytest.fixture(scope="module")
+def fit(record: Record, keys: dict[str, Any]) -> Fit:
+    """Return a fit of the small run's arrays."""
+    arrays = record.voltage, record.displacement
+    made = bw.Record.from_arrays(*arrays, interval=record.interval, voltage_is="command")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return bw.fit(replace(made, origin=record.origin, truth=record.truth), **keys)
+
+
+@pytest.fixture
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "draw_all", lambda _: {})
+
+
+def stopped(folder: Path, steps: int = 25) -> Fit:
+    """Return the run of a folder as its first steps leave it."""
+    made = bw.open_run(folder)
+    outcome = replace(made.outcome, converged=False, stop_reason=f"budget of {steps} steps used up")
+    return replace(made, outcome=outcome)
+
+
+# Arrays to bands
+
+
+def test_arrays_become_bands_in_five_lines(folder: Path, fit: Fit) -> None:
+    """The fit is the second line of them."""
+    assert fit.converged
+    assert fit.holds is not False
+    new_record = read_record(folder / "records/sine.h5")
+    bands = fit.predict(new_record, from_rest=True)
+    table = bands.to_pandas()
+    assert list(table.columns[:4]) == ["time_s", "voltage_V", "displacement_um", "mean_um"]
+    assert len(table) == new_record.samples
+    assert bands.scores is not None
+    assert 0.8 < np.mean(np.abs(bands.residuals) < 2 * (table.sensor_upper_95_um - table.mean_um))
+    assert bands.plot().axes
+
+
+def test_draws_and_summary_are_labelled_and_agree(fit: Fit) -> None:
+    assert ("chain", "draw") == tuple(fit.draws.sizes)
+    table = fit.summary
+    assert set(fit.draws.data_vars) == set(table.index)
+    for name, row in table.iterrows():
+        assert row["mean"] == pytest.approx(float(fit.draws[name].mean()))
+        assert row["sd"] == pytest.approx(float(fit.draws[name].std()), rel=1e-3)
+        assert row["unit"] == fit.draws[name].attrs["units"]
+    assert set(fit.posterior.children) >= {"posterior", "sample_stats", "log_likelihood"}
+
+
+def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
+    record = fit.problem.record
+    assert record.displacement is not None
+    residuals = fit.residuals
+    assert (record.samples,) == residuals.shape
+    for name, window in (("training", slice(0, 250)), ("held-out", slice(250, 300))):
+        expected = record.displacement[window] - fit.bands[name].mean
+        np.testing.assert_array_equal(expected, residuals.values[window])
+    np.testing.assert_array_equal(record.time, residuals.time)
+
+
+# What it shows
+
+
+def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
+    said, page = repr(fit), fit._repr_html_()
+    for name, row in fit.summary.iterrows():
+        for text in (str(name), f"{row['mean']:.5g}", f"{row['sd']:.2g}"):
+            assert text in said
+            assert text in page
+    assert said.startswith("small: converged, ")
+    assert page.count("<table>") == 2
+    assert '<th scope="col">mean</th>' in page
+
+
+def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:
+    config = opened.problem.config.model_copy(update={"name": "<b>x</b>"})
+    shown = replace(opened, problem=replace(opened.problem, config=config))
+    assert "&lt;b&gt;x" in shown._repr_html_()
+
+
+@pytest.mark.parametrize(
+    "name", ["loop", "bands", "coverage", "innovations", "corner", "trace", "ranks", "record"]
+)
+def test_every_figure_is_one_of_matplotlib(fit: Fit, name: str) -> None:
+    assert getattr(fit.plot, name)().axes
+
+
+def test_a_figure_that_does_not_exist_is_one_line(fit: Fit) -> None:
+    with pytest.raises(bw.InputError, match=r"plot: no 'heldout' here; did you mean held-out\?"):
+        fit.plot.bands("heldout")
+
+
+# One format, one path
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_saved_it_is_the_command_lines_run_bit_by_bit(
+    folder: Path, fit: Fit, tmp_path: Path
+) -> None:
+    path = fit.save(tmp_path / "copy")
+    small.assert_same_end(folder, path)
+    # The record was an array, and not the stand's signal: the stand is not mentioned.
+    theirs_config = load(folder / "config.toml").model_copy(update={"stand": StandConfig()})
+    assert theirs_config == load(path / "config.toml")
+    ours = {one.relative_to(path).as_posix() for one in path.rglob("*") if one.is_file()}
+    theirs = {one.relative_to(folder).as_posix() for one in folder.rglob("*") if one.is_file()}
+    assert ours == {name for name in theirs if not name.startswith("figures/")}
+    with pytest.raises(bw.InputError, match=r"copy: exists"):
+        fit.save(path)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_saved_and_opened_again_it_is_the_same(fit: Fit, tmp_path: Path) -> None:
+    again = bw.open_run(fit.save(tmp_path / "copy"))
+    assert again.summary.equals(fit.summary)
+    assert again.draws.equals(fit.draws)
+    assert (again.seconds, again.remarks) == (fit.seconds, fit.remarks)
+    assert repr(again) == repr(fit)
+
+
+def test_a_prediction_is_the_command_lines(folder: Path, opened: Fit, tmp_path: Path) -> None:
+    copy = tmp_path / "sine.h5"
+    shutil.copyfile(folder / "records/sine.h5", copy)
+    out = tmp_path / "theirs.csv"
+    predict(folder, copy, None, Start(from_rest=True), out, small.quiet())
+    write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True)])
+    assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_ctrl_c_leaves_a_folder_to_go_on_from(
+    record: Record,
+    keys: dict[str, Any],
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("bwbayes.app.progress.Progress.__call__", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            bw.fit(record, folder=tmp_path / "a", **keys)
+    with pytest.raises(bw.InputError, match=r"a: exists; go on with `bwbayes resume"):
+        bw.fit(record, folder=tmp_path / "a", **keys)
+    assert bw.resume_run(tmp_path / "a", workers=1, progress=False).converged
+    small.assert_same_end(folder, tmp_path / "a")
+
+
+# Without convergence
+
+
+def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path) -> None:
+    made = stopped(folder)
+    line = r"not converged: budget of 25 steps used up; no interval is given. Go on with fit.resume"
+    for ask in (
+        lambda: made.summary,
+        lambda: made.bands,
+        lambda: made.residuals,
+        lambda: made.predict(made.problem.record),
+        made.plot.loop,
+        made.plot.corner,
+    ):
+        with pytest.raises(bw.NotConvergedError, match=line):
+            ask()
+    assert made.holds is None
+    assert made.verdicts == {}
+
+
+def test_without_convergence_the_draws_and_the_chains_figures_stay(folder: Path) -> None:
+    made = stopped(folder)
+    assert made.draws["d"].size
+    assert made.draws.attrs["converged"] == 0
+    assert made.plot.trace().axes
+    for text in (repr(made), made._repr_html_()):
+        assert "NOT CONVERGED: budget of 25 steps used up; no interval is given" in text
+        assert "95 %" not in text
+
+
+def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
+    record: Record,
+    keys: dict[str, Any],
+    fit: Fit,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.warns(bw.InputWarning, match="not converged: budget of 25 steps") as caught:
+        made = bw.fit(record, **keys | {"steps": 25})
+    assert {__file__} == {warning.filename for warning in caught}
+    assert not made.converged
+    again = made.resume(steps=20_000, workers=1, progress=False)
+    assert again.draws.equals(fit.draws)
+    assert list(tmp_path.iterdir())
+    del made, again
+    assert [] == list(tmp_path.iterdir())
+
+
+# Remarks are warnings, at the line that asked
+
+
+def test_remarks_of_the_record_are_warnings(
+    record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bwbayes.app.calls.carried_on", none)
+    assert record.displacement is not None
+    spoilt = record.displacement.copy()
+    spoilt[120] += 60.0
+    with (
+        pytest.raises(KeyboardInterrupt),
+        pytest.warns(bw.InputWarning, match="record: spikes: 1 isolated outlier") as caught,
+    ):
+        bw.fit(replace(record, displacement=spoilt))
+    assert {__file__} == {warning.filename for warning in caught}
+
+
+def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None:
+    other = read_record(folder / "records/sine.h5")
+    assert other.displacement is not None
+    turned = replace(other, displacement=-other.displacement)
+    with pytest.warns(
+        bw.InputWarning, match="sine, not fitted: does not hold: .*against"
+    ) as caught:
+        bands = opened.predict(turned, from_rest=True, name="sine")
+    assert {__file__} == {warning.filename for warning in caught}
+    assert bands.holds is False
+    assert "DOES NOT HOLD" in repr(bands)
+
+
+def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
+    made = opened.problem.record
+    plan = replace(made, voltage=5 * made.voltage, displacement=None, truth=None)
+    with pytest.warns(bw.InputWarning, match="plan: the voltage .* are an extrapolation"):
+        bands = opened.predict(plan, from_rest=True, name="plan")
+    assert bands.scores is None
+    assert bands.holds is None
+    assert np.isnan(bands.residuals).all()
+
+
+def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened.predict(folder / "records/sine.h5", from_rest=True)
+
+
+# Keys
+
+
+@pytest.fixture
+def _no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitted, "go_on", None)
+
+
+@pytest.mark.usefixtures("_no_run")
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ({"dynamcs": "lag"}, "fit: dynamcs: unknown key; did you mean dynamics?"),
+        ({"draws": 3}, "fit: draws: unknown key; did you mean ess?"),
+        ({"model": {}}, "fit: model: unknown key; give the keys of [model] themselves"),
+        ({"parameters": {"d": {"fixd": 1.0}}}, "fit: parameters.d.fixd: unknown key; did you mean"),
+        ({"parameters": {"delta": {"fixed": 1.0}}}, "parameters.delta: no such parameter here"),
+        ({"train": "all"}, "fit: record.train: input should be a valid list"),
+        ({"train": (5, 90)}, "window 5 to 90 s: reaches outside the record"),
+        ({"dynamics": "leg"}, "dynamics: 'leg' is unknown; did you mean lag?"),
+        ({"validation": {"a": {"windw": (0, 1)}}}, "fit: validation.a.windw: unknown key; did you"),
+        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is no record"),
+        ({"validation": {"a": "none.csv"}}, "none.csv: does not exist; check the path"),
+    ],
+)
+def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], line: str) -> None:
+    with pytest.raises(bw.InputError) as error:
+        bw.fit(record, **wrong)
+    assert line in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("_no_run")
+def test_what_is_no_record_is_one_line(record: Record) -> None:
+    with pytest.raises(bw.InputError, match=r"ndarray is no record; make one with Record.from_arr"):
+        bw.fit(record.voltage)  # type: ignore[arg-type]
+    with pytest.raises(bw.InputError, match="fit: record: has no displacement"):
+        bw.fit(replace(record, displacement=None, truth=None))

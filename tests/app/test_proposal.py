@@ -1,0 +1,280 @@
+"""From a CSV at once: a record without a config gets one, or one clear line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from bwbayes.app import cli
+from bwbayes.app.config import load
+from bwbayes.app.problem import resolve
+from bwbayes.app.proposal import Proposal, propose
+from bwbayes.arrays import FloatArray
+from bwbayes.data import Record, read_record
+from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.data.waveforms import Decay, Sine, Waveform
+from bwbayes.errors import InputError
+
+OWN = "time_s,voltage_V,displacement_um"
+FOREIGN = "t [ms],U_mV,pos"
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    """Return a decaying sine of six seconds at 100 Hz."""
+    waveform = Waveform(Sine(100.0, 1.0), 6.0, 0.0, Decay(1.0, 0.1))
+    return VirtualTestStand("process", 100.0).run(waveform, np.random.default_rng(1))
+
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path, record: Record) -> Write:
+    """Return a function that writes a CSV of the record's columns, changed and scaled."""
+
+    def written(
+        header: str = OWN,
+        factors: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        change: Callable[[FloatArray], object] = lambda _: None,
+        rows: slice | np.ndarray = slice(None),
+    ) -> Path:
+        assert record.displacement is not None
+        displacement = record.displacement.copy()
+        change(displacement)
+        columns = np.stack([record.time, record.voltage, displacement], axis=1) * factors
+        lines = [",".join(f"{value:.9g}" for value in row) for row in columns[rows]]
+        path = tmp_path / "mine.csv"
+        path.write_text("\n".join([header, *lines]) + "\n")
+        return path
+
+    return written
+
+
+def command(*arguments: str | Path) -> Result:
+    """Return what a command did."""
+    return CliRunner().invoke(cli.cli, [str(one) for one in arguments], standalone_mode=False)
+
+
+def proposed(path: Path, **units: str) -> Proposal:
+    return propose(path, path.parent, units)
+
+
+# What is recognised
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "units"),
+    [
+        (OWN, (1.0, 1.0, 1.0), {}),
+        ("time_ms,voltage_mV,displacement_nm", (1e3, 1e3, 1e3), {}),
+        (FOREIGN, (1e3, 1e3, 1e3), {"displacement": "nm"}),
+        ("t / s,command [V],x (mm)", (1.0, 1.0, 1e-3), {}),
+        ("Time,Volt,Position", (1.0, 1.0, 1.0), {"time": "s", "voltage": "V"}),
+        ("displacement_um,voltage_V,time_s", (1.0, 1.0, 1.0), {}),
+        ("time_s,voltage_V,displcement_um", (1.0, 1.0, 1.0), {}),
+        ("time,voltage,displacement", (1.0, 1e-3, 1.0), {"voltage": "kV", "time": "s"}),
+    ],
+)
+def test_columns_and_units_are_recognised(
+    write: Write,
+    record: Record,
+    header: str,
+    factors: tuple[float, float, float],
+    units: dict[str, str],
+) -> None:
+    if header.startswith(("Time", "time,")):
+        units = units | {"displacement": "um"}
+    order = [2, 1, 0] if header.startswith("disp") else [0, 1, 2]
+    path = write(header, factors)
+    if order[0]:
+        rows = [line.split(",")[::-1] for line in path.read_text().splitlines()[1:]]
+        path.write_text("\n".join([header, *(",".join(row) for row in rows)]) + "\n")
+    made = proposed(path, **units)
+    source = made.config.record
+    read = read_record(path, columns=source.columns, units=source.units)
+    assert read.interval == pytest.approx(record.interval, rel=1e-6)
+    np.testing.assert_allclose(read.voltage, record.voltage, atol=1e-5)
+    assert read.displacement is not None
+    np.testing.assert_allclose(read.displacement, record.displacement, atol=1e-5)  # type: ignore[arg-type]
+
+
+def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:
+    made = proposed(write(FOREIGN, (1e3, 1e3, 1e3)), displacement="nm")
+    path = write(FOREIGN, (1e3, 1e3, 1e3))
+    config = path.with_suffix(".toml")
+    config.write_text(made.text)
+    assert load(config) == made.config
+    problem = resolve(load(config), path.parent)
+    assert ["held_out"] == list(problem.validations)
+    assert problem.posterior.training == (slice(0, 450),)
+    assert problem.validations["held_out"].window == slice(450, 600)
+    assert problem.config.record.columns is None  # the run's own copy has the package's names
+
+
+def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: Write) -> None:
+    text = proposed(write()).text
+    assert text.startswith("# mine.csv: 600 samples every 0.01 s from 0 s on\n# voltage -")
+    assert "# Nothing wrong shows in it." in text
+    assert "# from_rest = true  # it starts at 0 V, moving; say so if" in text
+    assert '# voltage_is = "command"' in text
+
+
+def test_a_start_in_motion_is_said(write: Write) -> None:
+    text = proposed(write(rows=slice(20, None))).text
+    assert re.search(r"# from_rest = false  # it starts at 9\d\.\d V, moving: its history is", text)
+
+
+# What is held out
+
+
+def _drive(write: Write, voltage: Callable[[FloatArray], FloatArray], samples: int = 600) -> Path:
+    path = write()
+    time = np.arange(samples) / 100
+    drive = voltage(time)
+    rows = np.stack([time, drive, 0.7 * drive + 0.1 * np.sin(40 * time)], axis=1)
+    path.write_text("\n".join([OWN, *(",".join(f"{v:.9g}" for v in row) for row in rows)]) + "\n")
+    return path
+
+
+def _gap_and_growth(time: FloatArray) -> FloatArray:
+    """Return a drive whose third quarter stands still, and whose last is larger than the rest."""
+    size = np.select([time < 3, time < 4.5], [10.0, 0.0], 90.0)
+    drive: FloatArray = size * np.sin(2 * np.pi * time)
+    return drive
+
+
+def test_a_part_is_held_out_whose_drive_the_rest_covers(write: Write) -> None:
+    """Of a growing sine this is the third quarter, and not the last."""
+    made = proposed(_drive(write, lambda t: (20 + 10 * t) * np.sin(2 * np.pi * t)))
+    assert [3.0, 4.5] == made.config.validation["held_out"].window
+    assert [[0.0, 3.0], [4.5, 6.0]] == made.config.record.train
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        lambda write: _drive(write, _gap_and_growth),
+        lambda write: _drive(write, lambda t: 50 * np.sin(9 * t), 110),
+    ],
+    ids=["nothing alike", "few readings"],
+)
+def test_nothing_is_held_out_where_the_rest_would_not_do(
+    write: Write, path: Callable[[Write], Path]
+) -> None:
+    made = proposed(path(write))
+    assert {} == made.config.validation
+    assert "Too little of the record can be left out" in made.text
+
+
+# What is wrong
+
+
+def _spikes(displacement: FloatArray) -> None:
+    displacement[np.arange(30, 440, 41)] += 60.0
+
+
+def _turned(displacement: FloatArray) -> None:
+    displacement *= -1
+
+
+def test_ten_outliers_are_set_aside(write: Write) -> None:
+    path = write(change=_spikes)
+    made = proposed(path)
+    assert made.config.model.outliers
+    assert "# spikes: 10 isolated outliers" in made.text
+    problem = resolve(made.config, path.parent)
+    assert any(text.startswith("10 readings set aside") for text in problem.remarks)
+
+
+@pytest.mark.parametrize(
+    ("written", "line"),
+    [
+        (
+            {"change": _turned},
+            "reversed sign: the displacement falls by .* --unit displacement=-um`",
+        ),
+        (
+            {"factors": (1.0, 1e3, 1.0)},
+            "wrong units: voltages of up to .*; check the units in the",
+        ),
+        ({"rows": np.r_[0:200, 220:600]}, r"csv:202: time_s: gap of 0.21 s .*; give the voltage"),
+        ({"header": "time_s,voltage_V,pos"}, "pos: no unit of the displacement .* --unit displ"),
+        ({"header": "time_s,a_V,b_V"}, "which column is the voltage"),
+        ({"header": "time_s,voltage_V,displacement_pm"}, "displacement_pm: no unit|which column"),
+    ],
+    ids=["sign", "mV", "gap", "no unit", "two voltages", "odd unit"],
+)
+def test_what_makes_a_fit_pointless_is_one_line(
+    write: Write, written: dict[str, object], line: str
+) -> None:
+    path = write(**written)
+    done = command("run", path)
+    assert isinstance(done.exception, InputError)
+    assert re.search(line, str(done.exception)), str(done.exception)
+    assert "" == done.output
+    assert ["mine.csv"] == [one.name for one in path.parent.iterdir()]
+
+
+def test_a_reversed_sign_is_turned_by_its_unit(write: Write, record: Record) -> None:
+    path = write(change=_turned)
+    assert 0 == command("init", path, "--unit", "displacement=-um").return_value
+    problem = resolve(load(path.with_suffix(".toml")), path.parent)
+    assert problem.record.displacement is not None
+    np.testing.assert_allclose(problem.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
+    assert () == problem.findings
+
+
+# The commands
+
+
+def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write) -> None:
+    path = write()
+    done = command("init", path)
+    assert 0 == done.return_value
+    assert done.output.startswith("wrote ")
+    assert path.with_suffix(".toml").read_text() == proposed(path).text
+    again = command("init", path)
+    assert isinstance(again.exception, InputError)
+    assert "mine.toml: exists; edit it, or choose another name with --out" in str(again.exception)
+
+
+def test_init_elsewhere_finds_the_record(write: Write) -> None:
+    path = write()
+    (path.parent / "configs").mkdir()
+    out = path.parent / "configs/a.toml"
+    assert 0 == command("init", path, "--out", out).return_value
+    assert "../mine.csv" == load(out).record.file
+    assert 600 == resolve(load(out), out.parent).record.samples
+
+
+@pytest.mark.parametrize("unit", ["displacement", "length=nm", "displacement=furlong", "time=-s"])
+def test_a_unit_that_does_not_exist_is_one_line(write: Write, unit: str) -> None:
+    assert isinstance(command("init", write(), "--unit", unit).exception, InputError)
+
+
+def test_run_without_a_config_runs_the_proposed_one(
+    write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = write(FOREIGN.replace("pos", "pos_nm"), (1e3, 1e3, 1e3))
+    ran: list[Path] = []
+
+    def finish(folder: Path, *_: object) -> int:
+        ran.append(folder)
+        return 0
+
+    monkeypatch.setattr(cli, "_finish", finish)
+    done = command("run", path, "--out", tmp_path / "out", "--quiet")
+    assert 0 == done.return_value
+    assert "" == done.output
+    assert [tmp_path / "out"] == ran
+    config = load(tmp_path / "out/config.toml")
+    assert ("mine", [[0.0, 4.5]]) == (config.name, config.record.train)
+    assert [4.5, 6.0] == config.validation["held_out"].window
+    said = command("run", path, "--out", tmp_path / "again").output
+    assert "fitting 0 to 4.5 s; the rest is held out; `bwbayes init" in said
