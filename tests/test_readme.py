@@ -12,9 +12,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bwbayes.app import cli
+from bwbayes.app.config import parse
+from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.results.bands import LEVELS
 from tests.found import found
 
@@ -40,6 +44,27 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
             cli.main()
     assert ended.value.code == 0
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
+    stand = VirtualTestStand(discrepancy="none")
+    generator = np.random.default_rng(1)
+    record = stand.run(Waveform(Sine(100.0, 1.0), 14.0, decay=Decay(0.0, 0.05)), generator)
+    names: dict[str, Any] = {
+        "voltage": record.voltage,
+        "displacement": record.displacement,
+        "new_record": stand.run(Waveform(Sine(80.0, 0.7), 4.0), generator),
+    }
+    (lines,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    exec(lines, names)  # that is what a reader does
+    assert names["fit"].converged
+    assert names["bands"].scores.nrmse < 0.05
+
+
+@pytest.mark.parametrize("text", re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL))
+def test_each_config_of_the_readme_can_be_read(text: str) -> None:
+    record = "" if "[record]" in text else '[record]\nfile = "my_record.csv"\n'
+    parse(record + text, "README")
 
 
 def test_each_command_starts_from_a_bare_checkout() -> None:
