@@ -37,6 +37,7 @@ __all__ = [
     "InputError",
     "InputWarning",
     "JointPrior",
+    "Loops",
     "NotConvergedError",
     "Outcome",
     "Parameter",
@@ -49,6 +50,8 @@ __all__ = [
     "SamplingPlan",
     "Scores",
     "Start",
+    "Step",
+    "StepResponse",
     "Verdict",
     "VirtualTestStand",
     "Waveform",
@@ -56,10 +59,13 @@ __all__ = [
     "draws",
     "first_chain",
     "fit",
+    "forecast",
     "hysteresis",
     "inspect",
     "judge",
     "load_config",
+    "measure_loops",
+    "measure_step",
     "noise_model",
     "open_run",
     "parse_config",
@@ -103,10 +109,12 @@ if TYPE_CHECKING:
     from bwbayes.model.distributions import Distribution
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
-    from bwbayes.results.prediction import predict_record, predict_windows, thinned
+    from bwbayes.results.loops import Loops, measure_loops
+    from bwbayes.results.prediction import forecast, predict_record, predict_windows, thinned
     from bwbayes.results.replicates import Experiment, Replicate, replicates
     from bwbayes.results.scores import Scores, score
     from bwbayes.results.start import Start
+    from bwbayes.results.steps import Step, StepResponse, measure_step
     from bwbayes.results.verdict import Background, Verdict, assess
 else:
     # The module of each name, and what it is called there if not the same.
@@ -124,6 +132,7 @@ else:
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
+        "Loops": "results.loops",
         "NotConvergedError": "errors",
         "Outcome": "inference.sampling",
         "Parameter": "inference.parameters",
@@ -136,17 +145,22 @@ else:
         "SamplingPlan": "inference.sampling",
         "Scores": "results.scores",
         "Start": "results.start",
+        "Step": "results.steps",
+        "StepResponse": "results.steps",
         "Verdict": "results.verdict",
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",
         "assess": "results.verdict",
         "draws": "inference.sampling",
         "first_chain": "inference.sampling",
+        "forecast": "results.prediction",
         "fit": "app.calls",
         "hysteresis": "model.boucwen",
         "inspect": "data.inspection",
         "judge": "results.calibration",
         "load_config": "app.config:load",
+        "measure_loops": "results.loops",
+        "measure_step": "results.steps",
         "noise_model": "inference.noise",
         "open_run": "app.calls",
         "parse_config": "app.config:parse",

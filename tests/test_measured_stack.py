@@ -88,6 +88,28 @@ def test_white_noise_scores_worse_and_its_parameters_look_too_sure(honest: Any, 
 
 
 @pytest.fixture(scope="module")
+def parts_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("parts") / "out"
+
+
+@pytest.fixture(scope="module")
+def parts(parts_folder: Path) -> Any:
+    """Run the config with another operator and a gain, with default priors alone."""
+    return run(parts_folder, ROOT / "runs/measured_stack_parts.toml")
+
+
+def test_parts_halve_the_error_and_the_bands(honest: Any, parts: Any) -> None:
+    """NRMSE at most 0.42 %, every sensor band within two errors, a third narrower or more."""
+    assert parts["converged"]
+    held_out = parts["validation"]["held_out"]
+    assert held_out["nrmse"] <= 0.0042
+    for level, covered in held_out["coverage"]["sensor"].items():
+        error = held_out["coverage_error"]["sensor"][level]
+        assert abs(covered - int(level) / 100) <= 2 * error, level
+    assert held_out["width_95_um"] <= 0.65 * honest["validation"]["held_out"]["width_95_um"]
+
+
+@pytest.fixture(scope="module")
 def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
@@ -140,6 +162,26 @@ def test_records_cut_out_in_motion_are_predicted(fitted: tuple[Posterior, FloatA
     assert usual[0] >= 0.88
     assert usual[1] <= 0.0095
     assert usual[2] <= 1.7
+    np.testing.assert_allclose(usual, knocked, rtol=0.1)
+
+
+def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
+    parts_folder: Path, parts: Any
+) -> None:
+    """Their 95 % bands cover 88 to 99 %; plain Bouc-Wen's cover more than that."""
+    assert parts["converged"]
+    problem, chain, _ = finished(RunFolder.open(parts_folder))
+    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    drawn = thinned(flat, np.random.default_rng(1))
+    record = read_record(RECORD)
+    results = []
+    for transient in (0.0, 20.0):
+        ten = ((cut(record, n, transient), np.random.default_rng(n)) for n in range(10))
+        bands = [predict_record(problem.posterior, drawn, one, Start(), g) for one, g in ten]
+        results.append(judged(bands))
+    usual, knocked = results
+    assert 0.88 <= usual[0] <= 0.99
+    assert usual[1] <= 0.0095
     np.testing.assert_allclose(usual, knocked, rtol=0.1)
 
 

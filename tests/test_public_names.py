@@ -37,9 +37,11 @@ PUBLIC = {
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},
-    "bwbayes.results.prediction": {"predict_record", "predict_windows", "thinned"},
+    "bwbayes.results.loops": {"Loops", "measure_loops"},
+    "bwbayes.results.prediction": {"forecast", "predict_record", "predict_windows", "thinned"},
     "bwbayes.results.scores": {"Scores", "score"},
     "bwbayes.results.start": {"Start"},
+    "bwbayes.results.steps": {"Step", "StepResponse", "measure_step"},
     "bwbayes.results.verdict": {"Background", "Verdict", "assess"},
 }
 HOMES = {

@@ -1,4 +1,4 @@
-"""Calibration of a config's posterior, from its first replicate to its last file.
+"""Simulation-based calibration of a config's posterior, from first replicate to last file.
 
 :func:`start` makes the folder: the config with every prior an explicit number, the same for all
 replicates. :func:`carry_on` makes whatever replicates are missing, side by side, writes a line for
@@ -41,7 +41,7 @@ __all__ = ["carry_on", "experiment", "start"]
 TRIED = 64
 
 
-class _Wanted(BaseModel):
+class _Request(BaseModel):
     """The first line, and any that asks for more: how many replicates, of what."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -68,8 +68,8 @@ def start(
     """
     problem = resolve(config, where)
     experiment(problem)
-    wanted = _Wanted(replicates=count, of=_identity(problem))
-    return CalibrationFolder.create(out, problem, overwrite, wanted.line)
+    request = _Request(replicates=count, of=_identity(problem))
+    return CalibrationFolder.create(out, problem, overwrite, request.line)
 
 
 def experiment(problem: Problem) -> Experiment:
@@ -122,11 +122,11 @@ def carry_on(
     with folder.locked(), one_thread():
         problem = resolve(load(folder.config), folder.path)
         common = experiment(problem)
-        wanted, entries = _read(folder, common, _identity(problem))
-        if count is not None and count != wanted.replicates:
-            wanted = wanted.model_copy(update={"replicates": count})
-            _append(folder, wanted.line)
-        missing = [number for number in range(wanted.replicates) if number not in entries]
+        request, entries = _read(folder, common, _identity(problem))
+        if count is not None and count != request.replicates:
+            request = request.model_copy(update={"replicates": count})
+            _append(folder, request.line)
+        missing = [number for number in range(request.replicates) if number not in entries]
         # What is written last is the sign that all is there; now something is to come.
         _clear(folder)
         if missing:
@@ -176,18 +176,18 @@ def _append(folder: CalibrationFolder, line: bytes) -> None:
 
 def _read(
     folder: CalibrationFolder, common: Experiment, identity: str
-) -> tuple[_Wanted, dict[int, Entry]]:
+) -> tuple[_Request, dict[int, Entry]]:
     """Read how many replicates are wanted, and those that are there; cut off half a line."""
     content = folder.replicates.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
         os.truncate(folder.replicates, whole)
     first, *others = content[:whole].splitlines() or [b""]
-    wanted = _wanted(folder, first, identity)
+    request = _request(folder, first, identity)
     entries: dict[int, Entry] = {}
     for number, line in enumerate(others, start=2):
         if line.startswith(b'{"replicates"'):
-            wanted = _wanted(folder, line, identity)
+            request = _request(folder, line, identity)
             continue
         try:
             entry = _entry(line, common, entries)
@@ -196,31 +196,31 @@ def _read(
                 f"{folder.replicates}:{number}: is no replicate of these; delete this line"
             ) from None
         entries[entry["number"]] = entry
-    return wanted, entries
+    return request, entries
 
 
-def _wanted(folder: CalibrationFolder, line: bytes, identity: str) -> _Wanted:
+def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
     """Read the line that says how many replicates are wanted, and check that they are these."""
     try:
-        wanted = _Wanted.model_validate_json(line)
+        request = _Request.model_validate_json(line)
     except ValueError:
         raise InputError(
             f"{folder.replicates}: does not say how many replicates there are to be; "
             "calibrate anew with --overwrite"
         ) from None
-    if wanted.of != identity:
+    if request.of != identity:
         raise InputError(
             f"{folder.replicates}: these are replicates of another config or record than the "
             "folder's; put that back, or calibrate anew with --overwrite"
         )
-    return wanted
+    return request
 
 
 def _entry(line: bytes, common: Experiment, others: Mapping[int, Entry]) -> Entry:
     """Read a line, and check that it is a replicate of this experiment, and a new one."""
     entry = TypeAdapter(Entry).validate_json(line)
-    found = [*entry["ranks"]], [*entry["covered"]]
-    if found not in (([*common.statistics], [*common.bands]), ([], [])):
+    stored = [*entry["ranks"]], [*entry["covered"]]
+    if stored not in (([*common.statistics], [*common.bands]), ([], [])):
         raise ValueError("has other statistics")
     if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
         raise ValueError("has a rank that there is not")

@@ -1,4 +1,4 @@
-"""The calibration's page: verdict, what was tested and how sharply, numbers and pictures.
+"""The page of a simulation-based calibration: verdict, tests and their power, numbers, pictures.
 
 One HTML file that needs nothing else, as the report of a run.
 """
@@ -10,6 +10,7 @@ from itertools import product
 from typing import Any
 
 from bwbayes.app.figures.style import unit_text
+from bwbayes.app.model import in_words
 from bwbayes.app.problem import Problem
 from bwbayes.app.report import picture, symbol, template
 from bwbayes.results.bands import KINDS, LEVELS
@@ -108,10 +109,14 @@ def _bands(calibration: Calibration) -> list[dict[str, Any]]:
     """Return a row for each kind of band of held-out windows and of other records, if any."""
     rows = []
     for other, kind in product(calibration.predicted, KINDS):
-        found = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
+        coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
         of = other or "held-out samples"
         rows.append(
-            {"kind": kind, "of": of, "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in found]}
+            {
+                "kind": kind,
+                "of": of,
+                "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in coverages],
+            }
         )
     return rows
 
@@ -128,7 +133,7 @@ def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]
     return [
         ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
         ("fitted, held out", f"{fitted} samples, {judged} samples"),
-        ("model", f"Bouc-Wen, dynamics {model.dynamics}, {model.hold}-order hold"),
+        ("model", in_words(model)),
         ("noise", model.noise),
         (
             "sampling",

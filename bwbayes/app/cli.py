@@ -272,7 +272,7 @@ def calibrate(
     workers: int | None,
     quiet: bool,
 ) -> int:
-    """Calibrate the posterior of a CONFIG: fit simulated records whose truth is known.
+    """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
 
     Each replicate draws parameters from the config's prior, simulates its record anew and fits it
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the

@@ -16,22 +16,21 @@ from typing import Annotated
 import tomlkit
 from pydantic import Field, ValidationError, field_validator
 
-from bwbayes.app.keys import described, one_line
+from bwbayes.app.keys import Table, described, one_line
+from bwbayes.app.model_settings import ActuatorConfig, ModelConfig, StandConfig
 from bwbayes.app.settings import (
-    ModelConfig,
     Name,
     ParameterConfig,
     RecordConfig,
     SamplingConfig,
     SignalConfig,
-    StandConfig,
-    Table,
     ValidationConfig,
 )
 from bwbayes.errors import InputError
 
 __all__ = [
     "LARGEST_SEED",
+    "ActuatorConfig",
     "Config",
     "ModelConfig",
     "ParameterConfig",

@@ -117,8 +117,8 @@ class RunFolder:
 
     def _is_of_its_kind(self) -> bool:
         """Tell a run's folder from a calibration's."""
-        found = (self.path / CalibrationFolder.MARK).is_file()
-        return found == (self.MARK is not None)
+        is_calibration = (self.path / CalibrationFolder.MARK).is_file()
+        return is_calibration == (self.MARK is not None)
 
     def _may_go(self) -> bool:
         """Tell whether nothing of another kind would be lost with this folder."""

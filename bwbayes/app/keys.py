@@ -13,12 +13,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from bwbayes.errors import suggestion
 
-__all__ = ["ANY", "MEANINGS", "Key", "described", "keys", "one_line"]
+__all__ = [
+    "ANY",
+    "MEANINGS",
+    "Key",
+    "Positive",
+    "Table",
+    "described",
+    "keys",
+    "one_line",
+]
 
 # What people call a key of a config, and its name here.
 MEANINGS = {
@@ -65,7 +74,15 @@ MEANINGS = {
 # What stands for the name that a user gives to one of several tables of a kind.
 ANY = "NAME"
 
+Positive = Annotated[float, Field(gt=0)]
+
 KINDS = {str: "text", bool: "true or false", int: "whole number", float: "number", dict: "table"}
+
+
+class Table(BaseModel):
+    """A table of a config: it knows its keys, and takes no others."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def described(text: str, *, unit: str = "", example: str = "") -> Any:
@@ -254,7 +271,7 @@ def _shown(value: object) -> str:
 
 def _is_branch(part: str) -> bool:
     """Tell the names that pydantic gives to the branches of a union from keys."""
-    return part in ("str", "float", "SignalConfig")
+    return part in ("str", "float", "SignalConfig") or part.startswith("function-after")
 
 
 def _keys_at(place: list[str], root: type[BaseModel]) -> list[str]:

@@ -16,7 +16,8 @@ from pydantic import BaseModel
 
 from bwbayes.app.config import Config, checked
 from bwbayes.app.keys import MEANINGS
-from bwbayes.app.settings import ModelConfig, RecordConfig, SamplingConfig, ValidationConfig
+from bwbayes.app.model_settings import ModelConfig
+from bwbayes.app.settings import RecordConfig, SamplingConfig, ValidationConfig
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
 

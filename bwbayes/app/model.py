@@ -6,22 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.app.config import ModelConfig
+from bwbayes.app.config import ActuatorConfig, ModelConfig
 from bwbayes.data import Record
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.registry import HYSTERESIS, made
 
-__all__ = ["actuator_of", "explicit_model"]
+__all__ = ["actuator_of", "explicit_model", "in_words"]
 
 # What a config may say of a hysteresis operator beside its name.
 OPTIONS = ("passive", "thresholds", "odd", "terms")
 
 
-def actuator_of(model: ModelConfig, record: Record) -> Actuator:
+def actuator_of(model: ActuatorConfig, record: Record) -> Actuator:
     """Put the actuator together that a config asks for; ``auto`` and ``true`` ask the record.
 
     Raises
@@ -29,9 +30,9 @@ def actuator_of(model: ModelConfig, record: Record) -> Actuator:
     InputError
         A part that does not exist, or an option that it does not have.
     """
-    hold = model.hold
-    if hold == "auto":
-        hold = "zero" if record.voltage_is == "command" else "first"
+    hold: Hold = "zero" if record.voltage_is == "command" else "first"
+    if isinstance(model, ModelConfig) and model.hold != "auto":
+        hold = model.hold
     span = Span(float(np.min(record.voltage)), float(np.max(record.voltage)))
     return Actuator(
         model.dynamics,
@@ -53,7 +54,7 @@ def explicit_model(model: ModelConfig, actuator: Actuator) -> ModelConfig:
     return model.model_copy(update={"creep": times, **_chosen(actuator.hysteresis)})
 
 
-def _creep(model: ModelConfig, record: Record, span: Span) -> Creep | None:
+def _creep(model: ActuatorConfig, record: Record, span: Span) -> Creep | None:
     """Return the creep that a config asks for, if any; ``true`` takes its times from the record."""
     if model.creep is False or model.creep == []:
         if model.creep_growth:
@@ -63,7 +64,7 @@ def _creep(model: ModelConfig, record: Record, span: Span) -> Creep | None:
     return Creep(tuple(times), model.creep_growth, span)
 
 
-def _options(model: ModelConfig) -> dict[str, object]:
+def _options(model: ActuatorConfig) -> dict[str, object]:
     """Return what the config says of the hysteresis operator beside its name."""
     given = {name: getattr(model, name) for name in OPTIONS}
     return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
@@ -73,3 +74,13 @@ def _chosen(operator: Operator) -> dict[str, Any]:
     """Return the options that an operator has, by name, as a config has them."""
     chosen = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in chosen.items()}
+
+
+def in_words(model: ModelConfig) -> str:
+    """Return which parts a model has, in a line."""
+    parts = [model.hysteresis]
+    if model.gain:
+        parts.append(f"{' and '.join(model.gain)} gain")
+    if model.creep:
+        parts.append("creep that grows with the voltage" if model.creep_growth else "creep")
+    return f"{', '.join(parts)}, dynamics {model.dynamics}, {model.hold} hold"

@@ -33,7 +33,7 @@ NOT_CONVERGED = 4
 def predict(
     path: Path,
     record: Path | None,
-    wanted: str | None,
+    waveform: str | None,
     start: Start,
     out: Path | None,
     console: Console,
@@ -49,7 +49,7 @@ def predict(
         No such run, a record that cannot be used, or a file that is there already.
     """
     folder = RunFolder.open(path)
-    name = record.stem if record is not None else str(wanted)
+    name = record.stem if record is not None else str(waveform)
     table = out or folder.path / "predictions" / f"{name}.csv"
     numbers, picture = table.with_suffix(".json"), table.with_suffix(".png")
     if table in (numbers, picture):
@@ -63,7 +63,7 @@ def predict(
             f"NOT CONVERGED: {path} gives no interval; go on with `bwbayes resume {path}`", err=True
         )
         return NOT_CONVERGED
-    other = _record(problem, record, wanted)
+    other = _record(problem, record, waveform)
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     bands = predict_another(problem, flat, other, start, name, window)
     scores, verdict = bands.scores, bands.verdict
@@ -88,11 +88,11 @@ def predict(
     return 0
 
 
-def _record(problem: Problem, path: Path | None, wanted: str | None) -> Record:
+def _record(problem: Problem, path: Path | None, waveform: str | None) -> Record:
     """Read the record, or sample the signal as the training record was sampled."""
     if path is not None:
         return read_record(path, need_displacement=False)
-    assert wanted is not None
+    assert waveform is not None
     interval = problem.record.interval
-    _, voltage = signal(wanted).sample(1 / interval)
-    return Record(voltage, None, interval, origin=f"{wanted} signal")
+    _, voltage = signal(waveform).sample(1 / interval)
+    return Record(voltage, None, interval, origin=f"{waveform} signal")

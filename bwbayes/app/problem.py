@@ -23,11 +23,20 @@ from bwbayes.app.config import (
 )
 from bwbayes.app.model import actuator_of, explicit_model
 from bwbayes.app.parameters import as_config, context_of, parameters_of
+from bwbayes.app.stand import planned, recoverable, stand_of
 from bwbayes.data import Record, Split, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Triangle, Waveform, signal
+from bwbayes.data.waveforms import (
+    Carrier,
+    Decay,
+    Sine,
+    Staircase,
+    Triangle,
+    Waveform,
+    signal,
+)
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -79,6 +88,12 @@ class Problem:
         """All parameters of the model and the noise."""
         return self.posterior.prior.parameters
 
+    @property
+    def others(self) -> dict[str, Record]:
+        """The records that are predicted, by name, besides the one that is fitted."""
+        every = {name: one.record for name, one in self.validations.items()}
+        return {name: record for name, record in every.items() if record is not None}
+
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
     """Return the generator of one purpose of a run: each has a stream of its own."""
@@ -89,9 +104,14 @@ def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config draws up."""
     if isinstance(wanted, str):
         return signal(wanted)
-    shape = Sine if wanted.shape == "sine" else Triangle
+    carrier: Carrier
+    if wanted.shape == "steps":
+        carrier = Staircase(tuple(wanted.levels or ()), wanted.dwell or 0.0)
+    else:
+        shape = Sine if wanted.shape == "sine" else Triangle
+        carrier = shape(wanted.amplitude or 0.0, wanted.frequency or 0.0)
     return Waveform(
-        shape(wanted.amplitude, wanted.frequency),
+        carrier,
         wanted.duration,
         wanted.start,
         Decay(wanted.decay_from, wanted.decay),
@@ -112,10 +132,10 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         given = records or {}
-        record, truth = _training_record(config, folder, given.get("record"))
+        record, stand = _training_record(config, folder, given.get("record"))
         split = _split(config, record)
         others = {
-            name: _other_record(config, name, folder, given.get(name))
+            name: _other_record(config, name, folder, record, given.get(name))
             for name, validation in config.validation.items()
             if validation.another
         }
@@ -166,6 +186,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         voltage = other.voltage[one.window or slice(None)]
         leaving = beyond_training(posterior, voltage, other.interval)
         remarks += [f"{name}: {remark}" for remark in leaving]
+    truth = (recoverable(stand, actuator) if stand else {}) | config.truth
     explicit = _explicit(config, posterior, truth, aside)
     plan = _plan(config, posterior)
     return Problem(
@@ -220,17 +241,16 @@ def _read(source: RecordConfig | ValidationConfig, folder: Path, given: Record |
 
 def _training_record(
     config: Config, folder: Path, given: Record | None
-) -> tuple[Record, dict[str, float]]:
-    source = config.record
-    truth = dict(config.truth)
+) -> tuple[Record, VirtualTestStand | None]:
+    """Return the record, and the stand that made it, if one did."""
+    source, stand = config.record, None
     if source.file is not None:
         record = _read(source, folder, given)
     else:
         assert source.signal is not None
-        stand = _stand(config)
         waveform = sampled_waveform(source.signal)
+        stand = stand_of(config, planned(config, waveform))
         record = _named(stand.run(waveform, generator(config.seed, "record")), source.signal)
-        truth = stand.parameters() | truth
     if source.exclude is not None:
         record = record.exclude([(window[0], window[1]) for window in source.exclude])
     if source.start is not None or source.stop is not None:
@@ -239,10 +259,12 @@ def _training_record(
     if source.decimate > 1:
         record = record.decimate(source.decimate)
     require_readable(record, "record")
-    return record, truth
+    return record, stand
 
 
-def _other_record(config: Config, name: str, folder: Path, given: Record | None) -> Record:
+def _other_record(
+    config: Config, name: str, folder: Path, training: Record, given: Record | None
+) -> Record:
     source = config.validation[name]
     if source.file is not None:
         record = _read(source, folder, given)
@@ -251,7 +273,7 @@ def _other_record(config: Config, name: str, folder: Path, given: Record | None)
     else:
         assert source.signal is not None
         waveform = sampled_waveform(source.signal)
-        made = _stand(config).run(waveform, generator(config.seed, f"record {name}"))
+        made = stand_of(config, training).run(waveform, generator(config.seed, f"record {name}"))
         record = _named(made, source.signal)
         require_readable(record, f"validation.{name}")
     # Said now: it would be a pity after the sampling.
@@ -277,10 +299,6 @@ def _start(config: Config, name: str) -> Start:
         source.lead_in_from,
         None if hold == "auto" else hold,
     )
-
-
-def _stand(config: Config) -> VirtualTestStand:
-    return VirtualTestStand(config.stand.discrepancy, config.stand.sample_rate)
 
 
 def _named(record: Record, wanted: str | SignalConfig) -> Record:

@@ -57,7 +57,7 @@ class ReplicateProgress(_Line):
     def __init__(self, console: Console, done: int, missing: int, unconverged: int = 0) -> None:
         super().__init__(console)
         self.before = self.done = done
-        self.wanted = done + missing
+        self.total = done + missing
         self.unconverged = unconverged
 
     def __call__(self, converged: bool) -> None:
@@ -66,8 +66,8 @@ class ReplicateProgress(_Line):
         self.unconverged += not converged
         rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
         self.show(
-            f"replicate {self.done} of {self.wanted}   {60 * rate:.1f} a minute   "
-            f"ETA {_minutes((self.wanted - self.done) / rate)}   "
+            f"replicate {self.done} of {self.total}   {60 * rate:.1f} a minute   "
+            f"ETA {_minutes((self.total - self.done) / rate)}   "
             f"not converged {self.unconverged}"
         )
 
@@ -83,15 +83,15 @@ class Progress(_Line):
         self.since = 0  # blocks of ensembles since the check
         self.end: float | None = None  # when it will be done, by the check; of a monotonic clock
 
-    def __call__(self, phase: Phase, found: Check | None) -> None:
+    def __call__(self, phase: Phase, check: Check | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
-        self.done += found is None
-        self.since += found is None
-        if found is not None:
-            self.check, self.since, self.end = found, 0, None
+        self.done += check is None
+        self.since += check is None
+        if check is not None:
+            self.check, self.since, self.end = check, 0, None
         if self.end is None:
             self.end = self._forecast()
-        self.show(self.line(phase), printed=found is not None)
+        self.show(self.line(phase), printed=check is not None)
 
     def line(self, phase: Phase) -> str:
         """Return the line that is shown."""
@@ -123,12 +123,12 @@ class Progress(_Line):
         if self.check is None or not self.done or self.check.disagreements():
             return None
         fewest = float(np.min([self.check.ess_bulk, self.check.ess_tail]))
-        wanted = self.check.steps * self.plan.ess / fewest if fewest > 0 else np.inf
-        wanted = max(wanted, LENGTH * float(np.max(self.check.autocorrelation)))
-        if not np.isfinite(wanted):
+        needed = self.check.steps * self.plan.ess / fewest if fewest > 0 else np.inf
+        needed = max(needed, LENGTH * float(np.max(self.check.autocorrelation)))
+        if not np.isfinite(needed):
             return None
         each = self.plan.block / self.plan.ensembles
-        left = min(wanted, self.plan.most_steps) - self.check.steps - self.since * each
+        left = min(needed, self.plan.most_steps) - self.check.steps - self.since * each
         now = time.monotonic()
         return now + max(left, 0) * (now - self.begun) / (self.done * each)
 

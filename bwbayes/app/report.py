@@ -21,8 +21,10 @@ from bwbayes.app.figures.style import title, unit_text
 from bwbayes.inference.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
+from bwbayes.results.loops import MEASURES, Estimate
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
+from bwbayes.results.steps import STEP_MEASURES
 from bwbayes.results.verdict import Verdict
 
 __all__ = ["Symbol", "digits", "picture", "render", "symbol", "template"]
@@ -38,6 +40,18 @@ CAPTIONS = {
         "Hysteresis loop",
         "Displacement against voltage; below, the marked tip enlarged. The sensor band is where "
         "new readings lie, the parameter band where the model lies.",
+    ),
+    "loops": (
+        "Major loop, minor loop and initial curve",
+        "The model driven slowly, without dynamics, creep and offset. Left: displacement against "
+        "voltage. Right: the same less the straight line between the major loop's turns, where "
+        "the 95 % bands of the parameters can be seen.",
+    ),
+    "steps": (
+        "Step responses",
+        "Displacement since a step of the voltage from zero, over the log of the time; on the "
+        "right its growth from 0.1 s on. Of an ideal step, whatever the amplifier did. Bands: "
+        "95 %, of the parameters.",
     ),
     "bands": (
         "Along time",
@@ -119,6 +133,8 @@ def render(result: Result, summary: Mapping[str, object], pictures: Mapping[str,
         truth_known=any(p.name in result.truth for p in result.free),
         assumed=list(_assumed(result.parameters)),
         validation=_validation(result) if result.outcome.converged and result.scores else None,
+        loops=_loops(result),
+        steps=_steps(result),
         pictures=[
             picture(png, name, *_caption(name))
             for name, png in pictures.items()
@@ -256,6 +272,54 @@ def _validation(result: Result) -> dict[str, Any]:
         for row in zip(*columns, strict=True)
     ]
     return {"titles": [title(bands) for bands in judged], "rows": rows}
+
+
+def _loops(result: Result) -> dict[str, Any] | None:
+    """Return the table of loops: a row for each measure, mean, sd and interval for each loop."""
+    if not result.outcome.converged or result.loops is None:
+        return None
+    both = result.loops.major, result.loops.minor
+    rows = [
+        {
+            "title": title,
+            "unit": unit_text(unit),
+            "texts": [text for loop in both for text in _measured(loop.estimates[name])],
+        }
+        for name, (title, unit) in MEASURES.items()
+    ]
+    titles = [
+        f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V"
+        for name, loop in zip(("Major", "Minor"), both, strict=True)
+    ]
+    return {"titles": titles, "rows": rows, "closed": all(loop.closed for loop in both)}
+
+
+def _steps(result: Result) -> dict[str, Any] | None:
+    """Return the table of steps, built as that of loops."""
+    if not result.outcome.converged or not result.steps:
+        return None
+    every = result.steps.values()
+    rows = [
+        {
+            "title": title,
+            "unit": unit_text(unit),
+            "texts": [text for step in every for text in _measured(step.estimates[name])],
+        }
+        for name, (title, unit) in STEP_MEASURES.items()
+    ]
+    titles = [
+        f"{name}: {one.step.height:.4g} V for {one.step.held:.4g} s"
+        for name, one in result.steps.items()
+    ]
+    return {"titles": titles, "rows": rows}
+
+
+def _measured(one: Estimate | None) -> tuple[str, str, str]:
+    """Return mean, sd and 95 % interval of what was measured, in words."""
+    if one is None:
+        return UNKNOWN, UNKNOWN, UNKNOWN
+    interval = f"{digits(one.lower, one.sd)} to {digits(one.upper, one.sd)}"
+    return digits(one.mean, one.sd), digits(one.sd, one.sd), interval
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from bwbayes.app.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.folder import RunFolder
+from bwbayes.app.model import in_words
 from bwbayes.app.predictions import judged, predictions, scoring
 from bwbayes.app.problem import Problem, generator, resolve
 from bwbayes.app.progress import Progress
@@ -40,10 +41,12 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.sampling import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.results import innovations
 from bwbayes.results.files import write_bands, write_posterior, write_summary
+from bwbayes.results.loops import measure_loops
 from bwbayes.results.prediction import thinned
 from bwbayes.results.refit import without_start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
+from bwbayes.results.steps import measure_steps
 from bwbayes.results.verdict import Background
 
 __all__ = [
@@ -286,6 +289,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     )
     if not outcome.converged:
         return result
+    chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
     found = innovations.innovations(posterior, best, problem.record.start)
@@ -309,6 +313,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         },
         verdicts=verdicts,
         innovations=found,
+        loops=measure_loops(posterior, chosen),
+        steps=measure_steps(posterior, chosen, problem.others),
         remarks=(*result.remarks, *innovations.remarks(found)),
     )
 
@@ -327,7 +333,7 @@ def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str
     return {
         "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
         "fitted": windows,
-        "model": f"Bouc-Wen, dynamics {config.model.dynamics}, {config.model.hold}-order hold",
+        "model": in_words(config.model),
         "noise": config.model.noise,
         "sampling": (
             f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
@@ -359,13 +365,8 @@ def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: fl
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
-    record = problem.record
-    write_posterior(
-        folder.path / "posterior.nc",
-        result,
-        log_likelihood(problem.posterior, result),
-        record,
-    )
+    density = log_likelihood(problem.posterior, result)
+    write_posterior(folder.path / "posterior.nc", result, density, problem.record)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)

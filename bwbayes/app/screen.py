@@ -15,6 +15,7 @@ from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import Calibration
+from bwbayes.results.loops import MEASURES, Loops
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 from bwbayes.results.verdict import Verdict
@@ -25,6 +26,7 @@ __all__ = [
     "parameter_rows",
     "score_texts",
     "show_calibration",
+    "show_loops",
     "show_priors",
     "show_result",
     "show_scores",
@@ -52,6 +54,8 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
             table.add_row(*map(escape, row))
         console.print(table)
         show_scores(result.scores, console, result.verdicts)
+        if result.loops is not None:
+            show_loops(result.loops, console)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
     for remark in result.remarks:
         console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
@@ -101,6 +105,18 @@ def show_scores(
     for name, one in scores.items():
         held = [_held(verdicts[name])] if verdicts else []
         table.add_row(name, *held, *score_texts(one))
+    console.print(table)
+
+
+def show_loops(loops: Loops, console: Console) -> None:
+    """Show what is measured of the major and of the minor loop."""
+    both = loops.major, loops.minor
+    columns = (f"{loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V" for loop in both)
+    table = Table("loop, 95 % interval", *columns, "unit")
+    for name, (title, unit) in MEASURES.items():
+        estimates = (loop.estimates[name] for loop in both)
+        cells = ("-" if e is None else f"{e.lower:.4g} to {e.upper:.4g}" for e in estimates)
+        table.add_row(title.lower(), *cells, unit)
     console.print(table)
 
 

@@ -1,4 +1,4 @@
-"""What a config says, table by table: the home of every key's type, default and description.
+"""What a config says but for the model: the home of every key's type, default and description.
 
 A key is a field here and nowhere else: its type is what is checked, its :func:`described` what
 ``bwbayes config`` prints. A new key is a new field, and a new table a model that
@@ -9,52 +9,50 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    StringConstraints,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, StringConstraints, field_validator, model_validator
 
-from bwbayes.app.keys import described
+from bwbayes.app.keys import Positive, Table, described
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
-    "ModelConfig",
     "Name",
     "ParameterConfig",
     "RecordConfig",
     "SamplingConfig",
     "SignalConfig",
-    "StandConfig",
-    "Table",
     "ValidationConfig",
 ]
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
-Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Window = Annotated[list[float], Field(min_length=2, max_length=2)]
 Windows = Annotated[list[Window], Field(min_length=1)]
-
-
-class Table(BaseModel):
-    """A table of a config: it knows its keys, and takes no others."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class SignalConfig(Table):
     """A voltage for the virtual test stand: V, Hz, s."""
 
     shape: Annotated[
-        Literal["sine", "triangle"], described("Shape of a period.", example='"triangle"')
+        Literal["sine", "triangle", "steps"],
+        described("Shape of a period, or steps.", example='"triangle"'),
     ] = "sine"
-    amplitude: Annotated[Positive, described("Amplitude.", unit="V", example="100.0")]
-    frequency: Annotated[Positive, described("Frequency.", unit="Hz", example="1.0")]
+    amplitude: Annotated[
+        Positive | None, described("Amplitude, but of steps.", unit="V", example="100.0")
+    ] = None
+    frequency: Annotated[
+        Positive | None, described("Frequency, but of steps.", unit="Hz", example="1.0")
+    ] = None
+    levels: Annotated[
+        Annotated[list[float], Field(min_length=1)] | None,
+        described("Voltages of steps.", unit="V", example="[10.0, 50.0, 0.0]"),
+    ] = None
+    dwell: Annotated[
+        Positive | None,
+        described(
+            "How long each step lasts; the last one stays to the end.", unit="s", example="2.0"
+        ),
+    ] = None
     duration: Annotated[
         Positive, described("Length of the record, from zero.", unit="s", example="16.0")
     ]
@@ -69,21 +67,14 @@ class SignalConfig(Table):
         NotNegative, described("When the decay begins.", unit="s", example="4.0")
     ] = 0.0
 
-
-class StandConfig(Table):
-    """The virtual test stand that signals are run on."""
-
-    discrepancy: Annotated[
-        Literal["none", "process", "structural"],
-        described(
-            "How the stand's actuator departs from the model: not at all, by a random process, or "
-            "by creep, drift and an even term.",
-            example='"structural"',
-        ),
-    ] = "process"
-    sample_rate: Annotated[
-        Positive, described("Samples of a record per second.", unit="Hz", example="200.0")
-    ] = 1000.0
+    @model_validator(mode="after")
+    def _of_its_shape(self) -> SignalConfig:
+        own, other = (self.levels, self.dwell), (self.amplitude, self.frequency)
+        if self.shape != "steps":
+            own, other = other, own  # type: ignore[assignment]
+        if None in own or other != (None, None):
+            raise ValueError("give levels and dwell for steps, else amplitude and frequency")
+        return self
 
 
 class _Source(Table):
@@ -193,83 +184,6 @@ class RecordConfig(_Source):
         if (self.file is None) == (self.signal is None):
             raise ValueError("give either file or signal")
         return self
-
-
-class ModelConfig(Table):
-    """The model's parts, by name or by import path, and their options.
-
-    ``passive``, ``thresholds``, ``odd`` and ``terms`` are options of some operators only.
-    """
-
-    hysteresis: Annotated[
-        str,
-        described("The hysteresis operator.", example='"prandtl-ishlinskii"'),
-    ] = "bouc-wen"
-    gain: Annotated[
-        list[str],
-        described(
-            "Terms of the voltage without memory, about the middle of its range: the asymmetry of "
-            "measured loops.",
-            example='["quadratic", "cubic"]',
-        ),
-    ] = Field(default_factory=list)
-    creep: Annotated[
-        bool | list[float],
-        described(
-            "Slow growth after a step: true for a lag per decade of time, or the lags' times in s.",
-            example="true",
-        ),
-    ] = False
-    creep_growth: Annotated[
-        bool, described("Whether the creep grows with the voltage; needs creep.", example="true")
-    ] = False
-    dynamics: Annotated[
-        str, described("The linear dynamics behind the hysteresis.", example='"second-order"')
-    ] = "lag"
-    hold: Annotated[
-        Literal["auto", "first", "zero"],
-        described(
-            "What the voltage does between samples: straight lines (first), held (zero), or held "
-            "if it is a command (auto).",
-            example='"zero"',
-        ),
-    ] = "auto"
-    noise: Annotated[str, described("The model of the residual.", example='"white"')] = (
-        "discrepancy"
-    )
-    passive: Annotated[
-        bool | None,
-        described(
-            "For bouc-wen: whether |gamma| <= beta (the default), not only beta + gamma >= 0.",
-            example="false",
-        ),
-    ] = None
-    thresholds: Annotated[
-        int | list[float] | None,
-        described(
-            "For plays and maxwell-slip: how many thresholds (default: 10), or which.",
-            unit="V if a list",
-            example="[5.0, 20.0, 60.0]",
-        ),
-    ] = None
-    odd: Annotated[
-        bool | None,
-        described("For duhem: whether there are no even terms (default: false).", example="true"),
-    ] = None
-    terms: Annotated[
-        list[str] | None,
-        described(
-            "For bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all).",
-            example='["b4", "b5"]',
-        ),
-    ] = None
-    outliers: Annotated[
-        bool,
-        described(
-            "Whether readings far from what their neighbours predict are set aside.",
-            example="true",
-        ),
-    ] = False
 
 
 class ParameterConfig(Table):

@@ -47,7 +47,7 @@ def one_thread() -> AbstractContextManager[object]:
 
 
 def _start(pool: Executor, count: int) -> None:
-    """Start the workers deaf to the requests that stop a run: its own process sees to those.
+    """Start workers that ignore the signals that stop a run: its own process handles those.
 
     Without that, Ctrl-C would kill the workers first, or while they start make each complain.
     """
@@ -62,7 +62,7 @@ def _start(pool: Executor, count: int) -> None:
 
 
 def _settle() -> None:
-    """Prepare a worker process: one thread, deaf to Ctrl-C, and gone when its parent is."""
+    """Prepare a worker process: one thread, ignoring Ctrl-C, ended with its parent."""
     # The limit is set to libraries that are there, and this one has not been needed yet.
     import scipy.linalg  # noqa: F401, PLC0415
 

@@ -168,7 +168,7 @@ def checked(
     Raises
     ------
     InputError
-        For the first problem found, in one line.
+        For the first problem, in one line.
 
     Warns
     -----
@@ -210,9 +210,9 @@ def _check_lengths(table: Table, needed: Iterable[str]) -> None:
         if quantity not in table.columns:
             names = [name for name in table.names if name]
             near = difflib.get_close_matches(COMMON_NAMES[quantity], names, 1)
-            found = f"did you mean {near[0]!r}?" if near else f"found: {', '.join(names[:10])}"
+            hint = f"did you mean {near[0]!r}?" if near else f"found: {', '.join(names[:10])}"
             header = None if table.first_line is None else -1  # the line above the first sample
-            raise table.error(f"missing; add it ({found})", quantity, header)
+            raise table.error(f"missing; add it ({hint})", quantity, header)
     samples = table.columns["time"].values.size
     for quantity, column in table.columns.items():
         if column.values.size != samples:

@@ -169,8 +169,8 @@ def _outliers(record: Record) -> IntArray:
     levels = np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    found = spikes(displacement, drive, max(SPIKE_PART * extent, 6 * resolution))
-    return rows[found] if found.size <= MOST_SPIKES * rows.size else rows[:0]
+    isolated = spikes(displacement, drive, max(SPIKE_PART * extent, 6 * resolution))
+    return rows[isolated] if isolated.size <= MOST_SPIKES * rows.size else rows[:0]
 
 
 def _spikes(record: Record, outliers: IntArray) -> Iterator[Finding]:

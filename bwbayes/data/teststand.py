@@ -2,9 +2,9 @@
 
 A commanded electrode voltage goes through the DAC and the amplifier, drives the actuator of the
 paper's Table 1, and comes back through the laser sensor and the ADC as a
-:class:`~bwbayes.data.record.Record`. Because real actuators do what no Bouc-Wen model says, the
-displacement can also have a discrepancy of known kind and size, so that an analysis can be held
-against the truth.
+:class:`~bwbayes.data.record.Record`. Another actuator can be put on it, made of any parts that a
+model can have. Because real actuators do what no model says, the displacement can also have a
+discrepancy of known kind and size, so that an analysis can be held against the truth.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -20,10 +22,12 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record
+from bwbayes.data.truths import true_values
 from bwbayes.data.waveforms import Waveform
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Recursion, first_order_lag, second_order
+from bwbayes.model.linear import Recursion, first_order_lag
+from bwbayes.model.operators.one_state import OneState
 
 __all__ = ["Amplifier", "LaserSensor", "RingBender", "VirtualTestStand", "creep"]
 
@@ -154,9 +158,9 @@ class LaserSensor:
 class VirtualTestStand:
     """The whole stand: command in, :class:`~bwbayes.data.record.Record` with its truth out.
 
-    The actuator follows the amplifier's held output (``Actuator(hold="zero")``, second-order
-    dynamics), starting at rest and demagnetised at the first sample. On top of its displacement
-    comes one of three discrepancies:
+    The actuator follows the amplifier's held output, starting at rest and demagnetised at the
+    first sample; an operator that remembers extrema came there straight from zero volts. On top of
+    its displacement comes one of three discrepancies:
 
     ``"none"``
         nothing;
@@ -180,11 +184,19 @@ class VirtualTestStand:
         What drives it.
     sensor : LaserSensor
         What reads it.
+    actuator : Actuator
+        The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
+        interval is the stand's, its hold that of the amplifier.
+    true : mapping of str to float
+        True values of its parameters; of those that are not given the ``table``'s, or those of
+        :func:`~bwbayes.data.truths.true_values`. With an ``initial`` the hysteresis starts in that
+        state.
 
     Raises
     ------
     InputError
-        If the discrepancy is unknown or the sample rate not above zero.
+        If the discrepancy is unknown, the sample rate not above zero, or a true value is none of
+        the actuator's parameters.
     """
 
     discrepancy: Literal["none", "process", "structural"] = "process"
@@ -192,6 +204,8 @@ class VirtualTestStand:
     table: RingBender = RingBender()
     amplifier: Amplifier = Amplifier()
     sensor: LaserSensor = LaserSensor()
+    actuator: Actuator = field(default_factory=lambda: Actuator("second-order", "zero"))
+    true: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.discrepancy not in ("none", "process", "structural"):
@@ -204,13 +218,22 @@ class VirtualTestStand:
                 f"test stand: sample_rate: {self.sample_rate} Hz is not above zero; "
                 "give a positive, finite number"
             )
+        for name in self.true:
+            if name not in self.actuator.parameters:
+                raise InputError(
+                    f"test stand: {name}: its actuator has no such parameter; "
+                    f"{suggestion(name, self.actuator.parameters)}"
+                )
 
     def parameters(self) -> dict[str, float]:
         """Return all true values by name: the actuator's, ``sensor_sd`` and the process's.
 
-        ``discrepancy_sd`` (um) and ``discrepancy_time`` (s) exist for ``"process"`` only.
+        ``discrepancy_sd`` (um) and ``discrepancy_time`` (s) exist for ``"process"`` only. There is
+        no ``initial`` where no value of it is the demagnetised state.
         """
-        truth: dict[str, float] = {**asdict(self.table), "sensor_sd": self.sensor.sd}
+        truth = {**self._values, "sensor_sd": self.sensor.sd}
+        if self._from_rest:
+            del truth["initial"]
         if self.discrepancy == "process":
             truth |= {"discrepancy_sd": PROCESS_SD, "discrepancy_time": PROCESS_TIME}
         return truth
@@ -273,11 +296,34 @@ class VirtualTestStand:
             )
         return command
 
+    @cached_property
+    def _values(self) -> dict[str, float]:
+        """The true values of the actuator's parameters."""
+        return true_values(self.actuator, asdict(self.table)) | dict(self.true)
+
+    @property
+    def _from_rest(self) -> bool:
+        """Whether the voltage came straight from zero; else ``initial`` is the first state."""
+        one_state = isinstance(self.actuator.hysteresis, OneState)
+        return not one_state and "initial" not in self.true
+
+    @property
+    def _columns(self) -> dict[str, FloatArray]:
+        """The true values, (1,) each."""
+        return {name: np.array([value]) for name, value in self._values.items()}
+
+    @property
+    def _driven(self) -> Actuator:
+        """The actuator behind the amplifier."""
+        return replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
+
     def _displacement(self, output: FloatArray) -> FloatArray:
-        actuator = Actuator("second-order", "zero", 1 / self.sample_rate)
-        values = asdict(self.table)
-        theta = np.array([[values[name] for name in actuator.parameters]])
-        (displacement,) = actuator.displacement(theta, output)
+        actuator = self._driven
+        theta = np.array([[self._values[name] for name in actuator.parameters]])
+        try:
+            (displacement,) = actuator.displacement(theta, output, from_rest=self._from_rest)
+        except InputError as error:
+            raise InputError(f"test stand: {error}") from None
         return np.asarray(displacement, dtype=np.float64)
 
     def _discrepancy(
@@ -294,10 +340,8 @@ class VirtualTestStand:
                 return np.zeros_like(displacement)
 
     def _even_term(self, output: FloatArray, interval: float) -> FloatArray:
-        mechanics = (self.table.mass, self.table.damping, self.table.stiffness)
-        mass, damping, stiffness = (np.array([value]) for value in mechanics)
         strain = QUADRATIC_AT_100_V * (output / 100.0) ** 2
-        dynamics = second_order(mass, damping, stiffness, interval, "zero")
+        dynamics = self.actuator.filter.recursion(self._columns, 1, interval, "zero")
         moved: FloatArray = strain[0] + _from_rest(dynamics, strain[np.newaxis] - strain[0])[0]
         return moved
 

@@ -250,7 +250,7 @@ def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
     least, most = parameter.limits(others)
     if np.isfinite(least).all() and np.isfinite(most).all():
         # What the bounds leave to a parameter of which nothing else is known.
-        return float(np.ptp([least, most])) / float(np.sqrt(12))
+        return float(np.max(most) - np.min(least)) / float(np.sqrt(12))
     # Half of the central 68 % stands for the sd: some distributions have none.
     low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
     if parameter.positive:

@@ -12,7 +12,7 @@ posterior has Gaussian tails even where it leans on a bound (γ near β, a discr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -55,7 +55,7 @@ class Parameter:
     fixed: float | None = None
     lower: float = -np.inf
     upper: float = np.inf
-    declared: Declaration | None = None
+    declared: Declaration | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, declared: Declaration, known: Distribution | float) -> Parameter:

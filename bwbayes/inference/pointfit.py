@@ -68,7 +68,12 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
     valleys = _valleys(least_squares, [least_squares.optimum(start) for start in starts])
     noise = draws[:DRAWS, ~least_squares.physical]
-    modes = [_mode(posterior, _with_noise(posterior, v, noise), spread) for v in valleys]
+    places = [_with_noise(posterior, valley, noise) for valley in valleys]
+    # Least squares knows no constraints: a reversed record's optimum may be an impossible place.
+    possible = np.isfinite(posterior.log_density(np.stack(places)))
+    likeliest = draws[int(np.argmax(density))]
+    climbed = [place for place, is_so in zip(places, possible, strict=True) if is_so]
+    modes = [_mode(posterior, place, spread) for place in climbed or [likeliest]]
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
     worth = [m.place for m in modes if m.log_density > best.log_density - HOPELESS]

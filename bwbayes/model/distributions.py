@@ -160,12 +160,12 @@ class Distribution:
         given = dict(self.arguments)
         if self.name not in FAMILIAR:
             return self._by_scipy_name(given)
-        wanted, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
-        missing = [key for key in wanted if key not in given]
-        unknown = [key for key in given if key not in (*wanted, *optional)]
+        required, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
+        missing = [key for key in required if key not in given]
+        unknown = [key for key in given if key not in (*required, *optional)]
         if missing or unknown:
             wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
-            raise InputError(f"{self.name}: {wrong}; it takes {', '.join((*wanted, *optional))}")
+            raise InputError(f"{self.name}: {wrong}; it takes {', '.join((*required, *optional))}")
         lower, upper = given.get("lower", 0.0), given.get("upper", 1.0)
         if not lower < upper:
             raise InputError(

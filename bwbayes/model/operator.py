@@ -77,6 +77,13 @@ class Operator(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the lowest and highest ``initial`` (models,) that earlier drives could leave."""
 
+    def earlier(self, span: Span) -> tuple[Span, ...]:
+        """Return the ranges of earlier drives within a span that leave states of their own.
+
+        The span alone, if ``initial`` in it holds all states.
+        """
+        return (span,)
+
     @abstractmethod
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return a typical slope dw/du (models,), um/V: the scale of an unknown start."""

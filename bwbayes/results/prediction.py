@@ -13,22 +13,23 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import State
 from bwbayes.results import mixture
 from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.start import Start, Started, fitted, started
 
-__all__ = ["DRAWS", "Start", "predict_record", "predict_windows", "thinned"]
+__all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "thinned"]
 
 # Posterior draws in the mixture.
 DRAWS = 1000
@@ -95,6 +96,46 @@ def predict_windows(
         training = any(w.start < window.stop and window.start < w.stop for w in posterior.training)
         bands.append(replace(_bands(name, mixed, record, window), training=training))
     return bands
+
+
+def forecast(
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    voltage: ArrayLike,
+    generator: np.random.Generator,
+    name: str = "forecast",
+) -> Bands:
+    """Predict what follows on the training record: its last sample goes on into a planned voltage.
+
+    Hysteresis, dynamics and creep start from where the record leaves them, and the sensor keeps its
+    offset. The discrepancy has its marginal distribution from the first sample on, so the band of
+    the first moments is wider than what the last readings would allow. Creep with a time longer
+    than the record is known by its prior alone: the model needs times up to the forecast's length.
+
+    Parameters
+    ----------
+    posterior, draws, generator
+        As in :func:`predict_windows`.
+    record
+        The training record, whole.
+    voltage
+        (samples,), V, at the record's sampling interval.
+    name
+        Name of the bands.
+
+    Raises
+    ------
+    InputError
+        A voltage that is not one finite row.
+    """
+    planned = np.asarray(voltage, dtype=np.float64)
+    if planned.ndim != 1 or planned.size == 0 or not np.isfinite(planned).all():
+        raise InputError(f"{name}: voltage of shape {planned.shape}; give one finite row, in V")
+    joined = np.concatenate([record.voltage, planned])
+    longer = replace(record, voltage=joined, displacement=None, truth=None)
+    after = slice(record.samples, longer.samples)
+    return predict_windows(posterior, draws, longer, {name: after}, generator)[0]
 
 
 def predict_record(
@@ -174,12 +215,10 @@ def _simulated(
     start: Started, voltage: FloatArray, window: slice
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
-    state = None
+    states: Sequence[State | None] = ()
     for first in range(0, window.stop, PIECE):
         piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, state = start.actuator.advance(
-            start.model, piece, state, start.unrest, from_rest=start.from_rest
-        )
+        simulated, states = start.advance(piece, states)
         skipped = max(window.start - first, 0)
         if skipped < piece.size:
             yield first + skipped, simulated[:, skipped:]

@@ -16,10 +16,12 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.sampling import Outcome
-from bwbayes.results import innovations
+from bwbayes.results import innovations, loops, steps
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.loops import Loops
 from bwbayes.results.scores import Scores, as_summary
+from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
 
 __all__ = ["Result", "summary"]
@@ -51,6 +53,11 @@ class Result:
         Whether the bands hold, by their name, for those with a measurement.
     innovations
         What each fitted reading brings anew, at the most probable draw; None unless converged.
+    loops
+        The loops of the actuator, measured; None unless converged.
+    steps
+        The responses to the steps among the records that were predicted, by name; empty unless
+        converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -69,6 +76,8 @@ class Result:
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     innovations: Innovations | None = None
+    loops: Loops | None = None
+    steps: Mapping[str, StepResponse] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -92,7 +101,8 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters`` and ``validation`` are None unless the sampling has converged.
+    ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
+    None unless the sampling has converged.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -111,6 +121,8 @@ def summary(result: Result) -> dict[str, object]:
         "parameters": None,
         "validation": None,
         "innovations": None,
+        "loops": None,
+        "step_responses": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -120,6 +132,9 @@ def summary(result: Result) -> dict[str, object]:
         }
         if result.innovations is not None:
             known["innovations"] = innovations.numbers(result.innovations)
+        if result.loops is not None:
+            known["loops"] = loops.numbers(result.loops)
+        known["step_responses"] = steps.numbers(result.steps)
     return known
 
 

@@ -59,9 +59,7 @@ class OtherRecord:
         """
         planned = replace(self.record, displacement=None, truth=None)
         begun = started(posterior, theta, planned, self.start, generator)
-        model = begun.actuator.advance(
-            begun.model, planned.voltage, unrest=begun.unrest, from_rest=begun.from_rest
-        )[0][0]
+        model = begun.advance(planned.voltage)[0][0]
         if self.start.own_offset and self.record.displacement is not None:
             model = model + np.ptp(posterior.readings.values) * generator.standard_normal()
         noise = posterior.noise.at(planned.interval)

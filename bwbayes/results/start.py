@@ -3,51 +3,39 @@
 A record that was not fitted brings unknowns of its own: the hysteretic state it starts from, how
 the dynamics are moving then, and its sensor's offset. Each posterior draw gets its own values. The
 readings of a lead-in, which is not judged later, choose them: offset and dynamics enter linearly
-and are integrated out exactly; the hysteretic state, one number, is found on a grid that closes in
-on where the lead-in allows it. The other parameters keep the posterior of the record that was
-fitted. Whether the lead-in fits the model at all is tested.
+and are integrated out exactly; the hysteretic state comes from :mod:`bwbayes.results.histories`.
+The other parameters keep the posterior of the record that was fitted. Whether the lead-in fits the
+model at all is tested.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy import stats
 from scipy.special import ndtri
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
-from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.actuator import Actuator
+from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
+from bwbayes.results.histories import Histories, States, chosen, uniform
 
-__all__ = ["Start", "Started", "fitted", "started", "uniform"]
-
-# Nodes of the grid of hysteretic states, and how often it closes in at most.
-NODES = 17
-ROUNDS = 6
-
-# A node less probable than the best by this much (nats) is outside of the next grid.
-IMPROBABLE = 10.0
-
-# The grid is fine enough when neighbours within two nats of the best node differ by less than this.
-FINE = 1.5
+__all__ = ["Start", "Started", "fitted", "started"]
 
 # Slow departures of a lead-in that are looked for, as polynomials of the time up to this degree, if
 # there are so many readings; and draws for which they are.
 SLOW = 3
 MANY = 20
 TESTED = 100
-
-# Points between two nodes that a state is chosen from.
-BETWEEN = 8
 
 
 @dataclass(frozen=True)
@@ -109,20 +97,42 @@ class Start:
 class Started:
     """What every draw takes for a record's start.
 
-    ``actuator`` with the record's interval and hold; ``model`` (draws, parameters of the actuator)
-    with initial state and offset; ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd``
-    (draws,), um, what is unsure of the offset still; ``from_rest`` if the record starts so;
-    ``lead_in`` says how that went, if there is one, and ``judged_from`` is the first sample after
-    it.
+    ``actuators`` with the record's interval and hold, one for each history, and ``which`` (draws,)
+    of them it is; ``model`` (draws, parameters of the actuator) with initial state and offset;
+    ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of
+    the offset still; ``from_rest`` if the record starts so; ``lead_in`` says how that went, if
+    there is one, and ``judged_from`` is the first sample after it.
     """
 
-    actuator: Actuator
+    actuators: tuple[Actuator, ...]
+    which: IntArray
     model: FloatArray
     unrest: FloatArray
     offset_sd: FloatArray
     from_rest: bool
     lead_in: LeadIn | None = None
     judged_from: int = 0
+
+    def advance(
+        self, voltage: FloatArray, states: Sequence[State | None] = ()
+    ) -> tuple[FloatArray, Sequence[State | None]]:
+        """Displacement (draws, samples) along the next piece, um, and all histories' states then.
+
+        Without states the record starts here.
+        """
+        result = np.empty((len(self.model), voltage.size))
+        after: list[State | None] = list(states) or [None] * len(self.actuators)
+        for number, actuator in enumerate(self.actuators):
+            rows = np.flatnonzero(self.which == number)
+            if rows.size:
+                result[rows], after[number] = actuator.advance(
+                    self.model[rows],
+                    voltage,
+                    after[number],
+                    self.unrest[rows],
+                    from_rest=self.from_rest,
+                )
+        return result, after
 
 
 def started(
@@ -143,16 +153,17 @@ def started(
     span = _voltages(posterior, record)
     actuator = replace(posterior.actuator, interval=record.interval, hold=hold, span=span)
     window = start.window(record)
-    likelihood = _likelihood(posterior, actuator, record, start, window)
+    whole = _likelihood(posterior, actuator, record, start, window)
+    earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
+    likelihoods = tuple(replace(whole, actuator=replace(actuator, span=one)) for one in earlier)
     if window is None:
-        return _unseen(likelihood, theta, generator)
+        return _unseen(likelihoods, theta, generator)
     if start.own_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
-        theta = likelihood.table.replaced(theta, "offset", level)
-    states = _States(likelihood, theta)
-    chosen = states.at(_chosen(likelihood, states, generator))
-    return _informed(likelihood, chosen, record, window, generator)
+        theta = whole.table.replaced(theta, "offset", level)
+    histories, begun = chosen(likelihoods, theta, generator)
+    return _informed(histories, begun, record, window, generator)
 
 
 def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
@@ -161,13 +172,8 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     start = likelihood.start(theta)
     unrest = _normal(start.mean, start.covariance, generator)
     model, none = posterior.table.actuator(theta), np.zeros(len(theta))
-    return Started(likelihood.actuator, model, unrest, none, posterior.from_rest)
-
-
-def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
-    """Uniform numbers (draws,), one from each of as many equal parts of 0 to 1, in any order."""
-    parts: FloatArray = (generator.permutation(draws) + generator.uniform(size=draws)) / draws
-    return parts
+    which = np.zeros(len(theta), dtype=np.int64)
+    return Started((likelihood.actuator,), which, model, unrest, none, posterior.from_rest)
 
 
 def _voltages(posterior: Posterior, record: Record) -> Span:
@@ -198,85 +204,37 @@ def _likelihood(
     )
 
 
-class _States:
-    """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
-
-    The highest and the lowest are those that an earlier drive within the range of voltages leaves.
-    """
-
-    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
-        self.table, self.theta = likelihood.table, theta
-        if likelihood.from_rest:
-            self.low = self.high = np.zeros(len(theta))
-            return
-        actuator = likelihood.actuator
-        assert actuator.span is not None
-        self.low, self.high = actuator.hysteresis.reachable(
-            self.table.columns(theta), float(likelihood.voltage[0]), actuator.span
-        )
-
-    def at(self, part: FloatArray) -> FloatArray:
-        """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
-        return self.table.replaced(self.theta, "initial", self.low + part * (self.high - self.low))
-
-
-def _unseen(likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator) -> Started:
-    """Draw the start from what is known of it beforehand."""
-    draws = len(theta)
-    sd = likelihood.start_sd(theta)
+def _unseen(
+    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+) -> Started:
+    """Draw the start from what is known of it beforehand: all histories are equally probable."""
+    draws, count, first = len(theta), len(likelihoods), likelihoods[0]
+    which = np.zeros(draws, dtype=np.int64)
+    if count > 1:
+        which = (count * uniform(generator, draws)).astype(np.int64)
+    histories = Histories(likelihoods, which)
+    (sd,) = histories.each(theta, lambda one, some: (one.start_sd(some),))
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    begun = _States(likelihood, theta).at(uniform(generator, draws))
-    model, none = likelihood.table.actuator(begun), np.zeros(draws)
-    return Started(likelihood.actuator, model, unrest, none, likelihood.from_rest)
-
-
-def _chosen(likelihood: Likelihood, states: _States, generator: np.random.Generator) -> FloatArray:
-    """Choose where every draw's state lies, (draws,), from 0 to 1, by what the lead-in says.
-
-    Beforehand all states between the lowest and the highest are equally probable.
-    """
-    draws = len(states.theta)
-    if not np.any(states.high > states.low):
-        return np.zeros(draws)
-    low, high = np.zeros(draws), np.ones(draws)
-    for _ in range(ROUNDS):
-        parts = np.linspace(low, high, NODES)
-        every = np.concatenate([states.at(part) for part in parts])
-        density = likelihood.log_density(every).reshape(NODES, draws)
-        density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
-        density = np.maximum(density - np.max(density, axis=0), -1e3)
-        if np.max(np.abs(np.diff(np.maximum(density, -2.0), axis=0))) < FINE:
-            break
-        possible = density > -IMPROBABLE
-        first = np.maximum(np.argmax(possible, axis=0) - 1, 0)
-        last = NODES - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
-        columns = np.arange(draws)
-        low, high = parts[first, columns], parts[last, columns]
-    return _drawn(parts, density, uniform(generator, draws))
-
-
-def _drawn(parts: FloatArray, density: FloatArray, uniform_: FloatArray) -> FloatArray:
-    """Draw from a log density (nodes, draws) that goes straight from node to node of ``parts``."""
-    inside = (np.arange(BETWEEN)[:, np.newaxis] + 0.5) / BETWEEN
-    fine, places = (
-        np.concatenate([a + inside * (b - a) for a, b in pairwise(nodes)])
-        for nodes in (density, parts)
+    part = uniform(generator, draws)
+    (begun,) = histories.each(
+        np.column_stack([theta, part]),
+        lambda one, some: (States(one, some[:, :-1], alone=count == 1).at(some[:, -1]),),
     )
-    weight = np.cumsum(np.exp(fine), axis=0)
-    index = np.sum(weight < uniform_ * weight[-1], axis=0)
-    drawn: FloatArray = places[index, np.arange(uniform_.size)]
-    return drawn
+    model, none = first.table.actuator(begun), np.zeros(draws)
+    actuators = tuple(one.actuator for one in likelihoods)
+    return Started(actuators, which, model, unrest, none, first.from_rest)
 
 
 def _informed(
-    likelihood: Likelihood,
+    histories: Histories,
     theta: FloatArray,
     record: Record,
     window: slice,
     generator: np.random.Generator,
 ) -> Started:
     """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
-    posterior = likelihood.start(theta)
+    likelihood = histories.likelihoods[0]
+    posterior = LinearStart(*histories.each(theta, Likelihood.start))
     offsets = int(likelihood.offset_sd > 0)
     mean, covariance = posterior.mean, posterior.covariance
     unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
@@ -293,27 +251,29 @@ def _informed(
         float(record.time[window.start]),
         float(record.time[window.stop]),
         likelihood.readings.rows.size,
-        _p_value(likelihood, theta, posterior.squares),
+        _p_value(histories, theta, posterior.squares),
     )
     model = likelihood.table.actuator(begun)
-    return Started(
-        likelihood.actuator, model, unrest, sd, likelihood.from_rest, lead_in, window.stop
-    )
+    actuators = tuple(one.actuator for one in histories.likelihoods)
+    from_rest, which = likelihood.from_rest, histories.which
+    return Started(actuators, which, model, unrest, sd, from_rest, lead_in, window.stop)
 
 
-def _p_value(likelihood: Likelihood, theta: FloatArray, squares: FloatArray) -> float:
+def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:
     """Test whether the lead-in fits the models θ at all.
 
     Two tests, either of which may object: the sum of all squared innovations, which sees any large
     departure, and a score test of slow ones (drift, a transient), which many readings would hide.
     """
-    readings = likelihood.readings.rows
+    readings = histories.likelihoods[0].readings.rows
     p = stats.chi2.sf(squares, readings.size)
     if readings.size > MANY:
         some = slice(None, None, -(-len(theta) // TESTED))
         place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
         shapes = np.polynomial.legendre.legvander(place, SLOW).T[1:]
-        slow = stats.chi2.sf(likelihood.taken(theta[some], shapes), SLOW)
+        tested = replace(histories, which=histories.which[some])
+        (taken,) = tested.each(theta[some], lambda one, few: (one.taken(few, shapes),))
+        slow = stats.chi2.sf(taken, SLOW)
         p = np.minimum(2 * np.minimum(p[some], slow), 1.0)
     return float(np.mean(p))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.stats import norm
 
@@ -13,15 +15,19 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
+from tests.declared import declared
+
+
+def _of(name: str, description: str, known: Distribution | float) -> Parameter:
+    return dataclasses.replace(Parameter.of(declared(name), known), description=description)
+
 
 PARAMETERS = (
-    Parameter("d", "um/V", "d", "coefficient", Distribution("normal", {"mean": 0.7, "sd": 0.1})),
-    Parameter("alpha", "um/V", r"\alpha", "part", Distribution("normal", {"mean": 0.3, "sd": 0.1})),
-    Parameter("exponent", "-", "n", "smoothness", fixed=1.0),
-    Parameter("lag", "s", r"\tau_\mathrm{lag}", "lag", Distribution("halfnormal", {"scale": 1e-3})),
-    Parameter(
-        "stiffness", "N/m", "k", "stiff", Distribution("uniform", {"lower": 0, "upper": 1e6})
-    ),
+    _of("d", "coefficient", Distribution("normal", {"mean": 0.7, "sd": 0.1})),
+    _of("alpha", "part", Distribution("normal", {"mean": 0.3, "sd": 0.1})),
+    _of("exponent", "smoothness", 1.0),
+    _of("lag", "lag", Distribution("halfnormal", {"scale": 1e-3})),
+    _of("stiffness", "stiff", Distribution("uniform", {"lower": 0, "upper": 1e6})),
 )
 MEANS = np.array([0.7, 0.36, 2e-3, 4.1e5])
 SDS = np.array([6e-3, 8e-3, 1.5e-5, 1.2e3])

@@ -133,6 +133,13 @@ def test_a_config_is_loaded_from_a_path_or_its_text(tmp_path: Path) -> None:
             "record.signal.amplitude",
         ),
         ("[record]\nsignal = {amplitude = 1.0, frequency = 1.0}", "record.signal.duration"),
+        ("[record]\nsignal = {amplitude = 1.0, duration = 1.0}", "record.signal"),
+        ("[record]\nsignal = {shape = 'steps', levels = [1.0], duration = 1.0}", "record.signal"),
+        (
+            "[record]\nsignal = {shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0, "
+            "duration = 1.0}",
+            "record.signal",
+        ),
         (RECORD + "[stand]\ndiscrepancy = 'some'", "stand.discrepancy"),
         (RECORD + "[stand]\nsample_rate = 0.0", "stand.sample_rate"),
         (RECORD + "[model]\nhold = 'second'", "model.hold"),
@@ -332,3 +339,9 @@ def test_numbers_and_texts_survive_to_the_last_digit(
         }
     )
     assert changed == parse(dump(changed), "")
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "runs").glob("*.toml")))
+def test_the_runs_that_come_with_the_package_can_be_read(path: Path) -> None:
+    config = load(path)
+    assert parse(dump(config), "again") == config

@@ -15,8 +15,8 @@ import bwbayes as bw
 from bwbayes.app import fitted, run
 from bwbayes.app.config import load
 from bwbayes.app.fitted import Fit
+from bwbayes.app.model_settings import StandConfig
 from bwbayes.app.predict import predict
-from bwbayes.app.settings import StandConfig
 from bwbayes.data import Record, read_record
 from bwbayes.results.files import write_bands
 from bwbayes.results.prediction import Start

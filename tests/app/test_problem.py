@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config import Config, dump, parse
+from bwbayes.app.config import Config, SignalConfig, dump, parse
 from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import Problem, generator, resolve
+from bwbayes.app.problem import Problem, generator, resolve, sampled_waveform
 from bwbayes.app.run import load_run
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
@@ -421,3 +421,9 @@ def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
     write_record(problem.record, folder / "records" / "record.h5")
     again = resolve(problem.config, folder)
     assert problem.posterior.readings.rows.tolist() == again.posterior.readings.rows.tolist()
+
+
+def test_steps_are_drawn_up_from_levels_and_their_dwell() -> None:
+    wanted = SignalConfig(shape="steps", levels=[0.0, 50.0, -20.0], dwell=2.0, duration=7.0)
+    _, voltage = sampled_waveform(wanted).sample(10.0)
+    np.testing.assert_array_equal(np.repeat([0.0, 50.0, -20.0], [20, 20, 30]), voltage)

@@ -30,6 +30,7 @@ from bwbayes.inference import sampling
 from bwbayes.inference.chain import Phase
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.diagnostics import Check
+from bwbayes.model.operators.bouc_wen import BoucWen
 from tests.app import example, small
 
 FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
@@ -324,9 +325,9 @@ def test_posterior_that_presses_against_the_passive_bound_is_remarked_on(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, chain, outcome = module.finished(RunFolder(run))
-    monkeypatch.setattr(module, "passive_remark", lambda _, every: f"pressed {every.ndim}")
+    monkeypatch.setattr(BoucWen, "remarks", lambda _, column, __: [f"pressed {column['d'].ndim}"])
     unconverged = replace(outcome, converged=False)
-    assert "pressed 4" in module.assemble(problem, chain, unconverged).remarks
+    assert "pressed 1" in module.assemble(problem, chain, unconverged).remarks
 
 
 def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:

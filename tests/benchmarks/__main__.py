@@ -63,6 +63,7 @@ def _measured(effort: Effort) -> Iterator[Table]:
     posterior = problem("numba").posterior
     yield likelihood.batches(posterior, effort)
     yield likelihood.models(posterior, effort)
+    yield likelihood.parts(posterior, effort)
     yield likelihood.lengths(posterior, effort)
     yield likelihood.hysteresis_alone(posterior, effort)
     yield likelihood.threads(posterior, effort)

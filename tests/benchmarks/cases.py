@@ -12,6 +12,11 @@ from bwbayes.app.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS, made
 from tests.benchmarks.stock import stock
 from tests.inference.problems import posterior_of, truth
 
@@ -32,6 +37,7 @@ __all__ = [
     "problem",
     "trial",
     "variant",
+    "with_parts",
 ]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,6 +99,33 @@ def variant(
     known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
     other = posterior_of(voltage, displacement, actuator, noise, known)
     return replace(other, engine=posterior.engine)
+
+
+def with_parts(posterior: Posterior, *, from_rest: bool) -> dict[str, Posterior]:
+    """Return posteriors of the same record with a lag and each operator, and all that adds to one.
+
+    Without a start from rest the state of everything at the first sample is unknown.
+    """
+    voltage, displacement = posterior.voltage, posterior.displacement
+    span = Span(float(np.min(voltage)), float(np.max(voltage)))
+    plain = Actuator("lag", posterior.actuator.hold, posterior.actuator.interval, span=span)
+    gain = PolynomialGain(reference=span)
+    actuators = {
+        name: replace(plain, hysteresis=made("hysteresis", name, HYSTERESIS, {}))
+        for name in HYSTERESIS
+    }
+    actuators["bouc-wen, gain"] = replace(plain, gain=gain)
+    actuators["bouc-wen, gain, four creep lags"] = replace(
+        plain, gain=gain, creep=Creep((0.1, 1.0, 10.0, 100.0), reference=span)
+    )
+    fixed = {"exponent": 1.0} | ({"initial": 0.0} if from_rest else {})
+    return {
+        name: replace(
+            posterior_of(voltage, displacement, one, "discrepancy", fixed, from_rest=from_rest),
+            engine="numba",
+        )
+        for name, one in actuators.items()
+    }
 
 
 def trial(posterior: Posterior, count: int = MODELS) -> FloatArray:

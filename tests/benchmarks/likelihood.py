@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
@@ -19,6 +22,7 @@ from tests.benchmarks.cases import (
     on_engine,
     trial,
     variant,
+    with_parts,
 )
 from tests.benchmarks.stock import hysteresis_loop
 from tests.benchmarks.tables import Cell, Table
@@ -31,6 +35,7 @@ __all__ = [
     "lengths",
     "likelihood_of",
     "models",
+    "parts",
     "shape_of",
     "speed_up",
     "threads",
@@ -73,6 +78,28 @@ def models(posterior: Posterior, effort: Effort) -> Table:
         for noise in NOISES
     ]
     return Table("models", f"Likelihood by model, {MODELS} models", PER_SAMPLE, rows)
+
+
+def parts(posterior: Posterior, effort: Effort) -> Table:
+    """Measure every operator, gain and creep on the compiled engine, and as times Bouc-Wen.
+
+    Models are draws of the default priors. In motion, the start is unknown.
+    """
+    calls: dict[str, Call] = {}
+    for start, from_rest in (("from rest", True), ("in motion", False)):
+        for name, one in with_parts(posterior, from_rest=from_rest).items():
+            theta = one.prior.theta(one.prior.draw(np.random.default_rng(1), MODELS))
+            one.log_likelihood(theta[:1])
+            calls[f"{name}, {start}"] = partial(one.log_likelihood, theta)
+    cost = interleaved(calls, effort.rounds)
+    usual = cost["bouc-wen, from rest"].wall
+    work = MODELS * posterior.voltage.size
+    rows = [
+        dict[str, Cell](model=name, ns=1e9 * one.wall / work, times=one.wall / usual)
+        for name, one in cost.items()
+    ]
+    text = "ns per sample and model on one core, compiled engine; times Bouc-Wen from rest"
+    return Table("parts", f"Likelihood by part, {MODELS} models", text, rows)
 
 
 def lengths(posterior: Posterior, effort: Effort) -> Table:

@@ -2,7 +2,8 @@
 
 The actuator has been driven for several periods when a record begins: at any phase, at a turning
 point, at full speed, or knocked away from where the drive holds it. Parameters are the true ones,
-so all that bands can get wrong is the start of the record.
+so all that bands can get wrong is the start of the record. Any operator may be in it, with the true
+values that the virtual stand has for it.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from scipy.signal import lfilter
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
+from bwbayes.data.truths import true_values
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record
 from tests.inference.problems import posterior_of
@@ -53,12 +56,24 @@ class Case:
     lead_in: float = 1.0
     cut: Cut = "any"
     from_rest: bool = False
+    hysteresis: str = "bouc-wen"
+
+    @property
+    def actuator(self) -> Actuator:
+        """The model."""
+        operator = made("hysteresis", self.hysteresis, HYSTERESIS, {})
+        return Actuator(self.dynamics, "first", 1 / RATE, operator)
+
+    @property
+    def true(self) -> dict[str, float]:
+        """All true values by name."""
+        own = {"lag": self.lag, "discrepancy_sd": self.discrepancy}
+        return TRUE | true_values(self.actuator, TRUE) | own
 
 
 def posterior_of_case(case: Case, engine: Engine = "numba") -> Posterior:
     """Return the model, its voltage range, and the width of its record; all parameters fixed."""
-    actuator = Actuator(case.dynamics, "first", 1 / RATE)
-    true = TRUE | {"lag": case.lag, "discrepancy_sd": case.discrepancy}
+    actuator, true = case.actuator, case.true
     voltage = 100 * np.sin(2 * np.pi * np.arange(400) / RATE)
     names = (*actuator.parameters, "sensor_sd", "discrepancy_sd", "discrepancy_time")
     fixed = {name: true[name] for name in names}
@@ -68,8 +83,7 @@ def posterior_of_case(case: Case, engine: Engine = "numba") -> Posterior:
 
 def record_of(case: Case, generator: np.random.Generator) -> Record:
     """Drive the actuator from rest, and cut a record out of the drive; its offset is anything."""
-    actuator = Actuator(case.dynamics, "first", 1 / RATE)
-    true = TRUE | {"lag": case.lag}
+    actuator, true = case.actuator, case.true
     theta = np.array([[true[name] for name in actuator.parameters]])
     before = 0.0 if case.from_rest else generator.uniform(2.0, 4.0)
     if case.cut in ("turn", "speed"):
@@ -79,7 +93,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
     amplitude = size + (100 - size) * np.sin(2 * np.pi * slow * time) ** 2
     voltage = amplitude * np.sin(2 * np.pi * time)
     cut = time.size - int(DURATION * RATE)
-    displacement = actuator.displacement(theta, voltage)[0][cut:]
+    displacement = actuator.displacement(theta, voltage, from_rest=True)[0][cut:]
     if case.cut == "knocked":
         column = dict(zip(actuator.parameters, theta.T, strict=True))
         free = actuator.sections(column).free_responses(displacement.size)[0]

@@ -265,7 +265,7 @@ def test_unrest_is_part_of_the_simulation(posterior: Posterior, draws: FloatArra
     bands = predicted(posterior, draws, record, Start(), seed=0)
     begun = start_of(posterior, draws, record, Start())
     own, at_rest = (
-        begun.actuator.advance(begun.model, record.voltage, unrest=unrest)[0].mean(axis=0)
+        begun.actuators[0].advance(begun.model, record.voltage, unrest=unrest)[0].mean(axis=0)
         for unrest in (begun.unrest, None)
     )
     np.testing.assert_allclose(own, bands.mean, atol=1e-9)

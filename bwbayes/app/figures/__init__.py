@@ -20,7 +20,9 @@ from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
+from bwbayes.app.figures.loops import draw_loops
 from bwbayes.app.figures.series import draw_bands
+from bwbayes.app.figures.steps import draw_steps
 from bwbayes.app.figures.style import STYLE
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -31,15 +33,21 @@ __all__ = ["draw_all", "draw_alone", "save", "save_one"]
 def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
-    ``loop``, ``bands_NAME`` for each of the result's bands, ``coverage``, ``innovations``,
-    ``corner``, ``trace`` and ``ranks``. Without convergence only the last two; without bands or a
-    measurement to hold them against, what needs them is left out.
+    ``loop``, ``loops``, ``steps``, ``bands_NAME`` for each of the result's bands, ``coverage``,
+    ``innovations``, ``corner``, ``trace`` and ``ranks``. Without convergence only the last two;
+    without bands or a measurement to hold them against, what needs them is left out.
     """
     figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
         if result.outcome.converged:
-            if result.bands:
-                figures["loop"] = draw_loop(result.bands)
+            # A step has no loop.
+            looped = [bands for bands in result.bands if bands.name not in result.steps]
+            if looped:
+                figures["loop"] = draw_loop(looped)
+            if result.loops is not None:
+                figures["loops"] = draw_loops(result.loops)
+            if result.steps:
+                figures["steps"] = draw_steps(result.steps)
             figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
             if result.scores:
                 figures["coverage"] = draw_coverage(result.bands, result.scores)

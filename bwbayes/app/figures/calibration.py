@@ -162,8 +162,8 @@ def _closed(values: FloatArray, first: float, last: float) -> FloatArray:
 
 
 def _share_legend(figure: Figure) -> None:
-    found: dict[str, Artist] = {}
+    handles: dict[str, Artist] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    figure.legend(list(found.values()), list(found), loc="outside upper center", ncols=8)
+            handles.setdefault(label, handle)
+    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=8)

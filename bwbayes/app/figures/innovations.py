@@ -20,20 +20,20 @@ EXTREMES = 100
 STRETCHES = 40
 
 
-def draw_innovations(found: Innovations) -> Figure:
+def draw_innovations(innovations: Innovations) -> Figure:
     """Draw autocorrelation, quantiles, size along time, and size along the drive."""
     figure = Figure(figsize=(11, 6.6), layout="constrained")
     axes = figure.subplots(2, 2)
-    _draw_correlation(axes[0, 0], found)
-    _draw_quantiles(axes[0, 1], found)
-    _draw_time(axes[1, 0], found)
-    _draw_drive(axes[1, 1], found)
+    _draw_correlation(axes[0, 0], innovations)
+    _draw_quantiles(axes[0, 1], innovations)
+    _draw_time(axes[1, 0], innovations)
+    _draw_drive(axes[1, 1], innovations)
     return figure
 
 
-def _draw_correlation(panel: Axes, found: Innovations) -> None:
-    correlation = found.correlation
-    bound = stats.norm.isf(0.025) / np.sqrt(found.white.size)
+def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
+    correlation = innovations.correlation
+    bound = stats.norm.isf(0.025) / np.sqrt(innovations.white.size)
     lags = np.arange(1, correlation.size + 1)
     panel.axhspan(-bound, bound, color="#dddddd", lw=0, label="95 % of independent ones")
     panel.vlines(lags, 0, correlation, color=COLOURS[0], lw=2)
@@ -44,8 +44,8 @@ def _draw_correlation(panel: Axes, found: Innovations) -> None:
     panel.legend(loc="lower right")
 
 
-def _draw_quantiles(panel: Axes, found: Innovations) -> None:
-    ordered = np.sort(found.white)
+def _draw_quantiles(panel: Axes, innovations: Innovations) -> None:
+    ordered = np.sort(innovations.white)
     size = ordered.size
     expected = stats.norm.ppf((np.arange(size) + 0.5) / size)
     middle = np.arange(EXTREMES, size - EXTREMES, max(1, size // DOTS))
@@ -62,9 +62,9 @@ def _draw_quantiles(panel: Axes, found: Innovations) -> None:
     panel.legend(loc="upper left")
 
 
-def _draw_time(panel: Axes, found: Innovations) -> None:
+def _draw_time(panel: Axes, innovations: Innovations) -> None:
     """Draw all innovations, and the root mean square of stretches: 1 if the size is right."""
-    time, white = found.time, found.white
+    time, white = innovations.time, innovations.white
     dim = min(0.7, 8000 / white.size)
     reach = max(4.5, 1.1 * float(np.quantile(np.abs(white), 0.9995)))
     shown = np.clip(white, -reach, reach)
@@ -79,13 +79,13 @@ def _draw_time(panel: Axes, found: Innovations) -> None:
     panel.legend(loc="upper right")
 
 
-def _draw_drive(panel: Axes, found: Innovations) -> None:
+def _draw_drive(panel: Axes, innovations: Innovations) -> None:
     """Draw mean and sd in parts of the drive, with the errors that chance gives them."""
     place = 0.0
     names: list[tuple[float, str]] = []
     edges: list[tuple[float, str]] = []
     for what in ("rate", "voltage", "direction"):
-        for name, values in found.by(what):
+        for name, values in innovations.by(what):
             if values.size < 2:
                 continue
             sd, mean, many = float(np.std(values)), float(np.mean(values)), values.size

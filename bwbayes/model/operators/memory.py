@@ -28,6 +28,11 @@ __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refus
 # Elements (models x samples) that one array expression handles: small enough for the cache.
 PIECE = 65_536
 
+# Ranges of earlier drives that are told apart: how far down, and how much further up they went.
+# Fewer leave steps that show; more take longer.
+REACHES = 16
+FURTHER = (0.8, 1.0, 1.25)
+
 
 def _initial_prior(_: Context) -> Distribution:
     return Distribution("uniform", {"lower": -1.0, "upper": 1.0})
@@ -90,6 +95,9 @@ class RemembersExtrema(Operator):
     m = u₀ + (initial + 1) / 2 (u₊ − u₀), and down to the record's first voltage u₀. So −1 is the
     ascending branch and 1 the descending one, and w at u₀ rises with ``initial`` from one to the
     other.
+
+    A drive that was smaller leaves other states, which show once the voltage goes beyond what it
+    reached: :meth:`earlier`. What a prediction does not know of the start goes through these too.
 
     Sources: F. Preisach, Z. Phys. 94 (1935) 277-302; I. D. Mayergoyz, Mathematical Models of
     Hysteresis (Springer, 1991), for the stack and the Everett function.
@@ -177,6 +185,22 @@ class RemembersExtrema(Operator):
         inside = float(span.low < voltage < span.high)
         bound = np.full(column[INITIAL.name].size, inside)
         return -bound, bound
+
+    def earlier(self, span: Span) -> tuple[Span, ...]:
+        """Return ranges about the span's middle, evenly from next to nothing to all of it."""
+        low, middle, half = span.low, span.middle, span.half
+        if not half > 0:
+            return (span,)
+        ends = [
+            (down / REACHES, min(further * down / REACHES, 1.0))
+            for down in range(1, REACHES + 1)
+            for further in FURTHER
+        ]
+        return tuple(
+            dict.fromkeys(
+                Span(max(middle - down * half, low), middle + up * half) for down, up in ends
+            )
+        )
 
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return the mean slope from the span's lowest to its highest voltage (models,), um/V."""

@@ -9,6 +9,9 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference import identifiability
+from bwbayes.inference.conflict import conflicts
+from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
@@ -98,3 +101,44 @@ def test_an_unknown_operator_is_refused_with_the_nearest_name() -> None:
         made("hysteresis", "presach", HYSTERESIS, {})
     with pytest.raises(InputError, match="cannot import 'nowhere:Loop'"):
         made("hysteresis", "nowhere:Loop", HYSTERESIS, {})
+
+
+@every_operator
+def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
+    """What the record does not tell, and where priors and draws disagree; by draws of the prior."""
+    of = posterior(name)
+    generator = np.random.default_rng(3)
+    draws = of.prior.draw(generator, 400)
+    mode = of.prior.unconstrain(draws[:1])[0]
+    identity = np.eye(mode.size)
+    point = PointFit(mode, identity, 0.0, mode[np.newaxis], identity)
+    column = of.table.columns(of.prior.theta(draws))
+    remarks = [
+        *identifiability.remarks(of, point, draws),
+        *conflicts(of.prior, draws, {}),
+        *of.actuator.hysteresis.remarks(column, of.names),
+    ]
+    assert all(isinstance(text, str) and text for text in remarks)
+
+
+def assert_finite(name: str, draws: int) -> None:
+    """Every draw of the default priors has a likelihood, on both engines."""
+    of = posterior(name, parts=True)
+    voltage = of.voltage[::8].copy()
+    displacement = of.displacement[::8].copy()
+    of = replace(of, voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
+    theta = drawn(of, draws)
+    for engine in ("numpy", "numba"):
+        density = replace(of, engine=engine).log_likelihood(theta)
+        assert np.isfinite(density).all()
+
+
+@every_operator
+def test_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
+    assert_finite(name, 300 if name in ("jiles-atherton", "domain-wall") else 2000)
+
+
+@pytest.mark.slow
+@every_operator
+def test_100000_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
+    assert_finite(name, 100_000)

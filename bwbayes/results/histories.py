@@ -1,0 +1,199 @@
+"""Histories: which drive before a record left the state that it starts from.
+
+Most operators' states are one number, ``initial``. Those that remember extrema have more: how far
+earlier drives went leaves states of their own, and each such range is a history. What a lead-in
+says of a history, and of the states in it, is found on a grid that closes in on where the lead-in
+allows them; every draw then chooses its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.likelihood import Likelihood
+
+__all__ = ["Histories", "States", "chosen", "uniform"]
+
+# Nodes of the grid of hysteretic states, and how often it closes in at most.
+NODES = 17
+ROUNDS = 6
+
+# A node less probable than the best by this much (nats) is outside of the next grid.
+IMPROBABLE = 10.0
+
+# The grid is fine enough when neighbours within two nats of the best node differ by less than this.
+FINE = 1.5
+
+# Draws that say which histories are possible at all: asking every draw about each takes long.
+FEW = 50
+
+# Points between two nodes that a state is chosen from.
+BETWEEN = 8
+
+
+@dataclass(frozen=True)
+class Histories:
+    """A record's likelihood for each history, and ``which`` of them each draw has, (draws,)."""
+
+    likelihoods: tuple[Likelihood, ...]
+    which: IntArray
+
+    def each(
+        self, theta: FloatArray, ask: Callable[[Likelihood, FloatArray], tuple[FloatArray, ...]]
+    ) -> tuple[FloatArray, ...]:
+        """Ask every draw's own likelihood about it; return answers (draws, ...)."""
+        groups = [np.flatnonzero(self.which == k) for k in range(len(self.likelihoods))]
+        answers = [
+            ask(one, theta[rows])
+            for one, rows in zip(self.likelihoods, groups, strict=True)
+            if rows.size
+        ]
+        back = np.argsort(np.concatenate(groups))
+        return tuple(np.concatenate(each)[back] for each in zip(*answers, strict=True))
+
+
+def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
+    """Uniform numbers (draws,), one from each of as many equal parts of 0 to 1, in any order."""
+    parts: FloatArray = (generator.permutation(draws) + generator.uniform(size=draws)) / draws
+    return parts
+
+
+def edged(part: FloatArray) -> FloatArray:
+    """Return how far a state of one of many histories is on its way, for an even part of 0 to 1.
+
+    The last sweep of an earlier drive ends, as often as not, at the record's first voltage: a
+    quarter of the states are the lowest, a quarter the highest, and half lie evenly between.
+    """
+    return np.clip(2 * part - 0.5, 0.0, 1.0)
+
+
+class States:
+    """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
+
+    The highest and the lowest are those that an earlier drive within the range of voltages leaves.
+    """
+
+    def __init__(self, likelihood: Likelihood, theta: FloatArray, *, alone: bool) -> None:
+        self.table, self.theta, self.alone = likelihood.table, theta, alone
+        if likelihood.from_rest:
+            self.low = self.high = np.zeros(len(theta))
+            return
+        actuator = likelihood.actuator
+        assert actuator.span is not None
+        self.low, self.high = actuator.hysteresis.reachable(
+            self.table.columns(theta), float(likelihood.voltage[0]), actuator.span
+        )
+
+    @property
+    def ends(self) -> tuple[FloatArray, FloatArray]:
+        """The lowest and the highest state, (draws,)."""
+        return self.low, self.high
+
+    @property
+    def open(self) -> bool:
+        """Whether any draw has more than one."""
+        return bool(np.any(self.high > self.low))
+
+    def at(self, part: FloatArray) -> FloatArray:
+        """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
+        way = part if self.alone else edged(part)
+        return self.table.replaced(self.theta, "initial", self.low + way * (self.high - self.low))
+
+
+class _Grid(NamedTuple):
+    """What a lead-in says of the states of one history.
+
+    ``parts`` (nodes, draws) of the way from the lowest to the highest, their log ``density`` up to
+    a constant, and the log ``evidence`` (draws,) for the history.
+    """
+
+    parts: FloatArray
+    density: FloatArray
+    evidence: FloatArray
+
+
+def chosen(
+    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+) -> tuple[Histories, FloatArray]:
+    """Choose every draw's history and state by what the lead-in says; return θ with the states.
+
+    Beforehand all histories are equally probable, and in each all states between the lowest and the
+    highest.
+    """
+    draws = np.arange(len(theta))
+    alone = len(likelihoods) == 1
+    likelihoods = _possible(likelihoods, theta)
+    states = [States(one, theta, alone=alone) for one in likelihoods]
+    if alone and not states[0].open:
+        return Histories(likelihoods, np.zeros_like(draws)), states[0].at(np.zeros(draws.size))
+    grids = [_grid(*both) for both in zip(likelihoods, states, strict=True)]
+    which = np.zeros_like(draws)
+    if len(grids) > 1:
+        evidence = np.stack([grid.evidence for grid in grids])
+        weight = np.cumsum(np.exp(evidence - np.max(evidence, axis=0)), axis=0)
+        which = np.sum(weight < uniform(generator, draws.size) * weight[-1], axis=0)
+    parts, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
+    part = _drawn(parts, density, uniform(generator, draws.size))
+    part = part if alone else edged(part)
+    low, high = (np.stack([one.ends[i] for one in states])[which, draws] for i in range(2))
+    begun = likelihoods[0].table.replaced(theta, "initial", low + part * (high - low))
+    return Histories(likelihoods, which), begun
+
+
+def _possible(likelihoods: tuple[Likelihood, ...], theta: FloatArray) -> tuple[Likelihood, ...]:
+    """Leave out the histories that the lead-in rules out with each of a few of the draws."""
+    few = theta[:: len(theta) // FEW] if len(theta) >= 2 * FEW else theta[:0]
+    if len(likelihoods) == 1 or not few.size:
+        return likelihoods
+    told = np.stack([_grid(one, States(one, few, alone=False)).evidence for one in likelihoods])
+    possible = np.any(told > np.max(told, axis=0) - IMPROBABLE, axis=1)
+    return tuple(one for one, able in zip(likelihoods, possible, strict=True) if able)
+
+
+def _grid(likelihood: Likelihood, states: States) -> _Grid:
+    """Close in on the states that a lead-in allows."""
+    draws = len(states.theta)
+    low, high = np.zeros(draws), np.ones(draws)
+    if not states.open:
+        # A single state.
+        nodes = np.zeros((NODES, draws))
+        return _Grid(
+            nodes, nodes, np.nan_to_num(likelihood.log_density(states.at(low)), nan=-np.inf)
+        )
+    for _ in range(ROUNDS):
+        parts = np.linspace(low, high, NODES)
+        every = np.concatenate([states.at(part) for part in parts])
+        density = likelihood.log_density(every).reshape(NODES, draws)
+        density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
+        best = np.max(density, axis=0)
+        density = np.maximum(density - best, -1e3)
+        if np.max(np.abs(np.diff(np.maximum(density, -2.0), axis=0))) < FINE:
+            break
+        possible = density > -IMPROBABLE
+        first = np.maximum(np.argmax(possible, axis=0) - 1, 0)
+        last = NODES - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
+        columns = np.arange(draws)
+        low, high = parts[first, columns], parts[last, columns]
+    evidence = best + np.log(np.mean(np.exp(_between(density)), axis=0) * (parts[-1] - parts[0]))
+    return _Grid(parts, density, evidence)
+
+
+def _between(nodes: FloatArray) -> FloatArray:
+    """Return points (any, draws) between nodes (nodes, draws), on straight lines."""
+    inside = (np.arange(BETWEEN)[:, np.newaxis] + 0.5) / BETWEEN
+    return np.concatenate([a + inside * (b - a) for a, b in pairwise(nodes)])
+
+
+def _drawn(parts: FloatArray, density: FloatArray, uniform_: FloatArray) -> FloatArray:
+    """Draw from a log density (nodes, draws) that goes straight from node to node of ``parts``."""
+    fine, places = _between(density), _between(parts)
+    weight = np.cumsum(np.exp(fine), axis=0)
+    index = np.sum(weight < uniform_ * weight[-1], axis=0)
+    drawn: FloatArray = places[index, np.arange(uniform_.size)]
+    return drawn

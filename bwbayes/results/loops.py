@@ -1,0 +1,366 @@
+"""Loops measured: what data sheets say of an actuator's hysteresis, with its uncertainty.
+
+Every posterior draw is driven slowly, without dynamics, creep and offset: up and down over the
+whole range of the record's voltage until the loop closes (the major loop), the same over half of
+that range (the minor loop), and once from the demagnetised state (the initial curve). What can be
+read off these, the range, the opening, the remanence, the coercive voltage and the area, then has a
+mean, an sd and an interval as any parameter has, and so can be held against another operator's or a
+data sheet's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import simpson
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
+from bwbayes.model.operator import Span
+
+__all__ = [
+    "MEASURES",
+    "Curve",
+    "Estimate",
+    "Loop",
+    "Loops",
+    "Traced",
+    "initial_curve",
+    "measure_loops",
+    "measures",
+    "numbers",
+    "steady_loop",
+]
+
+# Voltages along a branch: an odd number, so that a symmetric drive passes zero at one of them.
+POINTS = 201
+
+# Cycles before the first look at whether the loop has closed, twice as many before each next one,
+# and those after which it is taken as it is; it has where a cycle changes less than this part of
+# its range.
+CYCLES, MOST_CYCLES = 2, 1024
+CLOSED = 1e-9
+
+# Voltages of the initial curve in a summary, out of those along the curve.
+EVERY = 5
+
+# What is measured of a loop: its name in a summary, title and unit for people.
+MEASURES: Mapping[str, tuple[str, str]] = {
+    "range_um": ("Range", "um"),
+    "opening_um": ("Opening at zero voltage", "um"),
+    "widest_percent": ("Widest opening, of the range", "%"),
+    "remanence_um": ("Remanence", "um"),
+    "coercive_V": ("Coercive voltage", "V"),
+    "area_um_V": ("Area", "um V"),
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean, sd and equal-tailed 95 % interval of a number over the posterior."""
+
+    mean: float
+    sd: float
+    lower: float
+    upper: float
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Estimate:
+        """Return that of draws (draws,)."""
+        lower, upper = np.quantile(values, [0.025, 0.975])
+        sd = np.std(values, ddof=1) if values.size > 1 else 0.0
+        return cls(float(np.mean(values)), float(sd), float(lower), float(upper))
+
+    def summary(self) -> dict[str, float]:
+        """Return the numbers as a summary holds them."""
+        return {
+            "mean": self.mean,
+            "sd": self.sd,
+            "lower_95": self.lower,
+            "upper_95": self.upper,
+        }
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A displacement along a voltage: mean and 95 % band, each (points,), um."""
+
+    mean: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    @classmethod
+    def of(cls, traced: FloatArray) -> Curve:
+        """Return that of draws (draws, points)."""
+        lower, upper = np.quantile(traced, [0.025, 0.975], axis=0)
+        return cls(np.mean(traced, axis=0), lower, upper)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """A steady loop of some models.
+
+    ``voltage`` (points,) rises from the lowest to the highest, V; ``rising`` and ``falling``
+    (models, points) are the displacements at these voltages on the way up and on the way down, um;
+    ``closed`` says whether the last cycle was as the one before.
+    """
+
+    voltage: FloatArray
+    rising: FloatArray
+    falling: FloatArray
+    closed: bool = True
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A measured loop: voltages (points,), both branches, and its numbers by their name.
+
+    The names, and what they mean, are those of :func:`measures`; a number is None where the loop
+    does not have it.
+    """
+
+    voltage: FloatArray
+    rising: Curve
+    falling: Curve
+    estimates: Mapping[str, Estimate | None]
+    closed: bool
+
+    @property
+    def amplitude(self) -> float:
+        """Half of the voltage's range, V."""
+        return float(self.voltage[-1] - self.voltage[0]) / 2
+
+
+@dataclass(frozen=True)
+class Loops:
+    """The loops of an actuator, from its posterior.
+
+    ``major`` goes over the whole range of the record's voltage, ``minor`` over half of it about the
+    same middle; ``initial`` is the curve from the demagnetised state, along ``initial_voltage``
+    (points,), V.
+    """
+
+    major: Loop
+    minor: Loop
+    initial_voltage: FloatArray
+    initial: Curve
+
+
+def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS) -> Loops:
+    """Measure the loops of every draw.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled; its record's voltage gives the range.
+    draws
+        (draws, free), parameters in their own units.
+    points
+        Voltages along each branch, an odd number.
+
+    Raises
+    ------
+    InputError
+        A voltage that does not change, or an even number of points.
+    """
+    actuator = posterior.actuator.within(posterior.voltage)
+    column = posterior.table.columns(posterior.prior.theta(draws))
+    span = Span(float(np.min(posterior.voltage)), float(np.max(posterior.voltage)))
+    middle, half = span.middle, span.half
+    voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
+    return Loops(
+        _loop(steady_loop(actuator, column, span.low, span.high, points)),
+        _loop(steady_loop(actuator, column, middle - half / 2, middle + half / 2, points)),
+        voltage,
+        Curve.of(curve),
+    )
+
+
+def steady_loop(
+    actuator: Actuator, column: Values, low: float, high: float, points: int = POINTS
+) -> Traced:
+    """Drive models from the demagnetised state up and down until the loop closes.
+
+    Parameters
+    ----------
+    actuator
+        Its operator and gain; dynamics, creep and offset do not count.
+    column
+        Columns (models,) of the parameters, by name.
+    low, high
+        Where the voltage turns, V.
+    points
+        Voltages along each branch, an odd number.
+
+    Raises
+    ------
+    InputError
+        ``low`` is not below ``high``, or an even number of points.
+    """
+    voltage = _voltages(low, high, points)
+    column = _demagnetised(column)
+    memory = actuator.begin(column, np.zeros(1), from_rest=True)
+    operator = actuator.hysteresis
+    cycles, closed = CYCLES, False
+    while not closed and cycles <= MOST_CYCLES:
+        # Between two turns nothing needs to be sampled: what is exact is so for any step.
+        moved, memory = operator.advance(column, np.tile([high, low], cycles), memory)
+        changed = np.abs(moved[:, -2:] - moved[:, -4:-2])
+        closed = bool(np.all(changed <= CLOSED * np.abs(moved[:, -2:-1] - moved[:, -1:])))
+        cycles *= 2
+    rising, memory = operator.advance(column, voltage, memory)
+    falling, _ = operator.advance(column, voltage[::-1], memory)
+    added = _gain(actuator, column, voltage)
+    return Traced(voltage, rising + added, falling[:, ::-1] + added, closed)
+
+
+def initial_curve(
+    actuator: Actuator, column: Values, low: float, high: float, points: int = POINTS
+) -> tuple[FloatArray, FloatArray]:
+    """Return the voltages (points,), V, and the curve (models, points), um, from the virgin state.
+
+    The demagnetised actuator at zero volts goes straight to ``low``, and another time straight to
+    ``high``; where both lie on one side of zero, only to the farther one. Parameters as in
+    :func:`steady_loop`.
+    """
+    low, high = min(low, 0.0), max(high, 0.0)
+    voltage = _voltages(low, high, points)
+    column = _demagnetised(column)
+    sides = [voltage[voltage < 0][::-1], voltage[voltage >= 0]]
+    curves = [
+        actuator.hysteresis.advance(
+            column, side, actuator.begin(column, np.zeros(1), from_rest=True)
+        )[0]
+        if side.size
+        else np.empty((column["offset"].size, 0))
+        for side in sides
+    ]
+    joined = np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
+    return voltage, joined + _gain(actuator, column, voltage)
+
+
+def measures(traced: Traced) -> dict[str, FloatArray | None]:
+    """Measure a loop of models: each number (models,), None where the loop does not have it.
+
+    With x↑ and x↓ the displacement on the way up and on the way down, x₊ and x₋ that at the highest
+    and at the lowest voltage, and x_m = (x₊ + x₋) / 2 the loop's middle:
+
+    ``range_um``
+        x₊ − x₋.
+    ``opening_um``
+        x↓(0) − x↑(0), positive where the displacement lags behind the voltage; None if the loop
+        does not go through zero volts.
+    ``widest_percent``
+        The largest x↓ − x↑ at one voltage as a part of the range: what data sheets call hysteresis.
+    ``remanence_um``
+        x↓(0) − x_m: what is left at zero volts after the highest voltage, against the middle; half
+        of the opening in a loop that is symmetric about zero. None as for the opening.
+    ``coercive_V``
+        (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
+        the loop's width there. In a loop that is symmetric about zero it is the voltage that takes
+        the displacement back to zero, as the coercive field does a polarisation.
+    ``area_um_V``
+        −∮ x du = ∮ u dx over one cycle, positive where the displacement lags: the energy lost in a
+        cycle, in µJ, once multiplied with the actuator's force per volt, N/V.
+    """
+    voltage, rising, falling = traced.voltage, traced.rising, traced.falling
+    top, bottom = rising[:, -1], falling[:, 0]
+    middle = (top + bottom) / 2
+    gap = falling - rising
+    size = top - bottom
+    # A displacement may fall with the voltage.
+    sign = np.where(size < 0, -1.0, 1.0)
+    passed = [
+        _crossing(voltage, sign[:, np.newaxis] * (branch - middle[:, np.newaxis]))
+        for branch in (rising, falling)
+    ]
+    through_zero = bool(voltage[0] < 0 < voltage[-1])
+    return {
+        "range_um": size,
+        "opening_um": _at_zero(voltage, gap) if through_zero else None,
+        "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
+        "remanence_um": _at_zero(voltage, falling) - middle if through_zero else None,
+        "coercive_V": (passed[0] - passed[1]) / 2,
+        "area_um_V": np.asarray(simpson(gap, x=voltage, axis=1)),
+    }
+
+
+def numbers(loops: Loops) -> dict[str, object]:
+    """Return the loops as ``summary.json`` holds them, the initial curve at some voltages."""
+    some, curve = slice(None, None, EVERY), loops.initial
+    return {
+        "major": _numbers(loops.major),
+        "minor": _numbers(loops.minor),
+        "initial_curve": {
+            "voltage_V": loops.initial_voltage[some].tolist(),
+            "mean_um": curve.mean[some].tolist(),
+            "lower_95_um": curve.lower[some].tolist(),
+            "upper_95_um": curve.upper[some].tolist(),
+        },
+    }
+
+
+def _numbers(loop: Loop) -> dict[str, object]:
+    known: dict[str, object] = {
+        "from_V": float(loop.voltage[0]),
+        "to_V": float(loop.voltage[-1]),
+        "amplitude_V": loop.amplitude,
+        "closed": loop.closed,
+    }
+    estimates = {n: None if e is None else e.summary() for n, e in loop.estimates.items()}
+    return known | estimates
+
+
+def _loop(traced: Traced) -> Loop:
+    measured = measures(traced)
+    return Loop(
+        traced.voltage,
+        Curve.of(traced.rising),
+        Curve.of(traced.falling),
+        {name: None if v is None else Estimate.of(v) for name, v in measured.items()},
+        traced.closed,
+    )
+
+
+def _voltages(low: float, high: float, points: int) -> FloatArray:
+    """Return voltages (points,) from the lowest to the highest."""
+    if not low < high:
+        raise InputError(f"loops: {low:g} to {high:g} V is no range; give a voltage that changes")
+    if points < 3 or points % 2 == 0:
+        raise InputError(f"loops: {points} points along a branch; give an odd number from 3 on")
+    return np.linspace(low, high, points)
+
+
+def _demagnetised(column: Values) -> dict[str, FloatArray]:
+    return {**column, "initial": np.zeros_like(column["initial"])}
+
+
+def _gain(actuator: Actuator, column: Values, voltage: FloatArray) -> FloatArray:
+    """Return what the gain adds (models, points), um."""
+    if actuator.gain is None:
+        return np.zeros((1, voltage.size))
+    return actuator.gain.displacement(column, voltage)
+
+
+def _at_zero(voltage: FloatArray, branch: FloatArray) -> FloatArray:
+    """Return a branch (models, points) at zero volts, (models,)."""
+    after = int(np.searchsorted(voltage, 0.0))
+    part = voltage[after] / (voltage[after] - voltage[after - 1])
+    between: FloatArray = part * branch[:, after - 1] + (1 - part) * branch[:, after]
+    return between
+
+
+def _crossing(voltage: FloatArray, branch: FloatArray) -> FloatArray:
+    """Return the voltage (models,) at which a branch (models, points) first passes zero upwards."""
+    after = np.maximum(np.argmax(branch >= 0, axis=1), 1)
+    rows = np.arange(after.size)
+    below, above = branch[rows, after - 1], branch[rows, after]
+    # A model that does not move passes everywhere.
+    step = np.where(above > below, above - below, 1.0)
+    crossed: FloatArray = voltage[after] - above / step * (voltage[after] - voltage[after - 1])
+    return crossed

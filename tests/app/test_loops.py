@@ -1,0 +1,121 @@
+"""Measured loops and steps come into summary, report and picture, once a run has converged."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.app.figures import draw_all
+from bwbayes.app.report import render
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.results.loops import MEASURES, Loops, measure_loops
+from bwbayes.results.result import Result, summary
+from bwbayes.results.steps import STEP_MEASURES, Step, StepResponse, measure_step
+from tests.app import example
+from tests.app.test_report import rows
+from tests.inference.problems import decaying_sine, posterior_of
+
+
+@pytest.fixture(scope="module")
+def measured() -> Loops:
+    voltage = decaying_sine(200) + 130.0  # does not go through zero
+    actuator = Actuator("lag", "first", 0.01)
+    of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
+    return measure_loops(of, of.prior.draw(np.random.default_rng(1), 30))
+
+
+def with_loops(measured: Loops, *, converged: bool = True) -> Result:
+    return dataclasses.replace(example.run(converged), loops=measured)
+
+
+def test_table_is_the_summarys(measured: Loops) -> None:
+    run = with_loops(measured)
+    kept: Any = summary(run)["loops"]
+    table = rows(render(run, summary(run), {}), "loops")
+    for name, (title, unit) in MEASURES.items():
+        *texts, shown_unit = table[title]
+        assert unit.replace("um", "µm") == shown_unit
+        for loop, cells in (("major", texts[:3]), ("minor", texts[3:])):
+            one = kept[loop][name]
+            if one is None:
+                assert ["–"] * 3 == cells
+                continue
+            shown = [float(text) for text in (cells[0], cells[1], *cells[2].split(" to "))]
+            expected = [one[key] for key in ("mean", "sd", "lower_95", "upper_95")]
+            assert expected == pytest.approx(shown, abs=0.0503 * one["sd"], rel=0)
+    assert kept["major"]["opening_um"] is None
+
+
+def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
+    figures = draw_all(with_loops(measured))
+    assert ["loop", "loops"] == list(figures)[:2]
+    whole, less = figures["loops"].axes
+    assert ["major loop", "_nolegend_", "minor loop", "_nolegend_", "initial curve"] == [
+        line.get_label() for line in whole.lines
+    ]
+    falling, rising = (np.asarray(less.lines[i].get_ydata()) for i in (1, 0))
+    ends = [float(falling[0]), float(rising[-1])]
+    assert [0.0, 0.0] == pytest.approx(ends, abs=1e-9)
+
+
+def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
+    run = with_loops(measured, converged=False)
+    assert summary(run)["loops"] is None
+    assert 'id="loops"' not in render(run, summary(run), {"loops": b""})
+    assert "loops" not in draw_all(run)
+
+
+@pytest.fixture(scope="module")
+def steps() -> dict[str, StepResponse]:
+    voltage = decaying_sine(200)
+    found = {}
+    for name, creep in (("one", None), ("two", Creep((0.1, 1.0)))):
+        actuator = Actuator("lag", "first", 0.01, creep=creep)
+        of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
+        draws = of.prior.draw(np.random.default_rng(1), 20)
+        found[name] = measure_step(of, draws, Step(50.0, 5.0))
+    return found
+
+
+def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:
+    run = dataclasses.replace(example.run(), steps=steps)
+    kept: Any = summary(run)["step_responses"]
+    table = rows(render(run, summary(run), {}), "steps")
+    for name, (title, _) in STEP_MEASURES.items():
+        *texts, _ = table[title]
+        for step, cells in (("one", texts[:3]), ("two", texts[3:])):
+            one = kept[step][name]
+            if one is None:
+                assert ["–"] * 3 == cells
+            else:
+                assert one["mean"] == pytest.approx(float(cells[0]), abs=0.0503 * one["sd"])
+    assert kept["one"]["creep_percent"] is None
+
+
+def test_steps_are_drawn_with_their_creep(steps: dict[str, StepResponse]) -> None:
+    figures = draw_all(dataclasses.replace(example.run(), steps=steps))
+    rise, creep = figures["steps"].axes
+    assert ["one, 50 V", "two, 50 V"] == [line.get_label() for line in rise.lines]
+    assert ["two, 50 V"] == [line.get_label() for line in creep.lines]
+    assert ("log", "log") == (rise.get_xscale(), creep.get_xscale())
+    alone = draw_all(dataclasses.replace(example.run(), steps={"one": steps["one"]}))
+    assert 1 == len(alone["steps"].axes)
+
+
+def test_a_step_is_not_drawn_as_a_loop(steps: dict[str, StepResponse]) -> None:
+    run = dataclasses.replace(example.run(), steps={"held-out": steps["one"]})
+    figures = draw_all(run)
+    assert ["training (fitted)"] == [panel.get_title() for panel in figures["loop"].axes[:1]]
+    assert 2 == len(figures["loop"].axes)
+    assert "bands_held-out" in figures
+
+
+def test_without_convergence_no_step_is_shown(steps: dict[str, StepResponse]) -> None:
+    run = dataclasses.replace(example.run(converged=False), steps=steps)
+    assert summary(run)["step_responses"] is None
+    assert 'id="steps"' not in render(run, summary(run), {"steps": b""})
+    assert "steps" not in draw_all(run)

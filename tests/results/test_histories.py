@@ -1,0 +1,124 @@
+"""Histories of a record's start: chosen by evidence, and every draw keeps its own.
+
+A record that was driven by so much before it begins tells how far that was once its lead-in goes
+further; the evidence is the mean of the likelihood over states, on a fine grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
+from bwbayes.inference.likelihood import Likelihood
+from bwbayes.model.operator import Span
+from bwbayes.results.histories import Histories, chosen, edged
+from bwbayes.results.prediction import Start
+from bwbayes.results.start import started
+from tests.results.moving import RATE, Case, posterior_of_case
+
+CASE = Case(hysteresis="preisach", discrepancy=0.05)
+POSTERIOR = posterior_of_case(CASE)
+DRAWS = POSTERIOR.prior.theta(np.empty((40, 0)))
+
+
+def record_after(reach: float) -> Record:
+    """Return a record that begins at 0 V after sweeps to a reach, V, and soon goes beyond it."""
+    time = np.arange(int(2 * RATE)) / RATE
+    before = reach * np.sin(2 * np.pi * np.arange(int(2 * RATE)) / RATE)
+    voltage = np.concatenate([before, 95 * np.sin(2 * np.pi * time)])
+    theta = DRAWS[:1, : len(POSTERIOR.actuator.parameters)]
+    displacement = POSTERIOR.actuator.displacement(theta, voltage, from_rest=True)[0]
+    noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
+    return Record(95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, 1 / RATE)
+
+
+def likelihoods(spans: list[Span]) -> tuple[Likelihood, ...]:
+    return tuple(
+        replace(POSTERIOR.likelihood, actuator=replace(POSTERIOR.actuator, span=span))
+        for span in spans
+    )
+
+
+@pytest.mark.parametrize("reach", [30.0, 60.0])
+def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: float) -> None:
+    record = record_after(reach)
+    start = Start(lead_in=1.0)
+    begun = started(POSTERIOR, DRAWS, record, start, np.random.default_rng(2))
+    spans = [actuator.span for actuator in begun.actuators]
+    drawn = np.array([spans[k] for k in begun.which])
+    # To the next of the ranges that are told apart: 6 V down, a quarter up.
+    np.testing.assert_allclose(drawn[:, 0], -reach, atol=10)
+    np.testing.assert_allclose(np.median(drawn[:, 1]), reach, atol=10)
+    np.testing.assert_allclose(drawn[:, 1], reach, rtol=0.35)
+
+
+def test_a_planned_voltage_has_any_history() -> None:
+    planned = replace(record_after(30.0), displacement=None)
+    draws = POSTERIOR.prior.theta(np.empty((500, 0)))
+    begun = started(POSTERIOR, draws, planned, Start(), np.random.default_rng(2))
+    counts = np.bincount(begun.which, minlength=len(begun.actuators))
+    assert np.max(np.abs(counts - 500 / len(counts))) < 2
+
+
+def test_every_draw_is_simulated_with_its_own_history() -> None:
+    """In pieces as at once, and as one draw alone."""
+    planned = replace(record_after(30.0), displacement=None)
+    begun = started(POSTERIOR, DRAWS, planned, Start(), np.random.default_rng(3))
+    whole = begun.advance(planned.voltage)[0]
+    first, states = begun.advance(planned.voltage[:77])
+    second, _ = begun.advance(planned.voltage[77:], states)
+    np.testing.assert_allclose(np.hstack([first, second]), whole, atol=1e-9)
+    for row in (0, 7, 39):
+        one = begun.actuators[begun.which[row]].advance(
+            begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]]
+        )[0][0]
+        np.testing.assert_allclose(whole[row], one, atol=1e-9)
+
+
+def test_answers_come_back_in_the_order_of_the_draws() -> None:
+    which = np.random.default_rng(4).integers(0, 3, 40)
+    spans = [Span(-volts, volts) for volts in (10.0, 20.0, 30.0)]
+    histories = Histories(likelihoods(spans), which)
+
+    def ask(one: Likelihood, some: FloatArray) -> tuple[FloatArray, ...]:
+        assert one.actuator.span is not None
+        return some[:, 0], np.full((len(some), 2), one.actuator.span.high)
+
+    theta = DRAWS + np.arange(40.0)[:, np.newaxis]
+    first, second = histories.each(theta, ask)
+    np.testing.assert_array_equal(theta[:, 0], first)
+    np.testing.assert_array_equal(np.stack([10.0 * (1 + which)] * 2, axis=1), second)
+
+
+def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
+    """As often as 4,001 states of each say, within four standard errors."""
+    record = record_after(60.0)
+    start = Start(lead_in=0.15)
+    draws = POSTERIOR.prior.theta(np.empty((2000, 0)))
+    spans = [Span(-40.0, 40.0), Span(-60.0, 60.0), Span(-95.0, 95.0)]
+    window = start.window(record)
+    assert window is not None
+    assert record.displacement is not None
+    posterior = replace(
+        POSTERIOR, voltage=record.voltage, displacement=record.displacement, training=(window,)
+    )
+    every = tuple(
+        replace(posterior.likelihood, offset_sd=50.0, actuator=replace(posterior.actuator, span=s))
+        for s in spans
+    )
+    parts = edged(np.linspace(0, 1, 4001))
+    logs = []
+    for one in every:
+        theta = np.repeat(draws[:1], parts.size, axis=0)
+        logs.append(one.log_density(one.table.replaced(theta, "initial", 2 * parts - 1)))
+    weight = np.mean(np.exp(np.array(logs) - np.max(logs)), axis=1)
+    expected = weight / np.sum(weight)
+    histories, _ = chosen(every, draws, np.random.default_rng(5))
+    got = np.bincount(histories.which, minlength=3) / len(draws)
+    error = np.sqrt(expected * (1 - expected) / len(draws)) + 1e-3
+    assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
+    assert np.max(expected) < 0.95
