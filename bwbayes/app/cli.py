@@ -48,7 +48,7 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but err
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="bwbayes")
+@click.version_option(package_name="bwbayes", prog_name="bwbayes")
 def cli() -> None:
     """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
