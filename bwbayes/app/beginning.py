@@ -58,13 +58,13 @@ def init(record: Path, units: tuple[str, ...], out: Path | None) -> int:
     return 0
 
 
-def config_or_proposal(path: Path, console: Console) -> Config:
+def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> Config:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
 
     Raises
     ------
     InputError
-        The file cannot be used, or what is wrong with the record makes a fit pointless.
+        The file cannot be used; or, if that is to be refused, a fit of the record is pointless.
     """
     from bwbayes.data.files import SUFFIXES  # noqa: PLC0415  # --help need not wait for scipy
 
@@ -73,7 +73,7 @@ def config_or_proposal(path: Path, console: Console) -> Config:
     from bwbayes.app.proposal import propose  # noqa: PLC0415
 
     made = propose(path, path.parent)
-    if made.pointless is not None:
+    if refuse and made.pointless is not None:
         raise InputError(
             f"{path}: {made.pointless}; if it is right as it is, write a config with "
             f"`bwbayes init {path}` and run that"
@@ -82,7 +82,12 @@ def config_or_proposal(path: Path, console: Console) -> Config:
     held = "held_out" in made.config.validation
     train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.record.train or ())
     rest = "the rest is held out" if held else "nothing is held out"
-    console.print(f"fitting {train}; {rest}; `bwbayes init {path}` writes this as a config")
+    console.print(
+        f"fitting {train}; {rest}; `bwbayes init {path}` writes this as a config",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
     return made.config
 
 

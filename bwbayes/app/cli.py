@@ -48,7 +48,7 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but err
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="bwbayes")
+@click.version_option(package_name="bwbayes", prog_name="bwbayes")
 def cli() -> None:
     """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
@@ -122,13 +122,13 @@ def resume(
 @click.option("--record", type=FILE, help="Check this record instead of the config's.")
 @click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
 def check(config: Path, record: Path | None, out: Path | None) -> int:
-    """Check a CONFIG and its record, draw it, and fit a point, without sampling.
+    """Check a CONFIG or a record, draw the record, and fit a point, without sampling.
 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
     from bwbayes.app.check import check as look  # noqa: PLC0415
 
-    wanted = beginning.config_or_proposal(config, Console())
+    wanted = beginning.config_or_proposal(config, Console(quiet=True), refuse=False)
     if record is not None:
         source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
         wanted = wanted.model_copy(update={"record": source})

@@ -27,6 +27,7 @@ from bwbayes.app.folder import RunFolder
 from bwbayes.app.plots import Plots
 from bwbayes.app.predictions import Prediction, predict_another
 from bwbayes.app.problem import Problem
+from bwbayes.app.proposal import read_recognised
 from bwbayes.app.report import template
 from bwbayes.app.run import (
     Run,
@@ -42,7 +43,7 @@ from bwbayes.app.screen import (
     score_texts,
     show_result,
 )
-from bwbayes.data import Record, read_record
+from bwbayes.data import Record
 from bwbayes.errors import InputWarning, NotConvergedError
 from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.engine import Engine
@@ -235,7 +236,7 @@ class Fit:
         other = record
         if not isinstance(other, Record):
             name = name or Path(other).stem
-            other = read_record(other, need_displacement=False)
+            other = read_recognised(Path(other))
         hold = self.problem.config.model.hold
         start = Start(
             from_rest, own_offset, lead_in, lead_in_from, None if hold == "auto" else hold

@@ -15,9 +15,10 @@ from bwbayes.app.figures import save_one
 from bwbayes.app.folder import RunFolder
 from bwbayes.app.predictions import predict_another
 from bwbayes.app.problem import Problem
+from bwbayes.app.proposal import read_recognised
 from bwbayes.app.run import finished
 from bwbayes.app.screen import show_scores, show_verdicts
-from bwbayes.data import Record, read_record
+from bwbayes.data import Record
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.sampling import draws
@@ -91,7 +92,7 @@ def predict(
 def _record(problem: Problem, path: Path | None, waveform: str | None) -> Record:
     """Read the record, or sample the signal as the training record was sampled."""
     if path is not None:
-        return read_record(path, need_displacement=False)
+        return read_recognised(path)
     assert waveform is not None
     interval = problem.record.interval
     _, voltage = signal(waveform).sample(1 / interval)

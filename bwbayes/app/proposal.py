@@ -24,7 +24,7 @@ from bwbayes.data.files import column_names
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.errors import InputError, InputWarning
 
-__all__ = ["Proposal", "propose"]
+__all__ = ["Proposal", "naming_of", "propose", "read_recognised"]
 
 # Of the record's readings: what is held out, first choice first, and the fewest of either part.
 QUARTERS = ((0.75, 1.0), (0.5, 0.75))
@@ -77,7 +77,7 @@ def propose(path: Path, where: Path, units: Mapping[str, str] | None = None) -> 
     InputError
         A column that is not recognised or has no unit, or a record that cannot be used.
     """
-    naming = _naming(path, units or {})
+    naming = naming_of(path, units or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         record = read_record(path, columns=naming.columns, units=naming.units)
@@ -87,14 +87,33 @@ def propose(path: Path, where: Path, units: Mapping[str, str] | None = None) -> 
     return Proposal(text, parse(text, str(path)), record, findings, remarks)
 
 
-def _naming(path: Path, units: Mapping[str, str]) -> Naming:
-    """Recognise a file's columns and their units; the package's own names need no table."""
+def naming_of(
+    path: Path, units: Mapping[str, str] | None = None, *, need_displacement: bool = True
+) -> Naming:
+    """Recognise a file's columns and their units; the package's own names need no table.
+
+    Parameters
+    ----------
+    path
+        The record's file.
+    units
+        Units by quantity, where the names of the columns do not say them.
+    need_displacement
+        False also accepts a file of a planned voltage.
+
+    Raises
+    ------
+    InputError
+        A column that is not recognised or has no unit.
+    """
+    units = units or {}
+    needed = ("time", "voltage", *(["displacement"] if need_displacement else []))
     names = column_names(path)
     Naming({}, units)  # refuses what does not exist
     own = {quantity for name in names if (quantity := _own(name, units))}
     guessed = recognised(names)
     columns = {q: name for q, name in guessed.items() if q not in own}
-    missing = [q for q in ("time", "voltage", "displacement") if q not in {*own, *columns}]
+    missing = [q for q in needed if q not in {*own, *columns}]
     if missing:
         raise InputError(
             f"{path}: which column is the {missing[0]}? There are {', '.join(map(repr, names))}; "
@@ -108,6 +127,18 @@ def _naming(path: Path, units: Mapping[str, str]) -> Naming:
                 f"it: `bwbayes init {path} --unit {quantity}=UNIT` with one of {known}"
             )
     return Naming(columns, units)
+
+
+def read_recognised(path: Path) -> Record:
+    """Read a record or a planned voltage whose columns may have other people's names.
+
+    Raises
+    ------
+    InputError
+        A column that is not recognised or has no unit, or a record that cannot be used.
+    """
+    naming = naming_of(path, need_displacement=False)
+    return read_record(path, need_displacement=False, columns=naming.columns, units=naming.units)
 
 
 def _own(name: str, units: Mapping[str, str]) -> str | None:

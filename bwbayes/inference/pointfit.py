@@ -7,6 +7,7 @@ there is the Gaussian approximation: it starts the sampler and is never the answ
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -231,7 +232,10 @@ class _Surface:
         return place
 
     def inwards(self, place: FloatArray) -> FloatArray:
-        w: FloatArray = linalg.solve(self.axes, place - self.centre)
+        with warnings.catch_warnings():
+            # Axes of very different lengths are as they should be.
+            warnings.simplefilter("ignore", linalg.LinAlgWarning)
+            w: FloatArray = linalg.solve(self.axes, place - self.centre)
         return w
 
     def values(self, w: FloatArray) -> FloatArray:

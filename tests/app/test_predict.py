@@ -62,3 +62,17 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
     assert f"DOES NOT HOLD: turned; see {tmp_path / 'bands.png'}\n" in capsys.readouterr().err
     found = json.loads(out.with_suffix(".json").read_text())
     assert (False, "sign") == (found["holds"], found["cause"])
+
+
+def test_a_files_own_columns_are_recognised(run: Path, record: Record, tmp_path: Path) -> None:
+    """As by `bwbayes run`: a user's next file has the columns of the first."""
+    assert record.displacement is not None
+    rows = zip(1e3 * record.time, record.voltage, record.displacement, strict=True)
+    lines = ["t [ms],drive (V),pos_um", *(f"{t:.9g},{v:.12g},{y:.12g}" for t, v, y in rows)]
+    (tmp_path / "sine.csv").write_text("\n".join(lines) + "\n")
+    out = tmp_path / "bands.csv"
+    start = Start(from_rest=True)
+    assert 0 == predict(run, tmp_path / "sine.csv", None, start, out, small.quiet())
+    found = json.loads(out.with_suffix(".json").read_text())
+    assert record.samples == found["samples"]
+    assert found["holds"] in (True, None)

@@ -278,3 +278,11 @@ def test_run_without_a_config_runs_the_proposed_one(
     assert [4.5, 6.0] == config.validation["held_out"].window
     said = command("run", path, "--out", tmp_path / "again").output
     assert "fitting 0 to 4.5 s; the rest is held out; `bwbayes init" in said
+
+
+def test_check_takes_a_record_and_shows_what_a_run_refuses(write: Write, tmp_path: Path) -> None:
+    path = write(change=_turned)
+    done = command("check", path, "--out", tmp_path / "page")
+    assert 0 == done.return_value
+    assert "reversed sign: the displacement falls" in done.output
+    assert (tmp_path / "page/check.html").exists()
