@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from typing import Any
 
+import cloudpickle
 from threadpoolctl import threadpool_limits
 
 from bwbayes.inference.engine import Engine
@@ -32,12 +36,24 @@ def executor(workers: int | None = None, engine: Engine = "numpy") -> Iterator[E
     pool: Executor = ThreadPoolExecutor(count if engine == "numba" else 1)
     if count > 1 and engine == "numpy":
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_settle)
+        pool = _Processes(count, mp_context=context, initializer=_settle)
         _start(pool, count)
     try:
         yield pool
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Processes(ProcessPoolExecutor):
+    """Processes that take what pickle does not: priors and bounds that parts declare in a line."""
+
+    def submit[**P, T](self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Send a call by value."""
+        return super().submit(_called, cloudpickle.dumps(partial(fn, *args, **kwargs)))
+
+
+def _called(call: bytes) -> Any:
+    return pickle.loads(call)()
 
 
 def one_thread() -> AbstractContextManager[object]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
 from bwbayes.app.workers import executor, one_thread
 from bwbayes.inference.engine import Engine
+from tests.inference.problems import short_posterior, truth
 
 
 def linear_algebra_threads() -> set[int]:
@@ -22,3 +25,12 @@ def test_workers_use_one_thread_for_linear_algebra(workers: int, engine: Engine)
     with one_thread(), executor(workers, engine) as pool:
         found = [pool.submit(linear_algebra_threads) for _ in range(2 * workers)]
         assert [{1}] * len(found) == [future.result() for future in found]
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+def test_a_model_reaches_the_workers_with_all_that_its_parts_declare(engine: Engine) -> None:
+    posterior = replace(short_posterior(samples=40), engine=engine)
+    theta = truth(posterior)
+    with one_thread(), executor(2, engine) as pool:
+        density = pool.submit(posterior.log_likelihood, theta).result()
+    np.testing.assert_array_equal(posterior.log_likelihood(theta), density)
