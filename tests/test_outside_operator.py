@@ -169,6 +169,11 @@ def config(folder: Path, kind: str, engine: str = "auto") -> bwbayes.Config:
     return bwbayes.parse_config(text, "outside.toml")
 
 
+def test_a_truth_may_be_stated_of_its_own_parameters(tmp_path: Path) -> None:
+    stated = config(tmp_path, "SinglePlay").model_copy(update={"truth": {"width": 9.0}})
+    assert bwbayes.resolve(stated, tmp_path).config.truth == {"width": 9.0}
+
+
 @pytest.mark.parametrize(("kind", "engine"), [("TanhLoop", "numba"), ("SinglePlay", "numpy")])
 def test_an_operator_from_outside_goes_all_the_way(kind: str, engine: str, tmp_path: Path) -> None:
     """Resolved, fitted, sampled, predicted and reported; the truth is within four sds.

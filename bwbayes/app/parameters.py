@@ -41,7 +41,7 @@ def parameters_of(
         The config says something of a parameter that the model does not have, or cannot have.
     """
     _require_known("parameters", config.parameters, declarations)
-    _require_known("truth", config.truth, every_declaration())
+    _require_known("truth", config.truth, [*declarations, *every_declaration()])
     given = {d.name: config.parameters.get(d.name, ParameterConfig()) for d in declarations}
     if config.record.from_rest:
         given |= {"initial": config.parameters.get("initial", ParameterConfig(fixed=0.0))}
