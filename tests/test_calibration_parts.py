@@ -4,7 +4,8 @@ As in :mod:`tests.test_calibration_moving`: default priors are resolved once, fr
 of a ring bender cut out of a running drive, and replicates draw their truth from them, with another
 record that starts in a state and a history of its own.
 
-The default suite makes ten replicates of three models, with priors of someone who knows the kind of
+The default suite makes ten replicates of Prandtl-Ishlinskii, and the slow one of gain and of creep
+as well, with priors of someone who knows the kind of
 actuator for the hysteresis. All parameters of a replicate are tested together
 (:mod:`tests.together`) at a level of 0.01. That raises a false alarm in one of 100; it finds sds
 that are half of what they should be 93 times in 100, and a bias of half a sd 96 times (200
@@ -81,7 +82,13 @@ def made(common: Experiment, count: int) -> list[Replicate]:
 Sound = tuple[Experiment, list[Replicate]]
 
 
-@pytest.fixture(scope="module", params=THREE)
+QUICKEST = "prandtl-ishlinskii"
+
+
+@pytest.fixture(
+    scope="module",
+    params=[QUICKEST, *(pytest.param(n, marks=pytest.mark.slow) for n in THREE if n != QUICKEST)],
+)
 def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Sound:
     common = resolved(*THREE[request.param], tmp_path_factory.mktemp("typical"))
     return common, made(common, QUICK)
