@@ -84,26 +84,24 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from bwbayes.app.calls import fit, open_run, resume_run
-    from bwbayes.app.config import Config
-    from bwbayes.app.config import load as load_config
-    from bwbayes.app.config import parse as parse_config
-    from bwbayes.app.fitted import Fit
-    from bwbayes.app.predictions import Prediction
-    from bwbayes.app.problem import Problem, resolve
-    from bwbayes.data.files import read_record, write_record
+    from bwbayes.app.config.config import Config
+    from bwbayes.app.config.config import load as load_config
+    from bwbayes.app.config.config import parse as parse_config
+    from bwbayes.app.fit.calls import fit, open_run, resume_run
+    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.problem.problem import Problem, resolve
+    from bwbayes.app.running.predictions import Prediction
     from bwbayes.data.inspection import Finding, inspect
+    from bwbayes.data.io.formats import read_record, write_record
     from bwbayes.data.record import Record
     from bwbayes.data.teststand import VirtualTestStand
     from bwbayes.data.waveforms import Waveform, signal
     from bwbayes.errors import InputError, InputWarning, NotConvergedError
-    from bwbayes.inference.chain import Chain
     from bwbayes.inference.noise import noise_model
     from bwbayes.inference.parameters import JointPrior, Parameter
     from bwbayes.inference.pointfit import PointFit
     from bwbayes.inference.pointfit import fit as point_fit
     from bwbayes.inference.posterior import Posterior
-    from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
     from bwbayes.model.actuator import Actuator
     from bwbayes.model.boucwen import hysteresis
     from bwbayes.model.distributions import Distribution
@@ -116,6 +114,8 @@ if TYPE_CHECKING:
     from bwbayes.results.start import Start
     from bwbayes.results.steps import Step, StepResponse, measure_step
     from bwbayes.results.verdict import Background, Verdict, assess
+    from bwbayes.sampling.chain import Chain
+    from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
 else:
     # The module of each name, and what it is called there if not the same.
     HOMES = {
@@ -123,26 +123,26 @@ else:
         "Background": "results.verdict",
         "Bands": "results.bands",
         "Calibration": "results.calibration",
-        "Chain": "inference.chain",
-        "Config": "app.config",
+        "Chain": "sampling.chain",
+        "Config": "app.config.config",
         "Distribution": "model.distributions",
         "Experiment": "results.replicates",
         "Finding": "data.inspection",
-        "Fit": "app.fitted",
+        "Fit": "app.fit.fitted",
         "InputError": "errors",
         "InputWarning": "errors",
         "JointPrior": "inference.parameters",
         "Loops": "results.loops",
         "NotConvergedError": "errors",
-        "Outcome": "inference.sampling",
+        "Outcome": "sampling.sampler",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
         "Posterior": "inference.posterior",
-        "Prediction": "app.predictions",
-        "Problem": "app.problem",
+        "Prediction": "app.running.predictions",
+        "Problem": "app.problem.problem",
         "Record": "data.record",
         "Replicate": "results.replicates",
-        "SamplingPlan": "inference.sampling",
+        "SamplingPlan": "sampling.sampler",
         "Scores": "results.scores",
         "Start": "results.start",
         "Step": "results.steps",
@@ -151,31 +151,31 @@ else:
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",
         "assess": "results.verdict",
-        "draws": "inference.sampling",
-        "first_chain": "inference.sampling",
+        "draws": "sampling.sampler",
+        "first_chain": "sampling.sampler",
         "forecast": "results.prediction",
-        "fit": "app.calls",
+        "fit": "app.fit.calls",
         "hysteresis": "model.boucwen",
         "inspect": "data.inspection",
         "judge": "results.calibration",
-        "load_config": "app.config:load",
+        "load_config": "app.config.config:load",
         "measure_loops": "results.loops",
         "measure_step": "results.steps",
         "noise_model": "inference.noise",
-        "open_run": "app.calls",
-        "parse_config": "app.config:parse",
+        "open_run": "app.fit.calls",
+        "parse_config": "app.config.config:parse",
         "point_fit": "inference.pointfit:fit",
         "predict_record": "results.prediction",
         "predict_windows": "results.prediction",
-        "read_record": "data.files",
+        "read_record": "data.io.formats",
         "replicates": "results.replicates",
-        "resolve": "app.problem",
-        "resume_run": "app.calls",
-        "sample": "inference.sampling",
+        "resolve": "app.problem.problem",
+        "resume_run": "app.fit.calls",
+        "sample": "sampling.sampler",
         "score": "results.scores",
         "signal": "data.waveforms",
         "thinned": "results.prediction",
-        "write_record": "data.files",
+        "write_record": "data.io.formats",
     }
 
     def __getattr__(name: str) -> object:

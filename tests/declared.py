@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bwbayes.app.parameters import every_declaration
+from bwbayes.app.problem.parameters import every_declaration
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution

@@ -10,4 +10,6 @@ import multiprocessing
 __all__ = ["FORKS"]
 
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["pytest", "bwbayes.app.cli", "bwbayes.app.run", "tests.app.small"])
+FORKS.set_forkserver_preload(
+    ["pytest", "bwbayes.app.commands.cli", "bwbayes.app.running.run", "tests.app.small"]
+)

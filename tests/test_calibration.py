@@ -30,10 +30,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.calibrate import experiment
-from bwbayes.app.config import load, parse
-from bwbayes.app.problem import Problem, resolve
-from bwbayes.app.workers import executor, one_thread
+from bwbayes.app.commands.calibrate import experiment
+from bwbayes.app.config.config import load, parse
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise, SteadyState, WhiteNoise
 from bwbayes.inference.parameters import JointPrior

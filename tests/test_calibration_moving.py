@@ -32,12 +32,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.app.calibrate import experiment
-from bwbayes.app.config import parse
-from bwbayes.app.problem import resolve
-from bwbayes.app.workers import one_thread
+from bwbayes.app.commands.calibrate import experiment
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.data.files import write_record
+from bwbayes.data.io.formats import write_record
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference.noise import DiscrepancyNoise

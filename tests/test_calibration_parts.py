@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.calibrate import experiment
-from bwbayes.app.config import parse
-from bwbayes.app.problem import resolve
-from bwbayes.app.workers import one_thread
+from bwbayes.app.commands.calibrate import experiment
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.data.files import write_record
+from bwbayes.data.io.formats import write_record
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.found import keep

@@ -26,15 +26,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config import parse
-from bwbayes.app.problem import generator, resolve
-from bwbayes.app.run import predictions
-from bwbayes.app.workers import one_thread
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import generator, resolve
+from bwbayes.app.running.run import predictions
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
-from bwbayes.inference.sampling import draws, first_chain, sample
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.result import Result
+from bwbayes.sampling.sampler import draws, first_chain, sample
 from tests.found import keep
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"

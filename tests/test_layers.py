@@ -22,18 +22,23 @@ LAYERS = (
     ("bwbayes.model",),
     ("bwbayes.data",),
     ("bwbayes.inference",),
+    ("bwbayes.sampling",),
     ("bwbayes.results",),
     ("bwbayes.app",),
 )
 
 # Libraries that few modules may know, and these modules (patterns).
 KEEPERS = {
-    "h5py": ("bwbayes.inference.chainfile", "bwbayes.data.hdf5file", "bwbayes.data.matfile"),
-    "emcee": ("bwbayes.inference.ensemble", "bwbayes.inference.moves"),
-    "arviz": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_base": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_stats": ("bwbayes.inference.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "matplotlib": ("bwbayes.app.figures*", "bwbayes.app.plots", "bwbayes.app.predictions"),
+    "h5py": ("bwbayes.sampling.storage", "bwbayes.data.io.hdf5", "bwbayes.data.io.matlab"),
+    "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves"),
+    "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_stats": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "matplotlib": (
+        "bwbayes.app.figures*",
+        "bwbayes.app.fit.plots",
+        "bwbayes.app.running.predictions",
+    ),
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),

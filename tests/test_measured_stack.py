@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app import cli
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.run import finished
+from bwbayes.app.commands import cli
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import finished
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import draws
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record, thinned
+from bwbayes.sampling.sampler import draws
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"

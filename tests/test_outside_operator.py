@@ -18,8 +18,8 @@ import pytest
 from rich.console import Console
 
 import bwbayes
-from bwbayes.app import cli
-from bwbayes.app.run import carry_on, start
+from bwbayes.app.commands import cli
+from bwbayes.app.running.run import carry_on, start
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, noise_model

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app import cli
-from bwbayes.app.config import parse
+from bwbayes.app.commands import cli
+from bwbayes.app.config.config import parse
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.results.bands import LEVELS

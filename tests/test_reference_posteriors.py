@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.config import RecordConfig, load
-from bwbayes.app.problem import Problem, generator, resolve
-from bwbayes.app.workers import one_thread
+from bwbayes.app.config.config import RecordConfig, load
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from bwbayes.inference import pointfit
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
+from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
 from tests.reference.make import digest, from_cube
 from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
 

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config import parse
-from bwbayes.app.problem import Problem, generator, resolve
-from bwbayes.app.workers import executor, one_thread
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from bwbayes.inference import pointfit
-from bwbayes.inference.chain import Chain
-from bwbayes.inference.sampling import Outcome, draws, first_chain, sample
 from bwbayes.model.actuator import Actuator
+from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
 from tests.found import keep
 
 RATE = 250.0

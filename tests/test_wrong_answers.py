@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.problem import Problem, generator
+from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from bwbayes.results.prediction import Start, predict_record, thinned
@@ -315,7 +315,7 @@ def test_a_displacement_that_goes_the_other_way_is_said_first_and_ends_with_stat
 @pytest.fixture
 def bwbayes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """Return a function that runs a command line in an empty folder; it gives the exit status."""
-    from bwbayes.app import cli  # noqa: PLC0415
+    from bwbayes.app.commands import cli  # noqa: PLC0415
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("signal.signal", lambda *_: None)

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bwbayes.app.folder import CalibrationFolder, RunFolder
-from bwbayes.app.problem import generator
+from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bwbayes.data.files import read_record, write_record
+from bwbayes.data.io.formats import read_record, write_record
 from bwbayes.data.record import Record, Split
 
 __all__ = ["Record", "Split", "read_record", "write_record"]

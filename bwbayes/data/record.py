@@ -20,9 +20,9 @@ from typing import Any, Self
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
-from bwbayes.data.checks import Column, Table, VoltageIs, checked, require_voltage_is
-from bwbayes.data.columns import COMMON_NAMES, Naming
-from bwbayes.data.frames import frame_table
+from bwbayes.data.io.checks import Column, Table, VoltageIs, checked, require_voltage_is
+from bwbayes.data.io.columns import COMMON_NAMES, Naming
+from bwbayes.data.io.frames import frame_table
 from bwbayes.errors import InputError, InputWarning, one_line
 
 __all__ = ["Record", "Split", "Window", "require_readable"]

@@ -25,10 +25,10 @@ from bwbayes.data.record import Record
 from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import Outcome, SamplingPlan, draws, first_chain, sample
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
+from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
 
 __all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
 

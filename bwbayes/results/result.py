@@ -13,9 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
-from bwbayes.inference.sampling import Outcome
 from bwbayes.results import innovations, loops, steps
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
@@ -23,6 +21,8 @@ from bwbayes.results.loops import Loops
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.sampler import Outcome
 
 __all__ = ["Result", "summary"]
 

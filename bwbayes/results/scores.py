@@ -13,8 +13,8 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.ensemble import autocorrelation_time
 from bwbayes.results.bands import LEVELS, Bands, Kind
+from bwbayes.sampling.ensemble import autocorrelation_time
 
 __all__ = ["Scores", "as_summary", "block_bootstrap_error", "block_length", "score"]
 

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.diagnostics import Check
 from bwbayes.inference.parameters import Parameter
-from bwbayes.inference.sampling import Outcome
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.sampler import Outcome
 from tests.declared import declared
 
 

@@ -16,10 +16,10 @@ import pytest
 from filelock import FileLock
 from rich.console import Console
 
-from bwbayes.app.config import Config, parse
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.run import start
-from bwbayes.inference.chain import PHASES
+from bwbayes.app.config.config import Config, parse
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import start
+from bwbayes.sampling.chain import PHASES
 
 __all__ = [
     "TEXT",

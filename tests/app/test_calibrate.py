@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bwbayes.app import calibrate as module
-from bwbayes.app.calibrate import carry_on, start
-from bwbayes.app.cli import cli
-from bwbayes.app.config import parse
-from bwbayes.app.folder import CalibrationFolder, RunFolder
-from bwbayes.app.progress import ReplicateProgress
+from bwbayes.app.commands import calibrate as module
+from bwbayes.app.commands.calibrate import carry_on, start
+from bwbayes.app.commands.cli import cli
+from bwbayes.app.config.config import parse
+from bwbayes.app.running.folder import CalibrationFolder, RunFolder
+from bwbayes.app.running.progress import ReplicateProgress
 from bwbayes.errors import InputError
 from bwbayes.results.bands import KINDS, LEVELS
 from tests.app import small

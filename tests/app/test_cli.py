@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from bwbayes.app import cli
+from bwbayes.app.commands import cli
 from bwbayes.data import read_record, write_record
 from tests.app import small
 from tests.data.spoilt import looping

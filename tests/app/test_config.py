@@ -10,7 +10,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from bwbayes.app.config import Config, dump, load, parse
+from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.errors import InputError
 from tests.app import small
 

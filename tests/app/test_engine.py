@@ -11,12 +11,12 @@ import h5py
 import pytest
 from rich.console import Console
 
-from bwbayes.app.config import load
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.run import carry_on
+from bwbayes.app.config.config import load
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import carry_on
 from bwbayes.errors import InputError
 from bwbayes.inference import engine
-from bwbayes.inference.chainfile import ChainFile
+from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 

@@ -10,16 +10,16 @@ from pathlib import Path
 import h5py
 import pytest
 
-from bwbayes.app import run as module
-from bwbayes.app.config import Config, dump, load, parse
-from bwbayes.app.fingerprint import UNSAID, fingerprint, require_same, version_remarks
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.predict import predict
-from bwbayes.app.problem import resolve
-from bwbayes.app.run import carry_on, redraw
+from bwbayes.app.commands.predict import predict
+from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running import run as module
+from bwbayes.app.running.fingerprint import UNSAID, fingerprint, require_same, version_remarks
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import carry_on, redraw
 from bwbayes.errors import InputError
-from bwbayes.inference.chainfile import ChainFile
 from bwbayes.results.prediction import Start
+from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 

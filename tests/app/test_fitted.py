@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app import fitted, run
-from bwbayes.app.config import load
-from bwbayes.app.fitted import Fit
-from bwbayes.app.model_settings import StandConfig
-from bwbayes.app.predict import predict
+from bwbayes.app.commands.predict import predict
+from bwbayes.app.config.config import load
+from bwbayes.app.config.model_settings import StandConfig
+from bwbayes.app.fit import fitted
+from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.running import run
 from bwbayes.data import Record, read_record
-from bwbayes.results.files import write_bands
+from bwbayes.results.outputs import write_bands
 from bwbayes.results.prediction import Start
 from tests.app import small
 
@@ -201,7 +202,7 @@ def test_ctrl_c_leaves_a_folder_to_go_on_from(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("bwbayes.app.progress.Progress.__call__", interrupt)
+        patched.setattr("bwbayes.app.running.progress.Progress.__call__", interrupt)
         with pytest.raises(KeyboardInterrupt):
             bw.fit(record, folder=tmp_path / "a", **keys)
     with pytest.raises(bw.InputError, match=r"a: exists; go on with `bwbayes resume"):
@@ -268,7 +269,7 @@ def test_remarks_of_the_record_are_warnings(
     def none(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bwbayes.app.calls.carried_on", none)
+    monkeypatch.setattr("bwbayes.app.fit.calls.carried_on", none)
     assert record.displacement is not None
     spoilt = record.displacement.copy()
     spoilt[120] += 60.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.fitted import Fit
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.data import Record
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import identification_signal

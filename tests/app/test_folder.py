@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from bwbayes.app.config import load
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.config.config import load
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from tests.app import small
 from tests.forks import FORKS

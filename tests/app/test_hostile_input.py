@@ -27,12 +27,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app import check as app_check
-from bwbayes.app import cli
-from bwbayes.app.config import load
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import generator, resolve
-from bwbayes.app.run import load_run
+from bwbayes.app.commands import check as app_check
+from bwbayes.app.commands import cli
+from bwbayes.app.config.config import load
+from bwbayes.app.problem.problem import generator, resolve
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import load_run
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.figures import draw_all
-from bwbayes.app.report import render
+from bwbayes.app.report.report import render
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.results.loops import MEASURES, Loops, measure_loops

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config import Config, SignalConfig, dump, parse
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import Problem, generator, resolve, sampled_waveform
-from bwbayes.app.run import load_run
+from bwbayes.app.config.config import Config, SignalConfig, dump, parse
+from bwbayes.app.problem.problem import Problem, generator, resolve, sampled_waveform
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import load_run
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter

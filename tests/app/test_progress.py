@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.progress import Progress
-from bwbayes.inference.diagnostics import Check
-from bwbayes.inference.sampling import SamplingPlan
+from bwbayes.app.running.progress import Progress
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.sampler import SamplingPlan
 
 PLAN = SamplingPlan(ess=2000, block=50)
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from bwbayes.app import cli
-from bwbayes.app.config import load
-from bwbayes.app.problem import resolve
-from bwbayes.app.proposal import Proposal, propose
+from bwbayes.app.commands import cli
+from bwbayes.app.config.config import load
+from bwbayes.app.config.proposal import Proposal, propose
+from bwbayes.app.problem.problem import resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.data.teststand import VirtualTestStand

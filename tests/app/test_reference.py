@@ -12,9 +12,9 @@ import tomllib
 import numpy as np
 import pytest
 
-from bwbayes.app.config import Config, parse
-from bwbayes.app.keys import ANY, Key, keys
-from bwbayes.app.reference import (
+from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.keys import ANY, Key, keys
+from bwbayes.app.config.reference import (
     CHOICES,
     PARTS,
     RING_BENDER,

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bwbayes.app.check import check
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.run import assemble, finished
+from bwbayes.app.commands.check import check
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import assemble, finished
 from bwbayes.app.screen import show_priors
 from bwbayes.data.inspection import Finding
 from bwbayes.model.distributions import Distribution
@@ -58,7 +58,7 @@ def test_a_transient_in_sight_counts(
     def told(*_: object, seen: bool) -> None:
         counted.append(seen)
 
-    monkeypatch.setattr("bwbayes.app.run.without_start", told)
+    monkeypatch.setattr("bwbayes.app.running.run.without_start", told)
     transient = Finding("switch-on transient", 0.0, 1.0, "it starts off", "leave it out")
     drift = replace(transient, kind="drift")
     for findings in ((), (drift,), (drift, transient)):

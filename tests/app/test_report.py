@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from bwbayes.app.report import digits, render, symbol
+from bwbayes.app.report.report import digits, render, symbol
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.result import Result, summary

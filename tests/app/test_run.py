@@ -17,20 +17,20 @@ import pytest
 import xarray
 from rich.console import Console
 
-from bwbayes.app import run as module
-from bwbayes.app.cli import _finish
-from bwbayes.app.config import load, parse
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.progress import Progress
-from bwbayes.app.run import carry_on, redraw
+from bwbayes.app.commands.cli import _finish
+from bwbayes.app.config.config import load, parse
+from bwbayes.app.running import run as module
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.progress import Progress
+from bwbayes.app.running.run import carry_on, redraw
 from bwbayes.app.screen import show_result
 from bwbayes.data import read_record, write_record
 from bwbayes.errors import InputError
-from bwbayes.inference import sampling
-from bwbayes.inference.chain import Phase
-from bwbayes.inference.chainfile import ChainFile
-from bwbayes.inference.diagnostics import Check
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.sampling import sampler
+from bwbayes.sampling.chain import Phase
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.storage import ChainFile
 from tests.app import example, small
 
 FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
@@ -181,7 +181,7 @@ def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
 def test_posterior_is_the_chain(run: Path) -> None:
     problem = module.load_run(RunFolder(run))
     chain = ChainFile.read(run / "chain.h5")
-    draws = sampling.draws(problem.posterior, chain)
+    draws = sampler.draws(problem.posterior, chain)
     density = chain.log_density("sampling")
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
         posterior = tree["posterior"].to_dataset()

@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app import run as module
-from bwbayes.app.cli import _finish
-from bwbayes.app.config import load
-from bwbayes.app.fingerprint import fingerprint
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.predict import predict
-from bwbayes.app.run import carry_on
+from bwbayes.app.commands.cli import _finish
+from bwbayes.app.commands.predict import predict
+from bwbayes.app.config.config import load
+from bwbayes.app.running import run as module
+from bwbayes.app.running.fingerprint import fingerprint
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import carry_on
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.chain import Chain
-from bwbayes.inference.chainfile import ChainFile
-from bwbayes.inference.ensemble import Block, EnsembleState
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.prediction import Start
+from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.ensemble import Block, EnsembleState
+from bwbayes.sampling.storage import ChainFile
 from tests.app import small
-from tests.inference.hard_chains import BLOCK, HARD, good, moved
+from tests.sampling.hard_chains import BLOCK, HARD, good, moved
 
 
 @pytest.fixture(scope="module")

@@ -21,20 +21,20 @@ import pytest
 import scipy.io
 from rich.console import Console
 
-from bwbayes.app.config import parse
-from bwbayes.app.folder import RunFolder
-from bwbayes.app.problem import resolve
-from bwbayes.app.report import render
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.report.report import render
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.screen import show_priors
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.result import Result, summary
+from bwbayes.sampling.storage import ChainFile
 from tests.app import example
 from tests.app.odd_files import good_arrays
 from tests.app.oddities import CONFIGS, GOOD, QUICK
-from tests.inference.chains import finish, new
+from tests.sampling.chains import finish, new
 
 SOURCES = Path(__file__).parents[2] / "bwbayes"
 
@@ -197,7 +197,7 @@ CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "read_pickl
 
 
 # What this program's own processes send to each other comes from no file.
-BETWEEN_PROCESSES = {"app/workers.py": {"pickle", "cloudpickle"}}
+BETWEEN_PROCESSES = {"app/running/workers.py": {"pickle", "cloudpickle"}}
 
 
 def called(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:

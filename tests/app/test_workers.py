@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from bwbayes.app.workers import executor, one_thread
+from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.inference.engine import Engine
 from tests.inference.problems import short_posterior, truth
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.workers import one_thread
+from bwbayes.app.running.workers import one_thread
 from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
 from tests.benchmarks.startup import startup

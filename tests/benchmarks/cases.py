@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.app.config import Config, load
-from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.config.config import Config, load
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior

@@ -26,15 +26,15 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 from emcee.moves import Move, StretchMove
 
-from bwbayes.app.problem import Problem, generator
-from bwbayes.app.workers import executor
+from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.running.workers import executor
 from bwbayes.inference import pointfit
-from bwbayes.inference.chain import Chain, Phase
-from bwbayes.inference.diagnostics import TAIL, Check, as_chains
-from bwbayes.inference.ensemble import Block, EnsembleState, advance
-from bwbayes.inference.moves import pilot_moves, sampling_moves
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import Outcome, first_chain, sample
+from bwbayes.sampling.chain import Chain, Phase
+from bwbayes.sampling.diagnostics import TAIL, Check, as_chains
+from bwbayes.sampling.ensemble import Block, EnsembleState, advance
+from bwbayes.sampling.moves import pilot_moves, sampling_moves
+from bwbayes.sampling.sampler import Outcome, first_chain, sample
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, problem
 from tests.benchmarks.likelihood import speed_up
 from tests.benchmarks.tables import Cell, Table

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bwbayes.app.config import dump
+from bwbayes.app.config.config import dump
 from tests.benchmarks.cases import ROOT, Effort, config
 from tests.benchmarks.tables import Cell, Table
 from tests.benchmarks.timing import interleaved, timed
 
 __all__ = ["STARTS", "started", "startup"]
 
-MAIN = "import sys; from bwbayes.app.cli import main; sys.argv[0] = 'bwbayes'; main()"
+MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bwbayes'; main()"
 
 # One model through all that is compiled, with a record as a run has it: not to be written to.
 COMPILED = """
@@ -35,7 +35,7 @@ STARTS: Mapping[str, list[str]] = {
     "import numpy, scipy.signal, emcee": ["-c", "import numpy, scipy.signal, emcee"],
     "import bwbayes": ["-c", "import bwbayes"],
     "bwbayes --help": ["-c", MAIN, "--help"],
-    "import all of a run": ["-c", "import bwbayes.app.run"],
+    "import all of a run": ["-c", "import bwbayes.app.running.run"],
     "import and load the compiled engine": ["-c", COMPILED],
 }
 

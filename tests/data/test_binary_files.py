@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import scipy.io
 
-from bwbayes.data import Record, matfile, read_record, write_record
+from bwbayes.data import Record, read_record, write_record
+from bwbayes.data.io import matlab
 from bwbayes.errors import InputError
-from tests.data.test_csvfile import mutated, outcome
+from tests.data.test_text import mutated, outcome
 
 SAMPLES = 24
 TIME = 0.5 + 1e-3 * np.arange(SAMPLES)
@@ -270,7 +271,7 @@ def test_a_file_cannot_have_another_file_opened(
 def test_a_compressed_array_cannot_unpack_to_all_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(matfile, "_LARGEST_ELEMENT", 10_000)
+    monkeypatch.setattr(matlab, "_LARGEST_ELEMENT", 10_000)
     path = store(tmp_path, "compressed", {"zeros": np.zeros(10**5)} | GOOD)
     assert "damaged" in fault(path)
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.data import Record, read_record
-from bwbayes.data.columns import UNITS, Naming, recognised, unit_in
+from bwbayes.data.io.columns import UNITS, Naming, recognised, unit_in
 from bwbayes.errors import InputError, InputWarning
 
 TIME = np.arange(200) / 100

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from bwbayes.app.config import parse
-from bwbayes.app.problem import Problem, resolve
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import Amplifier, LaserSensor, VirtualTestStand
 from bwbayes.data.truths import true_values

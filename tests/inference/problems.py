@@ -22,17 +22,17 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import ranges_of
-from bwbayes.inference.ensemble import advance, start
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.proposals import StudentProposal
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
+from bwbayes.sampling.ensemble import advance, start
+from bwbayes.sampling.proposals import StudentProposal
 from tests.declared import NAMES, context, declared, joint, parameter
 
 __all__ = [

@@ -13,8 +13,8 @@ SCRIPT = """
 from pathlib import Path
 from dataclasses import replace
 import numpy as np
-from bwbayes.inference.ensemble import advance, start
-from bwbayes.inference.moves import pilot_moves
+from bwbayes.sampling.ensemble import advance, start
+from bwbayes.sampling.moves import pilot_moves
 from bwbayes.inference.pointfit import PointFit
 from tests.inference.problems import short_posterior
 

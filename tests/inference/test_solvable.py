@@ -26,14 +26,14 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from bwbayes.app.workers import one_thread
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import SamplingPlan, draws, first_chain, sample
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
+from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, sample
 from tests.inference.problems import (
     INTERVAL,
     TRUE_LAG,

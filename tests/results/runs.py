@@ -16,17 +16,14 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 from scipy.signal import lfilter
 
-from bwbayes.app.config import parse
-from bwbayes.app.problem import Problem, generator, resolve
-from bwbayes.app.run import assemble, judged, versions
-from bwbayes.app.workers import executor, one_thread
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.run import assemble, judged, versions
+from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.inference import pointfit
-from bwbayes.inference.chainfile import ChainFile
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.proposals import StudentMixture, StudentProposal
-from bwbayes.inference.sampling import first_chain, sample
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import innovations
@@ -34,6 +31,9 @@ from bwbayes.results.prediction import predict_record, predict_windows
 from bwbayes.results.refit import without_start
 from bwbayes.results.result import Result
 from bwbayes.results.verdict import Background, Verdict
+from bwbayes.sampling.proposals import StudentMixture, StudentProposal
+from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.storage import ChainFile
 
 __all__ = [
     "CONVERGED",

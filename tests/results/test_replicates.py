@@ -15,7 +15,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.sampling import SamplingPlan
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.results import replicates as module
@@ -23,6 +22,7 @@ from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import Start
 from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
+from bwbayes.sampling.sampler import SamplingPlan
 from tests.app import example
 from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
 

@@ -10,8 +10,8 @@ import pytest
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.diagnostics import check
 from bwbayes.results.result import summary
+from bwbayes.sampling.diagnostics import check
 from tests.app import example
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import identifiability
 from bwbayes.inference.conflict import conflicts
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
@@ -18,6 +17,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.results import identifiability
 from tests.inference.problems import decaying_sine, posterior_of
 
 every_operator = pytest.mark.parametrize("name", HYSTERESIS)

@@ -1,0 +1,1 @@
+"""The command line: a module for each job, and the thin layer of options over them."""

@@ -1,0 +1,33 @@
+"""The commands that print the reference: what a config may say, and what a model may be made of."""
+
+from __future__ import annotations
+
+import click
+
+__all__ = ["config", "models"]
+
+
+@click.command()
+@click.argument("key", required=False)
+def config(key: str | None) -> int:
+    """Print the keys of a config: type, unit, default and an example; of all, or of one KEY.
+
+    Example: bwbayes config record.train
+    """
+    from bwbayes.app.config.reference import config_reference  # noqa: PLC0415  # --help need not wait
+
+    click.echo(config_reference(key))
+    return 0
+
+
+@click.command()
+@click.argument("name", required=False)
+def models(name: str | None) -> int:
+    """Print the parts of a model, or of one NAME its equation, parameters and default priors.
+
+    Example: bwbayes models prandtl-ishlinskii
+    """
+    from bwbayes.app.config.reference import parts_reference  # noqa: PLC0415
+
+    click.echo(parts_reference(name))
+    return 0

@@ -1,0 +1,1 @@
+"""What a config may say: its keys, their types, defaults and descriptions, and how TOML is read."""

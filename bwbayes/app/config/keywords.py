@@ -1,0 +1,129 @@
+"""A config from keyword arguments: the keys of all its tables side by side, and records in memory.
+
+``bwbayes.fit(record, dynamics="lag", train=(0, 12), ess=4000)`` says what a config says under
+``[model]``, ``[record]`` and ``[sampling]``; it is checked by the same models and refused in the
+same words. ``parameters`` and ``validation`` are tables, as in a config.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from bwbayes.app.config.config import Config, checked
+from bwbayes.app.config.keys import MEANINGS
+from bwbayes.app.config.model_settings import ModelConfig
+from bwbayes.app.config.settings import RecordConfig, SamplingConfig, ValidationConfig
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError, suggestion
+
+__all__ = ["config_of"]
+
+# Where a key belongs; of a key of two tables (`outliers`) the first table counts.
+TABLES: dict[str, type[BaseModel]] = {
+    "model": ModelConfig,
+    "record": RecordConfig,
+    "sampling": SamplingConfig,
+}
+ABOVE = ("name", "seed", "parameters", "validation", "truth")
+
+# What a record is called that is not a file.
+IN_MEMORY = "records/{}.h5"
+
+
+def config_of(
+    record: Record | str | Path, keys: Mapping[str, Any], where: str = "fit"
+) -> tuple[Config, dict[str, Record]]:
+    """Return the config of a record and of keyword arguments, and the records in memory by name.
+
+    Parameters
+    ----------
+    record
+        The training record, or its file.
+    keys
+        Keys of a config's [record], [model] and [sampling], and ``name``, ``seed``, ``parameters``,
+        ``validation`` and ``truth``. A validation is a pair (start, stop) in s, which is a window
+        of the training record; another record or its file; or a table of the keys of
+        [validation.NAME], in which ``record`` may be a record.
+    where
+        What is called, for errors.
+
+    Raises
+    ------
+    InputError
+        A key that does not exist, or what no config can say.
+    """
+    homes = {key: name for name in reversed(TABLES) for key in TABLES[name].model_fields}
+    homes = {key: name for key, name in homes.items() if key not in ("file", "signal")}
+    tables: dict[str, Any] = {"record": {}, "model": {}, "sampling": {}}
+    for key, value in keys.items():
+        if key in ABOVE:
+            tables[key] = _plain(value)
+        elif key in homes:
+            tables[homes[key]][key] = _plain(value)
+        else:
+            raise InputError(f"{where}: {key}: unknown key; {_hint(key, [*homes, *ABOVE])}")
+    records: dict[str, Record] = {}
+    tables["record"]["file"] = _file(record, "record", records, where)
+    if isinstance(keys.get("validation"), Mapping):
+        tables["validation"] = {
+            name: _validation(str(name), given, records, where)
+            for name, given in keys["validation"].items()
+        }
+    return checked(tables, where), records
+
+
+def _hint(key: str, known: list[str]) -> str:
+    """Say which key is meant."""
+    if key in TABLES:
+        example = next(iter(TABLES[key].model_fields))
+        return f"give the keys of [{key}] themselves, {example} for instance"
+    return suggestion(key, known, MEANINGS)
+
+
+def _validation(name: str, given: Any, records: dict[str, Record], where: str) -> Any:
+    """Return a validation as a config's table has it."""
+    if isinstance(given, Record | str | Path):
+        return {"file": _file(given, name, records, where)}
+    if not isinstance(given, Mapping):
+        return {"window": _plain(given)}
+    table = {key: _plain(value) for key, value in given.items() if key != "record"}
+    if "record" in given:
+        if not isinstance(given["record"], Record | str | Path):
+            known = ", ".join(ValidationConfig.model_fields)
+            raise InputError(
+                f"{where}: validation.{name}.record: is no record; give a Record, a file or a "
+                f"window; other keys are {known}"
+            )
+        table["file"] = _file(given["record"], name, records, where)
+    return table
+
+
+def _file(given: Any, name: str, records: dict[str, Record], where: str) -> str:
+    """Return the file of a record; of one in memory, which is noted, the name it will have."""
+    if isinstance(given, Record):
+        if given.displacement is None:
+            raise InputError(f"{where}: {name}: has no displacement; give a measured record")
+        records[name] = given
+        return IN_MEMORY.format(name)
+    if isinstance(given, str | Path):
+        return str(Path(given).absolute())
+    raise InputError(
+        f"{where}: {name}: {type(given).__name__} is no record; make one with "
+        "Record.from_arrays(voltage, displacement, interval=...) or Record.from_pandas(frame)"
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Return a value in the types of TOML: lists for tuples and arrays, Python's own numbers."""
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

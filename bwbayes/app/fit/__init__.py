@@ -1,0 +1,1 @@
+"""A fit as Python users have it: one call, one object, its figures."""

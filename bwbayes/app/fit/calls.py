@@ -1,0 +1,127 @@
+"""From a record to a fit in Python: ``fit = bwbayes.fit(record, dynamics="lag", train=(0, 12))``.
+
+What :func:`fit` makes, ``bwbayes run`` makes too, by the same functions; :func:`open_run` reads
+what either has written, and :func:`resume_run` goes on with it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from bwbayes.app.config.keywords import config_of
+from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import finished
+from bwbayes.data import Record
+from bwbayes.inference.engine import Engine
+
+__all__ = ["fit", "open_run", "resume_run"]
+
+
+def fit(
+    record: Record | str | Path,
+    *,
+    folder: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: bool = True,
+    **keys: Any,
+) -> Fit:
+    """Fit a record: sample the posterior until it has converged, predict and judge.
+
+    Parameters
+    ----------
+    record
+        The training record, or its file.
+    folder
+        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is there after
+        Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
+    overwrite
+        Replace a run that is in the folder already.
+    workers
+        Ensembles side by side; by default one a core. The draws do not depend on it.
+    progress
+        Show how far it is.
+    keys
+        The keys of a config: those of [model], [record] and [sampling], side by side
+        (``dynamics="lag"``, ``train=(0, 12)``, ``ess=4000``), ``seed``, ``name``, ``parameters``
+        and ``validation``. The last is a dict of names and what is held out: a window
+        (start, stop) of this record, another record, or a dict of the keys of [validation.NAME]
+        with ``record`` among them.
+
+    Raises
+    ------
+    InputError
+        A misspelt key, a record that cannot be used, a folder that exists.
+
+    Warns
+    -----
+    InputWarning
+        What is wrong with the record or its priors, bands that do not hold, and a sampling that
+        has not converged.
+    """
+    config, records = config_of(record, keys)
+    problem = resolve(config, Path(), records)
+    warn(problem.remarks, 3)
+    scratch = Scratch() if folder is None else None
+    path = scratch.path / "run" if scratch is not None else Path(str(folder))
+    made = carried_on(RunFolder.create(path, problem, overwrite), scratch, progress, workers)
+    warn([one for one in to_know(made) if one not in problem.remarks], 3)
+    return made
+
+
+def open_run(folder: str | Path) -> Fit:
+    """Open a run's folder, written by :func:`fit`, :meth:`Fit.save` or ``bwbayes run``.
+
+    Raises
+    ------
+    InputError
+        No such run, or it has no draws yet.
+    """
+    where = RunFolder.open(Path(folder))
+    problem, chain, outcome = finished(where)
+    seconds = 0.0
+    if where.summary.is_file():
+        seconds = json.loads(where.summary.read_text(encoding="utf-8"))["wall_s"]
+    return Fit(problem, chain, outcome, where, seconds)
+
+
+def resume_run(
+    folder: str | Path,
+    *,
+    ess: float | None = None,
+    steps: int | None = None,
+    engine: Engine | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Fit:
+    """Go on with a run in a folder that was interrupted or is short of its target.
+
+    Parameters
+    ----------
+    folder
+        The run's folder.
+    ess, steps
+        A new target of effective draws, a new budget of steps; by default as before.
+    engine
+        Go on with this engine, whatever the chain was begun with.
+    workers, progress
+        As in :func:`fit`.
+
+    Raises
+    ------
+    InputError
+        No such run, or its files do not fit together.
+
+    Warns
+    -----
+    InputWarning
+        As :func:`fit` does.
+    """
+    where = RunFolder.open(Path(folder))
+    made = carried_on(where, None, progress, workers, ess, steps, engine)
+    warn(to_know(made), 3)
+    return made

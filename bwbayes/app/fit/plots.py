@@ -1,0 +1,95 @@
+"""The figures of a fit, each by a function of its own: ``fit.plot.loop()``.
+
+They are those of the report. Each function returns a matplotlib figure, which a notebook shows and
+``figure.savefig("loop.png")`` writes. Without convergence there are the record and the chain's
+figures alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures import draw_alone
+from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
+from bwbayes.app.figures.coverage import draw_coverage
+from bwbayes.app.figures.innovations import draw_innovations
+from bwbayes.app.figures.loop import draw_loop
+from bwbayes.app.figures.record import draw_record
+from bwbayes.app.figures.style import STYLE
+from bwbayes.app.problem.problem import Problem
+from bwbayes.errors import InputError, suggestion
+from bwbayes.results.bands import Bands
+from bwbayes.results.result import Result
+
+__all__ = ["Plots"]
+
+
+@dataclass(frozen=True)
+class Plots:
+    """The figures of a fit.
+
+    ``converged`` returns the result, or raises a
+    :class:`~bwbayes.errors.NotConvergedError` where nothing may be said of an interval.
+    """
+
+    problem: Problem
+    result: Result
+    converged: Callable[[], Result]
+
+    def record(self, kind: str = "time") -> Figure:
+        """Draw the training record: along "time", as a "loop", or its "drive"'s spectrum."""
+        problem = self.problem
+        every = draw_record(problem.record, problem.posterior.training, problem.findings)
+        return _named(every, kind)
+
+    def loop(self, *names: str) -> Figure:
+        """Draw displacement against voltage with its bands, and its tip enlarged.
+
+        By default for all that was predicted with the fit, or for the bands of these names.
+        """
+        return _drawn(draw_loop, [self._bands(name) for name in names] or self.converged().bands)
+
+    def bands(self, name: str = "training") -> Figure:
+        """Draw the bands of one window or record along time."""
+        return draw_alone(self._bands(name))
+
+    def coverage(self) -> Figure:
+        """Draw how much the bands cover against what they promise, and the readings' PIT."""
+        result = self.converged()
+        return _drawn(draw_coverage, result.bands, result.scores)
+
+    def innovations(self) -> Figure:
+        """Draw whether what each reading brings anew is white, normal and of one size."""
+        return _drawn(draw_innovations, self.converged().innovations)
+
+    def corner(self) -> Figure:
+        """Draw each parameter of the posterior, and each pair of them."""
+        return _drawn(draw_corner, self.converged())
+
+    def trace(self) -> Figure:
+        """Draw each ensemble's mean and spread, step by step."""
+        return _drawn(draw_trace, self.result)
+
+    def ranks(self) -> Figure:
+        """Draw how the ranks of each ensemble's draws are spread."""
+        return _drawn(draw_ranks, self.result)
+
+    def _bands(self, name: str) -> Bands:
+        every = {one.name: one for one in self.converged().bands}
+        return _named(every, name)
+
+
+def _named[T](every: Mapping[str, T], name: str) -> T:
+    if name not in every:
+        raise InputError(f"plot: no {name!r} here; {suggestion(name, every)}")
+    return every[name]
+
+
+def _drawn(draw: Callable[..., Figure], *what: Any) -> Figure:
+    with mpl.rc_context(STYLE):
+        return draw(*what)

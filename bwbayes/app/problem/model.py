@@ -1,0 +1,86 @@
+"""From a config to the actuator's parts, and back to a config in explicit words and numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bwbayes.app.config.config import ActuatorConfig, ModelConfig
+from bwbayes.data import Record
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep, creep_times
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Operator, Span
+from bwbayes.model.registry import HYSTERESIS, made
+
+__all__ = ["actuator_of", "explicit_model", "in_words"]
+
+# What a config may say of a hysteresis operator beside its name.
+OPTIONS = ("passive", "thresholds", "odd", "terms")
+
+
+def actuator_of(model: ActuatorConfig, record: Record) -> Actuator:
+    """Put the actuator together that a config asks for; ``auto`` and ``true`` ask the record.
+
+    Raises
+    ------
+    InputError
+        A part that does not exist, or an option that it does not have.
+    """
+    hold: Hold = "zero" if record.voltage_is == "command" else "first"
+    if isinstance(model, ModelConfig) and model.hold != "auto":
+        hold = model.hold
+    span = Span(float(np.min(record.voltage)), float(np.max(record.voltage)))
+    return Actuator(
+        model.dynamics,
+        hold,
+        record.interval,
+        made("model.hysteresis", model.hysteresis, HYSTERESIS, _options(model), Operator),
+        PolynomialGain(tuple(model.gain), span) if model.gain else None,
+        _creep(model, record, span),
+        span,
+    )
+
+
+def explicit_model(model: ModelConfig, actuator: Actuator) -> ModelConfig:
+    """Return what a config says of the model with all that it left open but the hold.
+
+    The hold stays: another record has its own.
+    """
+    times = list(actuator.creep.times) if actuator.creep else False
+    return model.model_copy(update={"creep": times, **_chosen(actuator.hysteresis)})
+
+
+def _creep(model: ActuatorConfig, record: Record, span: Span) -> Creep | None:
+    """Return the creep that a config asks for, if any; ``true`` takes its times from the record."""
+    if model.creep is False or model.creep == []:
+        if model.creep_growth:
+            raise InputError("model.creep_growth: there is no creep; give creep = true with it")
+        return None
+    times = creep_times(record.interval, record.duration) if model.creep is True else model.creep
+    return Creep(tuple(times), model.creep_growth, span)
+
+
+def _options(model: ActuatorConfig) -> dict[str, object]:
+    """Return what the config says of the hysteresis operator beside its name."""
+    given = {name: getattr(model, name) for name in OPTIONS}
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
+
+
+def _chosen(operator: Operator) -> dict[str, Any]:
+    """Return the options that an operator has, by name, as a config has them."""
+    chosen = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in chosen.items()}
+
+
+def in_words(model: ModelConfig) -> str:
+    """Return which parts a model has, in a line."""
+    parts = [model.hysteresis]
+    if model.gain:
+        parts.append(f"{' and '.join(model.gain)} gain")
+    if model.creep:
+        parts.append("creep that grows with the voltage" if model.creep_growth else "creep")
+    return f"{', '.join(parts)}, dynamics {model.dynamics}, {model.hold} hold"

@@ -1,0 +1,146 @@
+"""The page of a simulation-based calibration: verdict, tests and their power, numbers, pictures.
+
+One HTML file that needs nothing else, as the report of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any
+
+from bwbayes.app.figures.style import unit_text
+from bwbayes.app.problem.model import in_words
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.report.report import picture, symbol, template
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration
+from bwbayes.results.replicates import EXTRA, RANKED
+
+__all__ = ["render"]
+
+CAPTIONS = {
+    "rank_histograms": (
+        "Ranks",
+        "Where the truth lies among the posterior's draws, over all replicates. Level is right; a "
+        "bowl means posteriors that are too narrow, a hump too wide, a slope a bias.",
+    ),
+    "rank_ecdf": (
+        "Distribution of the ranks",
+        "The ranks' cumulative distribution less that of even ranks, with the band that even ranks "
+        "leave anywhere no more often than the stated level allows; p of the smooth test.",
+    ),
+    "coverage": (
+        "Coverage",
+        "Left: how often the posteriors' central intervals hold the truth. Right: how far the "
+        "coverage of the bands on held-out samples is off what they promise.",
+    ),
+}
+
+EXTRA_WORDS = {
+    "log_likelihood": ("log likelihood", "-"),
+    "opening": ("loop opening", "um"),
+    "range": ("displacement range", "um"),
+}
+
+
+def render(
+    problem: Problem,
+    calibration: Calibration,
+    numbers: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
+) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    problem
+        What was calibrated.
+    calibration
+        How it turned out; ``numbers`` are those of ``calibration.json``.
+    pictures
+        PNG files by the name of their figure, in their order.
+    """
+    return template("calibration.html.j2").render(
+        name=problem.config.name or "calibration",
+        passed=calibration.passed,
+        telling=calibration.telling,
+        shortcomings=calibration.shortcomings,
+        replicates=calibration.replicates,
+        unconverged=[str(number) for number in calibration.unconverged],
+        levels=LEVELS,
+        rows=_rows(problem, calibration),
+        limits=[_percent(calibration.limits[level]) for level in LEVELS],
+        bands=_bands(calibration),
+        priors=[
+            {"name": p.name, "symbol": symbol(p), "unit": unit_text(p.unit), "prior": str(p.prior)}
+            for p in problem.parameters
+            if p.fixed is None
+        ],
+        power=calibration.power,
+        tests=2 * len(calibration.statistics),
+        family_level=f"{FAMILY_LEVEL:.0%}",
+        judged_from=JUDGED_FROM,
+        ranked=RANKED,
+        pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
+        facts=_facts(problem, numbers),
+    )
+
+
+def _rows(problem: Problem, calibration: Calibration) -> list[dict[str, Any]]:
+    """Return a row for each statistic."""
+    known = {p.name: (p.description, unit_text(p.unit)) for p in problem.parameters}
+    known |= {name: (EXTRA_WORDS[name][0], unit_text(EXTRA_WORDS[name][1])) for name in EXTRA}
+    return [
+        {
+            "name": name,
+            "description": known[name][0],
+            "unit": known[name][1],
+            "p": f"{one.p:.2g}",
+            "adjusted": f"{one.adjusted:.2g}",
+            "ecdf": "leaves the band" if one.outside else "inside",
+            "covered": [f"{one.covered[level]:.1%}" for level in LEVELS],
+        }
+        for name, one in calibration.statistics.items()
+    ]
+
+
+def _bands(calibration: Calibration) -> list[dict[str, Any]]:
+    """Return a row for each kind of band of held-out windows and of other records, if any."""
+    rows = []
+    for other, kind in product(calibration.predicted, KINDS):
+        coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
+        of = other or "held-out samples"
+        rows.append(
+            {
+                "kind": kind,
+                "of": of,
+                "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in coverages],
+            }
+        )
+    return rows
+
+
+def _percent(pair: Sequence[float]) -> str:
+    return f"{pair[0]:.1%} to {pair[1]:.1%}"
+
+
+def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
+    record, model, plan = problem.record, problem.config.model, problem.plan
+    held_out = [v.window for v in problem.validations.values() if v.window is not None]
+    judged = sum(window.stop - window.start for window in held_out)
+    fitted = sum(window.stop - window.start for window in problem.posterior.training)
+    return [
+        ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
+        ("fitted, held out", f"{fitted} samples, {judged} samples"),
+        ("model", in_words(model)),
+        ("noise", model.noise),
+        (
+            "sampling",
+            f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
+            f"at most {plan.most_steps} steps",
+        ),
+        ("seed", str(numbers["seed"])),
+        ("data, SHA-256", str(numbers["data_sha256"])),
+        ("versions", ", ".join(f"{name} {text}" for name, text in numbers["versions"].items())),
+    ]

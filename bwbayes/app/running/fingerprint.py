@@ -1,0 +1,125 @@
+"""Which posterior a chain belongs to, and what an edited config changes of it.
+
+Draws are stored as coordinates of one posterior: of a model, priors, bounds, fixed values, windows
+and readings. Under any other they mean something else, so a chain notes the posterior it was
+sampled from, and whoever goes on with the chain, or reads it, compares. What does not change the
+posterior may change: names, the target and budget of the sampling, the engine (which has a check
+of its own), and what is predicted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from bwbayes.app.config.config import Config
+from bwbayes.errors import InputError
+from bwbayes.inference.parameters import COORDINATES
+
+__all__ = ["fingerprint", "require_same", "version_remarks"]
+
+# Keys of a config that a chain does not depend on; of tables, everything in them. The record is
+# compared by its readings, not by its file's name.
+FREE_TO_CHANGE = (
+    "name",
+    "stand",
+    "truth",
+    "validation",
+    "record.file",
+    "record.signal",
+    "sampling.engine",
+    "sampling.ess",
+    "sampling.steps",
+    "sampling.pilot_steps",
+)
+NAMES_FOR_PEOPLE = ("label", "description")
+
+# What chains were sampled with before a config could say it.
+UNSAID: Mapping[str, object] = {
+    "model.hysteresis": "bouc-wen",
+    "model.gain": [],
+    "model.creep": False,
+    "model.creep_growth": False,
+}
+
+
+def fingerprint(config: Config) -> str:
+    """Return what a chain notes of a resolved config: its keys and values, as JSON."""
+    return json.dumps(_values(config))
+
+
+def require_same(noted: object, config: Config, chain: Path) -> None:
+    """Refuse a config that describes another posterior than a chain was sampled from.
+
+    Parameters
+    ----------
+    noted
+        The chain's fingerprint; None if it has none.
+    config
+        The run's config as it is now, resolved.
+    chain
+        The chain's file, for the error.
+
+    Raises
+    ------
+    InputError
+        They differ, and the text says in what; or the chain has no fingerprint.
+    """
+    if noted is None:
+        raise InputError(
+            f"{chain}: does not say which priors and settings it was sampled with, as chains of "
+            "earlier versions did not, so nothing can be read from it safely; start a new run"
+        )
+    before: dict[str, object] = {**UNSAID, **json.loads(str(noted))}
+    # As JSON gives them back: no tuples.
+    now: dict[str, object] = json.loads(fingerprint(config))
+    differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    if not differing:
+        return
+    first, *others = differing
+    also = f" (also {', '.join(others)})" if others else ""
+    raise InputError(
+        f"{chain}: {first} was {_shown(before.get(first))} when the chain was sampled, is "
+        f"{_shown(now.get(first))}{also}; undo the edit or start a new run"
+    )
+
+
+def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:
+    """Say, in one remark, which packages have other versions than when the chain was begun."""
+    before: dict[str, str] = json.loads(str(noted)) if noted else {}
+    changed = [
+        f"{name} {before[name]}, now {now[name]}"
+        for name in now
+        if name in before and before[name] != now[name]
+    ]
+    if not changed:
+        return ()
+    return (f"the chain was begun with other versions: {'; '.join(changed)}",)
+
+
+def _values(config: Config) -> dict[str, object]:
+    return {"coordinates": COORDINATES} | {
+        key: value
+        for key, value in _flat(config.model_dump(exclude_none=True))
+        if not any(key == one or key.startswith(f"{one}.") for one in FREE_TO_CHANGE)
+        and not (key.startswith("parameters.") and key.endswith(NAMES_FOR_PEOPLE))
+    }
+
+
+def _flat(table: Mapping[str, object], place: str = "") -> Iterator[tuple[str, object]]:
+    """Yield keys with their tables' names before them, and values; a prior counts as one."""
+    for name, value in table.items():
+        key = f"{place}{name}"
+        if isinstance(value, Mapping) and name != "prior":
+            yield from _flat(value, f"{key}.")
+        else:
+            yield key, value
+
+
+def _shown(value: object) -> str:
+    """Write a value as a config does, more or less; a prior as a function of its arguments."""
+    if isinstance(value, Mapping):
+        arguments = ", ".join(f"{k} {v}" for k, v in value.items() if k != "distribution")
+        return f"{value['distribution']} ({arguments})" if "distribution" in value else arguments
+    return "not set" if value is None else str(value)

@@ -1,0 +1,170 @@
+"""The folder of a run or a calibration: what is in it, who may write it, and how it comes to be.
+
+The folder appears in one step, with the resolved config and the records in it, so that its work can
+be continued from any moment on. It is never overwritten unless that is asked for, and a lock
+refuses a second writer.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Self
+
+from filelock import FileLock, Timeout
+
+from bwbayes.app.config.config import dump
+from bwbayes.app.problem.problem import Problem
+from bwbayes.data import write_record
+from bwbayes.errors import InputError
+
+__all__ = ["CalibrationFolder", "RunFolder"]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of one run, by what they are."""
+
+    path: Path
+
+    # What it holds, the file that only such a folder has at its start, and the commands for it.
+    KIND: ClassVar[str] = "run"
+    MARK: ClassVar[str | None] = None
+    BEGIN: ClassVar[str] = "bwbayes run CONFIG --out"
+    GO_ON: ClassVar[str] = "bwbayes resume"
+
+    @property
+    def config(self) -> Path:
+        """The resolved config: every choice an explicit number."""
+        return self.path / "config.toml"
+
+    @property
+    def chain(self) -> Path:
+        """The chain, appended block by block."""
+        return self.path / "chain.h5"
+
+    @property
+    def summary(self) -> Path:
+        """The run's numbers."""
+        return self.path / "summary.json"
+
+    @classmethod
+    def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
+        """Make the folder of a new run, whole or not at all; ``mark`` goes into its mark.
+
+        Raises
+        ------
+        InputError
+            It exists and ``overwrite`` is not given, or it is no run's, or it cannot be written.
+        """
+        if path.name == "..":
+            raise InputError(f"{path}: is no name of a folder; choose one with --out")
+        if path.exists():
+            if not overwrite:
+                raise InputError(
+                    f"{path}: exists; go on with `{cls.GO_ON} {path}`, choose another folder "
+                    "with --out, or give --overwrite"
+                )
+            if not cls(path)._may_go():
+                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another with --out")
+        draft = path.absolute().with_name(f".{path.name}.partial")
+        try:
+            shutil.rmtree(draft, ignore_errors=True)
+            (draft / "records").mkdir(parents=True)
+            write_record(problem.record, draft / "records/record.h5")
+            for name, validation in problem.validations.items():
+                if validation.record is not None:
+                    write_record(validation.record, draft / f"records/{name}.h5")
+            (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
+            if cls.MARK:
+                (draft / cls.MARK).write_bytes(mark)
+            if path.exists():
+                with cls(path).locked():
+                    shutil.rmtree(path)
+            draft.rename(path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{path}: {reason}; choose another folder with --out") from None
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Return the folder of a run that exists.
+
+        Raises
+        ------
+        InputError
+            There is no run.
+        """
+        folder = cls(path)
+        if folder.config.is_file() and folder._has_records() and folder._is_of_its_kind():
+            return folder
+        where = f"{path}: no {cls.KIND} here"
+        if path.is_file():
+            raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
+        if folder.config.is_file() and folder._has_records():
+            raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
+        raise InputError(f"{where}; start one with `{cls.BEGIN} {path}`")
+
+    def _has_records(self) -> bool:
+        """Tell a folder that was made from one that holds a config alone."""
+        return (self.path / "records/record.h5").is_file()
+
+    def _is_of_its_kind(self) -> bool:
+        """Tell a run's folder from a calibration's."""
+        is_calibration = (self.path / CalibrationFolder.MARK).is_file()
+        return is_calibration == (self.MARK is not None)
+
+    def _may_go(self) -> bool:
+        """Tell whether nothing of another kind would be lost with this folder."""
+        empty = self.path.is_dir() and not any(self.path.iterdir())
+        its_own = self.config.is_file() and self._has_records() and self._is_of_its_kind()
+        return empty or its_own
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder as its only writer.
+
+        Raises
+        ------
+        InputError
+            Another process holds it, or it cannot be written.
+        """
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
+            ) from None
+        except OSError as error:
+            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+
+@dataclass(frozen=True)
+class CalibrationFolder(RunFolder):
+    """The files of one calibration; its config is that of all its replicates."""
+
+    KIND: ClassVar[str] = "calibration"
+    MARK: ClassVar[str] = "replicates.jsonl"
+    BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out"
+    GO_ON: ClassVar[str] = "bwbayes calibrate --resume"
+
+    @property
+    def replicates(self) -> Path:
+        """What they are replicates of, how many are wanted, and then a line for each."""
+        return self.path / self.MARK
+
+    @property
+    def summary(self) -> Path:
+        """The calibration's numbers."""
+        return self.path / "calibration.json"

@@ -1,0 +1,377 @@
+"""A run, from a config or from where it was interrupted, to its last file.
+
+:func:`start` makes the run's folder; :func:`carry_on` does whatever is left to do in one: point
+fit, sampling, prediction, files. Each stage draws from a random stream of its own and stores what
+the next one needs, so it does not matter in how many pieces a run is done.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.figures import draw_all, save
+from bwbayes.app.problem.model import in_words
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.report.report import render
+from bwbayes.app.running.fingerprint import fingerprint, require_same, version_remarks
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.predictions import judged, predictions, scoring
+from bwbayes.app.running.progress import Progress
+from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference import conflict, pointfit
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results import identifiability, innovations
+from bwbayes.results.loops import measure_loops
+from bwbayes.results.outputs import write_bands, write_posterior, write_summary
+from bwbayes.results.prediction import thinned
+from bwbayes.results.refit import without_start
+from bwbayes.results.result import Result, summary
+from bwbayes.results.scores import score
+from bwbayes.results.steps import measure_steps
+from bwbayes.results.verdict import Background
+from bwbayes.sampling.chain import PHASES
+from bwbayes.sampling.sampler import Outcome, draws, first_chain, log_densities, sample
+from bwbayes.sampling.storage import ChainFile
+
+__all__ = [
+    "Run",
+    "assemble",
+    "carry_on",
+    "finished",
+    "go_on",
+    "judged",
+    "load_run",
+    "predictions",
+    "redraw",
+    "start",
+    "versions",
+    "write_files",
+]
+
+PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
+
+
+class Run(NamedTuple):
+    """A run whose sampling has come to an end: its problem, chain and outcome.
+
+    ``seconds`` is the wall time that it took, and ``result`` what came of it.
+    """
+
+    problem: Problem
+    chain: ChainFile
+    outcome: Outcome
+    result: Result
+    seconds: float
+
+
+def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
+    """Make the folder of a new run; the config's files are relative to the folder ``where``.
+
+    Raises
+    ------
+    InputError
+        The config, its records or the folder cannot be used.
+    """
+    return RunFolder.create(out, resolve(config, where), overwrite)
+
+
+def load_run(folder: RunFolder) -> Problem:
+    """Return the problem of a run's folder."""
+    return resolve(load(folder.config), folder.path)
+
+
+def carry_on(
+    folder: RunFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    ess: float | None = None,
+    steps: int | None = None,
+    engine: Engine | None = None,
+) -> Result:
+    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
+    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+
+
+def go_on(
+    folder: RunFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    ess: float | None = None,
+    steps: int | None = None,
+    engine: Engine | None = None,
+    files: bool = True,
+) -> Run:
+    """Do what is left of a run.
+
+    Parameters
+    ----------
+    folder
+        The run's folder.
+    console
+        Where progress goes.
+    workers
+        Processes for the ensembles; by default one a core. The result does not depend on it.
+    ess, steps
+        A new target and budget, if given.
+    engine
+        Go on with this engine, whatever the chain was begun with: the same posterior, but from
+        here on not the same bits.
+    files
+        Write what a run leaves besides its config, records and chain.
+
+    Raises
+    ------
+    InputError
+        The folder's files do not fit together, or another process is writing them.
+    """
+    begun = time.monotonic()
+    with folder.locked(), one_thread():
+        if any(wanted is not None for wanted in (ess, steps, engine)):
+            _retarget(folder, ess, steps, engine)
+        problem = load_run(folder)
+        with (
+            _chain(folder, problem, console, engine) as chain,
+            executor(workers, problem.posterior.engine) as pool,
+            Progress(console, problem.plan) as progress,
+        ):
+            # It is written last, as the sign that all is there; now something is to come.
+            folder.summary.unlink(missing_ok=True)
+            outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
+        console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
+        result = assemble(problem, chain, outcome)
+        seconds = time.monotonic() - begun
+        if files:
+            write_files(folder, problem, result, seconds)
+    return Run(problem, chain, outcome, result, seconds)
+
+
+def redraw(folder: RunFolder) -> Result:
+    """Write the files of a finished run again, from its chain.
+
+    Raises
+    ------
+    InputError
+        The run has no draws yet, or another process is writing it.
+    """
+    with folder.locked(), one_thread():
+        if not folder.summary.is_file():
+            raise InputError(
+                f"{folder.path}: the run is not finished; go on with `bwbayes resume {folder.path}`"
+            )
+        seconds = json.loads(folder.summary.read_text(encoding="utf-8"))["wall_s"]
+        problem, chain, outcome = finished(folder)
+        result = assemble(problem, chain, outcome)
+        write_files(folder, problem, result, seconds)
+    return result
+
+
+def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
+    """Read a run's problem and chain, and judge the chain as it stands.
+
+    Raises
+    ------
+    InputError
+        The chain is missing, damaged or still in its pilot.
+    """
+    problem = load_run(folder)
+    chain = ChainFile.read(folder.chain)
+    _require_its_own(folder.chain, problem, chain.attributes())
+    if chain.blocks("sampling") == 0:
+        raise InputError(f"{folder.path}: no draws yet; go on with `bwbayes resume {folder.path}`")
+    as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
+    with executor(1) as pool:
+        return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
+
+
+def versions(engine: Engine = "numpy") -> dict[str, str]:
+    """Return the versions of what computed a result."""
+    packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def _chain(
+    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+) -> ChainFile:
+    """Open the run's chain where it stands, or start it with a point fit."""
+    posterior, config = problem.posterior, problem.config
+    if folder.chain.exists():
+        chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
+        begun, now = chain.attributes()["engine"], posterior.engine
+        if begun != now:
+            if wanted is None:
+                chain.close()
+                raise InputError(
+                    f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
+                    f'engine = "{begun}" in {folder.config}, or resume with --engine {now}'
+                )
+            console.print(f"going on with the {now} engine a chain begun with {begun}")
+        return chain
+    console.print("point fit ...", highlight=False)
+    point = pointfit.fit(posterior, generator(config.seed, "point fit"))
+    attributes: dict[str, str | int] = {
+        "config": dump(config),
+        "data_sha256": problem.record.sha256,
+        "posterior": fingerprint(config),
+        "versions": json.dumps(versions(posterior.engine)),
+        "engine": posterior.engine,
+        "platform": platform.platform(),
+        "seed": config.seed,
+        "parameters": json.dumps(posterior.names),
+    }
+    first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
+    return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+
+
+def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
+    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
+    if noted.get("data_sha256") != problem.record.sha256:
+        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
+    require_same(noted.get("posterior"), problem.config, path)
+
+
+def _retarget(
+    folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
+) -> None:
+    config = load(folder.config)
+    wanted = {"ess": ess, "steps": steps, "engine": engine}
+    sampling = config.sampling.model_copy(
+        update={name: value for name, value in wanted.items() if value is not None}
+    )
+    text = dump(config.model_copy(update={"sampling": sampling}))
+    parse(text, "resume")  # refuses what a config cannot say
+    draft = folder.config.with_suffix(".partial")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(folder.config)
+
+
+def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
+    """Put a result together: draws, remarks and, if the chain has converged, predictions."""
+    posterior = problem.posterior
+    sampled = draws(posterior, chain)
+    flat = sampled.reshape(-1, sampled.shape[-1])
+    remarks = [
+        *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
+        *problem.remarks,
+        *outcome.remarks,
+        *conflict.conflicts(posterior.prior, flat, problem.defaults),
+        *identifiability.remarks(posterior, chain.point, flat),
+    ]
+    columns = posterior.table.columns(posterior.prior.theta(flat))
+    remarks += posterior.actuator.hysteresis.remarks(columns, posterior.names)
+    result = Result(
+        name=problem.config.name or "run",
+        outcome=outcome,
+        parameters=problem.parameters,
+        draws=sampled,
+        log_density=log_densities(chain),
+        moves=chain.moves("sampling"),
+        facts=_facts(problem, posterior, chain),
+        remarks=tuple(remarks),
+        truth=problem.config.truth,
+    )
+    if not outcome.converged:
+        return result
+    chosen = thinned(flat, generator(problem.config.seed, "draws"))
+    bands = predictions(problem, result)
+    best = flat[int(np.argmax(result.log_density))]
+    found = innovations.innovations(posterior, best, problem.record.start)
+    # By a second point fit, without the record's start.
+    source = generator(problem.config.seed, "without start")
+    moved = without_start(
+        posterior,
+        thinned(flat, source),
+        source,
+        problem.record.start,
+        seen=any(one.kind == "switch-on transient" for one in problem.findings),
+    )
+    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
+    return replace(
+        result,
+        bands=bands,
+        scores={
+            one.name: score(one, scoring(problem.config.seed, one))
+            for one in bands
+            if one.name in verdicts
+        },
+        verdicts=verdicts,
+        innovations=found,
+        loops=measure_loops(posterior, chosen),
+        steps=measure_steps(posterior, chosen, problem.others),
+        remarks=(*result.remarks, *innovations.remarks(found)),
+    )
+
+
+def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
+    record, config = problem.record, problem.config
+    windows = ", ".join(
+        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
+    )
+    accepted = {
+        phase: ", ".join(
+            f"{n} {accepted / p:.0%}" for n, (p, accepted) in chain.moves(phase).items()
+        )
+        for phase in PHASES
+    }
+    return {
+        "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
+        "fitted": windows,
+        "model": in_words(config.model),
+        "noise": config.model.noise,
+        "sampling": (
+            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
+            f"{', '.join(f'{chain.steps(phase)} steps of {phase}' for phase in PHASES)}"
+        ),
+        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
+        "engine": posterior.engine,
+    }
+
+
+def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
+    """Return the log likelihood of each draw, nats, shaped as ``result.log_density``."""
+    prior = posterior.prior
+    _, log_prior = prior.constrain(prior.unconstrain(result.flat_draws))
+    return result.log_density - log_prior.reshape(result.log_density.shape)
+
+
+def going_on(path: Path, problem: Problem) -> str:
+    """Return the command that goes on with a run, with twice the budget that it had."""
+    return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
+
+
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    numbers = summary(result) | {
+        "seed": problem.config.seed,
+        "go_on": None if result.outcome.converged else going_on(folder.path, problem),
+        "wall_s": seconds,
+        "versions": versions(problem.posterior.engine),
+        "data_sha256": problem.record.sha256,
+    }
+    density = log_likelihood(problem.posterior, result)
+    write_posterior(folder.path / "posterior.nc", result, density, problem.record)
+    (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
+    if result.bands:
+        write_bands(folder.path / "bands.csv", result.bands)
+    shutil.rmtree(folder.path / "figures", ignore_errors=True)
+    pictures = save(draw_all(result), folder.path / "figures")
+    page = render(result, numbers, pictures)
+    (folder.path / "report.html").write_text(page, encoding="utf-8")
+    write_summary(folder.summary, numbers)

@@ -1,0 +1,1 @@
+"""Records in files and tables: CSV, HDF5, MATLAB and pandas, with the columns' units and checks."""

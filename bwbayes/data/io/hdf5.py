@@ -1,0 +1,178 @@
+"""Records in HDF5: datasets named like the columns, ``time_s``, ``voltage_V``, ``displacement_um``.
+
+The datasets stand at the root or in one group; the attributes ``voltage_is``, ``origin`` and
+``interval_s`` stand beside them, and a simulated record has the dataset ``truth_um``. Other
+datasets are passed over.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bwbayes.data.io.checks import Table, named_columns
+from bwbayes.data.io.columns import Naming
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+
+__all__ = ["check_lists", "datasets", "group_table", "read_hdf5", "record_arrays", "write_hdf5"]
+
+# Marks in an HDF5 file: its beginning, a heap of names, a collection of texts; and the number that
+# ends a list of free blocks.
+_SIGNATURE, _HEAP, _COLLECTION = b"\x89HDF\r\n\x1a\n", b"HEAP", b"GCOL\1\0\0\0"
+_NO_BLOCK = 1
+
+_NOTES = ("voltage_is", "origin", "interval_s")
+
+
+def read_hdf5(path: Path, naming: Naming) -> Table:
+    """Return the columns of an HDF5 file that ``naming`` says.
+
+    Raises
+    ------
+    InputError
+        If it is no HDF5 file, is damaged, or has datasets that are no vectors of real numbers.
+    """
+    if not h5py.is_hdf5(path):
+        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it anew")
+    try:
+        check_lists(path)
+        with h5py.File(path, "r") as file:
+            group = _group_of_columns(path, file)
+            notes = {key: _text(group.attrs[key]) for key in _NOTES if key in group.attrs}
+            return group_table(path, group, naming, notes)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
+        raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it anew") from error
+
+
+def group_table(path: Path, group: Any, naming: Naming, notes: dict[str, str]) -> Table:
+    """Return the columns among the datasets of an open HDF5 group."""
+    names = tuple(datasets(group))
+    columns = named_columns(
+        path, names, naming, lambda name: int(group[name].size or 0), lambda name: group[name][()]
+    )
+    return Table(path, columns, notes, names=names)
+
+
+def write_hdf5(record: Record, path: Path) -> None:
+    """Write a record as HDF5, every number exactly."""
+    # The file format since HDF5 1.8 has checksums: reading notices damage to all but the numbers.
+    content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
+    with h5py.File(content, "w", libver="v108") as file:
+        for name, values in record_arrays(record).items():
+            file.create_dataset(name, data=values)
+        # Text of fixed length, since HDF5 can loop for ever over damaged text of variable length.
+        file.attrs["voltage_is"] = np.bytes_(record.voltage_is)
+        if record.origin:
+            file.attrs["origin"] = np.bytes_(record.origin.encode())
+        file.attrs["interval_s"] = record.interval
+    path.write_bytes(content.getbuffer())
+
+
+def record_arrays(record: Record) -> dict[str, Any]:
+    """Return the arrays of a record by the names that they have in binary files."""
+    arrays = {
+        "time_s": record.time,
+        "voltage_V": record.voltage,
+        "displacement_um": record.displacement,
+        "truth_um": record.truth,
+    }
+    return {name: values for name, values in arrays.items() if values is not None}
+
+
+def _group_of_columns(path: Path, file: Any) -> Any:
+    """Return the root if datasets stand there, else the only group that has some."""
+    objects = (file, *(file[name] for name in _linked(file)))
+    groups = [group for group in objects if isinstance(group, h5py.Group) and any(datasets(group))]
+    if not groups or groups[0] == file:
+        return file
+    if len(groups) > 1:
+        names = ", ".join(repr(group.name) for group in groups[:5])
+        raise InputError(f"{path}: several groups hold records ({names}); keep one per file")
+    return groups[0]
+
+
+def datasets(group: Any) -> Iterator[str]:
+    """Yield the names of the datasets in a group whose numbers are in this very file.
+
+    Links to other files, and numbers stored in other files, are passed over unopened: a stranger's
+    file could name any file or device of this machine.
+    """
+    for name in _linked(group):
+        dataset = group[name]
+        if isinstance(dataset, h5py.Dataset) and not (dataset.external or dataset.is_virtual):
+            yield name
+
+
+def _linked(group: Any) -> list[str]:
+    """Return the names in a group that stand for objects in the same file."""
+    links = ((str(name), group.get(name, getlink=True)) for name in group)
+    return [name for name, link in links if isinstance(link, h5py.HardLink)]
+
+
+def check_lists(path: Path) -> None:
+    """Raise a ValueError if HDF5 2.0 would follow a damaged list in the file for ever.
+
+    There are two kinds: the free blocks of a heap of names, which may run in a circle and take all
+    memory, and the texts in a collection, of which one may have no length.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        base = data.find(_SIGNATURE)
+        endless = any(_runs_in_a_circle(data, base, at) for at in _places(data, _HEAP)) or any(
+            _stands_still(data, at) for at in _places(data, _COLLECTION)
+        )
+    if endless:
+        raise ValueError("a list in it has no end")
+
+
+def _places(data: mmap.mmap, mark: bytes) -> Iterator[int]:
+    """Yield where a structure with this mark and 32 bytes at least may begin."""
+    at = data.find(mark)
+    while 0 <= at <= len(data) - 32:
+        yield at
+        at = data.find(mark, at + 1)
+
+
+def _runs_in_a_circle(data: mmap.mmap, base: int, heap: int) -> bool:
+    # Behind the heap's own size: its first free block, and where its blocks are.
+    block, address = struct.unpack_from("<QQ", data, heap + 16)
+    passed = set()
+    while block != _NO_BLOCK and base + address + block <= len(data) - 8:
+        if block in passed:
+            return True
+        passed.add(block)
+        (block,) = struct.unpack_from("<Q", data, base + address + block)
+    return False
+
+
+def _stands_still(data: mmap.mmap, collection: int) -> bool:
+    (size,) = struct.unpack_from("<Q", data, collection + 8)
+    at, end = collection + 16, min(collection + size, len(data))
+    while at + 16 <= end:
+        number, length = struct.unpack_from("<H6xQ", data, at)
+        # Number 0 is what is free, and its length includes these 16 bytes.
+        step = 16 + (length + 7) // 8 * 8 if number else length
+        if not 0 < step <= end - at:
+            return True
+        at += step
+    return False
+
+
+def _text(value: Any) -> str:
+    if not np.size(value):
+        return ""
+    first = np.ravel(value)[0]
+    return first.decode("utf-8", errors="replace") if isinstance(first, bytes) else str(first)
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).split())[:80] or type(error).__name__

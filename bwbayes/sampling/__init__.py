@@ -1,0 +1,1 @@
+"""From a posterior to its draws: ensembles of walkers, the chain on disk, convergence."""

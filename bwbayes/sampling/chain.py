@@ -1,0 +1,138 @@
+"""The chain of a sampling: what every ensemble did, block by block.
+
+A :class:`Chain` keeps it in memory; :class:`~bwbayes.sampling.storage.ChainFile` writes it to a
+file as well. The blocks of the pilot and the tuning are kept apart from those that count, and so
+are blocks of the sampling whose proposal turned out not to cover the posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.sampling.ensemble import Block, EnsembleState
+from bwbayes.sampling.moves import MOVES
+from bwbayes.sampling.proposals import StudentMixture
+
+__all__ = ["MOST_DRAWS", "PHASES", "Chain", "Phase", "thinning"]
+
+# Draws of all walkers that are judged and reported at most; of more, every second or fourth step
+# is used, and so on. Chains get that long because their steps tell little that is new.
+MOST_DRAWS = 2**19
+
+Phase = Literal["pilot", "tuning", "sampling"]
+PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
+
+
+def thinning(draws: int, most: int = MOST_DRAWS) -> int:
+    """Return of how many steps one is used where a chain has so many draws: a power of two."""
+    thin = 1
+    while draws > most * thin:
+        thin *= 2
+    return thin
+
+
+class Chain:
+    """Blocks of all ensembles, in three phases.
+
+    Parameters
+    ----------
+    starts
+        The state that each ensemble starts from.
+
+    Attributes
+    ----------
+    proposals
+        The proposal that was fitted for each phase, if any.
+    set_aside
+        Blocks at the beginning of the sampling that do not count, because their proposal turned
+        out not to cover the posterior.
+    """
+
+    def __init__(self, starts: Sequence[EnsembleState]) -> None:
+        self.starts = tuple(starts)
+        self.proposals: dict[Phase, StudentMixture | None] = dict.fromkeys(PHASES)
+        self.set_aside = 0
+        self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
+
+    def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
+        """Fix the proposal of a phase, before its first block."""
+        self.proposals[phase] = proposal
+
+    def fall_back(self, blocks: int) -> None:
+        """Set the first blocks of the sampling aside, and its proposal: they count no longer."""
+        self.set_aside = blocks
+
+    def proposal_in_use(self, phase: Phase) -> StudentMixture | None:
+        """Return the proposal that a phase goes on with."""
+        return None if phase == "sampling" and self.set_aside else self.proposals[phase]
+
+    def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
+        """Add the next block of every ensemble."""
+        self._blocks[phase].append(tuple(blocks))
+
+    def blocks(self, phase: Phase) -> int:
+        """Return how many blocks each ensemble has, without those that were set aside."""
+        return len(self._counting(phase))
+
+    def block_of(self, phase: Phase, number: int) -> tuple[Block, ...]:
+        """Return block ``number`` of every ensemble."""
+        return self._counting(phase)[number]
+
+    def history(self, phase: Phase) -> tuple[tuple[Block, ...], ...]:
+        """Return all blocks of a phase, those that were set aside first."""
+        return tuple(self._blocks[phase])
+
+    def steps(self, phase: Phase) -> int:
+        """Return how many steps each ensemble has made."""
+        return sum(blocks[0].coordinates.shape[0] for blocks in self._counting(phase))
+
+    @property
+    def ends(self) -> tuple[EnsembleState, ...]:
+        """The state that each ensemble goes on from."""
+        done = [blocks for phase in PHASES for blocks in self._blocks[phase]]
+        return tuple(block.end for block in done[-1]) if done else self.starts
+
+    def draws(self, phase: Phase) -> int:
+        """Return how many draws all walkers have made."""
+        return sum(b.log_density.size for blocks in self._counting(phase) for b in blocks)
+
+    def coordinates(self, phase: Phase, thin: int = 1) -> FloatArray:
+        """Return (steps, ensembles, walkers, free), unconstrained, of every ``thin``-th step."""
+        return self._joined(phase, "coordinates", thin)
+
+    def log_density(self, phase: Phase, thin: int = 1) -> FloatArray:
+        """Return (steps, ensembles, walkers), nats, of every ``thin``-th step."""
+        return self._joined(phase, "log_density", thin)
+
+    def accepted(self, phase: Phase) -> IntArray:
+        """Return the accepted moves of each block, (blocks, ensembles, walkers)."""
+        return np.array([[block.accepted for block in blocks] for blocks in self._counting(phase)])
+
+    def moves(self, phase: Phase) -> dict[str, tuple[int, int]]:
+        """Return how often each kind of move was proposed to a walker, and accepted.
+
+        Kinds that were never proposed are left out.
+        """
+        counts = np.zeros((len(MOVES), 2), dtype=np.int64)
+        for blocks in self._counting(phase):
+            for block in blocks:
+                counts[: len(block.moves)] += block.moves
+        pairs = zip(MOVES, counts.tolist(), strict=True)
+        return {name: (proposed, accepted) for name, (proposed, accepted) in pairs if proposed}
+
+    def _counting(self, phase: Phase) -> list[tuple[Block, ...]]:
+        """Return the blocks that count."""
+        return self._blocks[phase][self.set_aside if phase == "sampling" else 0 :]
+
+    def _joined(self, phase: Phase, name: str, thin: int) -> FloatArray:
+        parts, done = [], 0
+        for blocks in self._counting(phase):
+            each = [getattr(block, name) for block in blocks]
+            first = -(done + 1) % thin  # of steps counted from one, those that thin divides
+            parts.append(np.stack([values[first::thin] for values in each], axis=1))
+            done += len(each[0])
+        return np.concatenate(parts)

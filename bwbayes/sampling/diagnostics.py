@@ -1,0 +1,324 @@
+"""Has it converged? What is asked of a chain before anything is said about the parameters.
+
+Ensembles are independent and start far apart; the walkers of one ensemble are not independent at
+the start and hardly so later. So R-hat is the nested one, with an ensemble as the superchain, and
+once more with the halves of each ensemble apart, which shows drift. That of single walkers, much
+more lenient, shows those that never leave their mode. Effective draws are counted with walkers as
+chains, capped by what the means of whole ensembles show, which also sees correlation between
+walkers. A walker that does not move blocks convergence by itself, and what is not a number never
+passes. This module alone knows arviz's statistics.
+"""
+
+# mypy: allow-untyped-calls
+# arviz_stats says that it has types, but its functions have none.
+
+from __future__ import annotations
+
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from scipy.special import ndtri
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.sampling.ensemble import autocorrelation_time
+
+__all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat", "pareto_k"]
+
+LARGEST_RHAT = 1.01
+
+# Of walkers that mix it is 1.01 after 50 autocorrelation times: √(1 + 1/50).
+LARGEST_WALKER_RHAT = 1.05
+
+# Above this a proposal does not cover the draws.
+LARGEST_PARETO_K = 0.7
+
+# Log weights that differ by less than this, nats, are equal: the proposal is the posterior itself.
+EQUAL = 1e-6
+
+# Steps in autocorrelation times, before which no estimate of it can be trusted.
+LENGTH = 50
+
+# Autocorrelation times without a move after which a walker is stuck. The longest of an independence
+# sampler's rests at a place where its proposal hardly goes are a third of that.
+STILL = 25
+
+TAIL = (0.05, 0.95)
+
+# Digits behind the point beyond which a number is not told from its limit.
+MOST_DIGITS = 9
+
+# Threads that judge parameters side by side: their sorting and transforms leave Python free.
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class Check:
+    """The state of a sampling; arrays are (free,).
+
+    ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk``, of the ranks, and
+    ``ess_tail`` are totals, and so is ``ess_mean``, which the Monte Carlo error of the mean hangs
+    on; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
+    ``stuck`` counts the walkers that have not moved for the last ``STILL`` autocorrelation times;
+    ``pareto_k`` is that of the proposal at these draws, None if there is no proposal;
+    ``walker_rhat`` is the largest R-hat with each walker a chain.
+    """
+
+    steps: int
+    rhat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    ess_mean: FloatArray
+    autocorrelation: FloatArray
+    acceptance: float
+    stuck: int
+    pareto_k: float | None = None
+    walker_rhat: float = 1.0
+
+    @property
+    def covered(self) -> bool:
+        """Whether the proposal, if there is one, covers the draws."""
+        return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
+
+    def shortcomings(self, ess: float, part: float = 1.0) -> list[str]:
+        """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
+
+        First what more draws need not cure. Of effective draws, and of autocorrelation times, a
+        ``part`` is enough. Every comparison is written so that nan fails it.
+        """
+        found = self.disagreements()
+        fewest = np.min([self.ess_bulk, self.ess_tail])
+        if not fewest >= part * ess:
+            found.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
+        times = self.steps / np.max(self.autocorrelation)
+        if not times >= part * LENGTH:
+            least = f"{part * LENGTH:g}"
+            found.append(
+                f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
+            )
+        return found
+
+    def disagreements(self) -> list[str]:
+        """Say what is wrong with the draws that there are; empty if nothing is."""
+        found = []
+        if not (self.rhat < LARGEST_RHAT).all():
+            rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
+            found.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
+        if not self.walker_rhat < LARGEST_WALKER_RHAT:
+            rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
+            found.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
+        if self.stuck:
+            found.append(f"{self.stuck} walkers are stuck")
+        if self.pareto_k is not None and not self.covered:
+            shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
+            found.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
+        return found
+
+
+def _told(value: float, limit: float, digits: int = 0) -> str:
+    """Write a value with so many digits, or as many as tell it from the limit that it misses."""
+    text = f"{value:.{digits}f}"
+    while digits < MOST_DIGITS and float(text) == float(f"{limit:g}") != value:
+        digits += 1
+        text = f"{value:.{digits}f}"
+    return text
+
+
+def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> Check:
+    """Judge the draws of a sampling.
+
+    Parameters
+    ----------
+    draws
+        (steps, ensembles, walkers, free), parameters in their own units.
+    accepted
+        (blocks, ensembles, walkers) accepted moves in each block.
+    block
+        Steps in a block.
+    thin
+        Of how many steps the draws are one.
+    """
+    free = draws.shape[-1]
+    # Where threads silence warnings side by side, as arviz does, the last to end may leave them so.
+    with warnings.catch_warnings(), ThreadPoolExecutor(THREADS) as executor:
+        each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
+        rhat, bulk, tail, mean, autocorrelation, walker_rhat = np.array([*each]).T
+    # A thinned series does not tell times below its own step.
+    autocorrelation = thin * autocorrelation
+    return Check(
+        steps=len(accepted) * block,
+        rhat=rhat,
+        ess_bulk=bulk,
+        ess_tail=tail,
+        ess_mean=mean,
+        autocorrelation=autocorrelation,
+        acceptance=float(accepted.sum() / (accepted.size * block)),
+        walker_rhat=float(np.max(walker_rhat)),
+        stuck=_stuck(accepted, STILL * np.max(autocorrelation) / block),
+    )
+
+
+def _one_parameter(values: FloatArray) -> tuple[float, ...]:
+    """Judge the draws (steps, ensembles, walkers) of one parameter.
+
+    R-hat, effective draws in bulk and tail and for the mean, autocorrelation time, and R-hat of
+    the walkers.
+    """
+    steps, ensembles, walkers = values.shape
+    draws = np.ascontiguousarray(values)[..., np.newaxis]
+    scores, folded = _scores(draws)
+    bulk, tail, mean = (float(ess[0]) for ess in _effective_draws(draws, scores))
+    half = steps // 2
+    halves, folded_halves = (
+        np.concatenate([s[..., :half], s[..., steps - half :]], axis=1) for s in (scores, folded)
+    )
+    # np.maximum keeps a nan of either.
+    rhat = np.maximum(_rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles))
+    time = autocorrelation_time(draws.reshape(steps, ensembles * walkers, 1))
+    return float(rhat[0]), bulk, tail, mean, float(time[0]), _walker_rhat(scores)
+
+
+def _stuck(accepted: IntArray, blocks: float) -> int:
+    """Count walkers without a move in the last so many blocks, if that is a number, or in all."""
+    last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
+    return int(np.sum(~accepted[-last:].any(axis=0)))
+
+
+def pareto_k(log_weights: FloatArray) -> float:
+    """Pareto k̂ of a proposal from log weights log p − log q (draws,) at draws of the posterior p.
+
+    Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
+    draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
+    k' = k / (1 − k), so k = k' / (1 + k'). Places count once, however long a walker stayed: else
+    one walker at a large weight would make the tail by itself. Weights that are all equal have no
+    tail to fear, k = 0: the proposal is the posterior. Too few of them to see a tail give infinity.
+    """
+    with np.errstate(invalid="ignore"):
+        if log_weights.size and np.ptp(log_weights) < EQUAL:
+            return 0.0
+    try:
+        shape = float(array_stats.psislw(-np.unique(log_weights))[1])
+    except (ValueError, IndexError):  # nothing
+        return np.inf
+    return shape / (1 + shape) if shape > 0 else shape
+
+
+def as_chains(draws: FloatArray) -> FloatArray:
+    """Return draws (steps, ensembles, walkers, free) as (ensembles x walkers, steps, free).
+
+    Every walker is a chain. Folding walkers into one chain step by step instead would count
+    neighbours at the same step as a long independent series and overstate the effective draws.
+    """
+    steps, ensembles, walkers, free = draws.shape
+    return np.moveaxis(draws, 0, 2).reshape(ensembles * walkers, steps, free)
+
+
+def nested_rhat(draws: FloatArray) -> FloatArray:
+    """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
+    return _rhat(*_scores(draws), draws.shape[1])
+
+
+def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Effective number of draws, bulk and tail, (free,) each.
+
+    With walkers as arviz's chains, and no more than the series of ensemble means allow: a mean of
+    W independent walkers has a W-th of the variance, so n effective means are worth n times the
+    ratio of the variances.
+    """
+    bulk, tail, _ = _effective_draws(draws, _scores(draws)[0])
+    return bulk, tail
+
+
+def _effective_draws(
+    draws: FloatArray, scores: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Effective draws, given the normal scores of the draws too.
+
+    Of the means of the scores and of being in a tail: what arviz calls bulk and tail, which would
+    rank the draws three times more. And of the mean of the draws as they are: those of a heavy
+    tail are worth another number.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        cap = _ensemble_mean_ess(draws)
+        bulk = array_stats.ess(scores, method="mean")
+        # A comparison would take what is not a number for a draw beyond the tail.
+        low, high = (np.where(np.isnan(scores), np.nan, scores <= ndtri(part)) for part in TAIL)
+        tails = [array_stats.ess(tail, method="mean") for tail in (low, high)]
+        mean = array_stats.ess(_series(draws), method="mean")
+    every = bulk, np.min(tails, axis=0), mean
+    bulk, tail, mean = (np.minimum(np.atleast_1d(ess), cap) for ess in every)
+    return bulk, tail, mean
+
+
+def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> FloatArray:
+    """Nested R-hat (free,) of scores (free, chains, steps), an ensemble's chains in a row.
+
+    Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
+    calls rank, which would rank the draws once more.
+    """
+    superchain = np.repeat(np.arange(ensembles), scores.shape[1] // ensembles)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        both = [
+            array_stats.rhat_nested(each, superchain_ids=superchain, method="split")
+            for each in (scores, folded)
+        ]
+    # np.maximum keeps a nan of either.
+    return np.atleast_1d(np.maximum(*both))
+
+
+def _walker_rhat(scores: FloatArray) -> float:
+    """Largest R-hat, √(1 + variance of the walkers' means / mean of their variances).
+
+    Walkers that share modes between them in the same way in each ensemble, and never change, look
+    alike to the nested R-hat, and are worth as many effective draws as they are.
+    """
+    between = np.var(np.mean(scores, axis=-1), axis=-1)
+    within = np.mean(np.var(scores, axis=-1), axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return float(np.max(np.sqrt(1 + between / within)))
+
+
+def _series(draws: FloatArray) -> FloatArray:
+    """Return chains (free, chains, steps), each parameter's together in memory."""
+    return np.ascontiguousarray(np.moveaxis(as_chains(draws), -1, 0))
+
+
+def _scores(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rank draws (steps, ensembles, walkers, free) into normal scores (free, chains, steps).
+
+    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)). The second ones are
+    those of the draws' distances from their median.
+    """
+    every = _series(draws)
+    scores, folded = np.empty_like(every), np.empty_like(every)
+    with np.errstate(invalid="ignore"):
+        for i, series in enumerate(every):
+            scores[i], median = _normal_scores(series)
+            folded[i], _ = _normal_scores(np.abs(series - median))
+    return scores, folded
+
+
+def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
+    """Rank one parameter's draws, and find their median; all nan if any of them is."""
+    values = draws.ravel()
+    order = np.argsort(values)
+    ordered = values[order]
+    if np.isnan(ordered[-1]):  # nan sorts last
+        return np.full(draws.shape, np.nan), np.nan
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    equal = np.diff(first, append=values.size)
+    rank = first + 0.5 * (equal + 1)
+    scores = np.empty(values.size)
+    scores[order] = np.repeat(ndtri((rank - 3 / 8) / (values.size + 1 / 4)), equal)
+    middle = ordered[(values.size - 1) // 2], ordered[values.size // 2]
+    return scores.reshape(draws.shape), float(np.mean(middle))
+
+
+def _ensemble_mean_ess(draws: FloatArray) -> FloatArray:
+    means = np.mean(draws, axis=2)
+    ess = array_stats.ess(np.moveaxis(means, 0, 1), chain_axis=0, draw_axis=1, method="mean")
+    ratio = np.var(draws, axis=(0, 1, 2)) / np.var(means, axis=(0, 1))
+    worth: FloatArray = np.atleast_1d(ess) * ratio
+    return worth

@@ -1,0 +1,366 @@
+"""Sampling: several independent ensembles, run until the chain says that it has converged.
+
+The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
+short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
+away. Then draws count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two
+judgements in a row find nothing wrong, the first on half the draws that are to be reached, the
+second on all of them and a fifth more than the first at least; or the budget of steps is used up.
+To judge costs as much as some steps, so each judgement predicts how long the chain must become,
+and the next one waits until then.
+
+A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
+from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
+differential evolution starts the sampling again from where the ensembles are: so all draws that
+count come from one kernel, fixed before the first of them. To keep the early draws would save
+little, because differential evolution alone needs about ten times the steps, and they are the very
+draws that are not to be trusted.
+
+All decisions are functions of the chain alone, and are taken again from its beginning when a run
+that was interrupted goes on: it comes to the same end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling.chain import MOST_DRAWS, Chain, Phase, thinning
+from bwbayes.sampling.diagnostics import (
+    LARGEST_PARETO_K,
+    LENGTH,
+    Check,
+    check,
+    nested_rhat,
+    pareto_k,
+)
+from bwbayes.sampling.ensemble import Block, advance, start
+from bwbayes.sampling.moves import sampling_moves
+from bwbayes.sampling.proposals import StudentMixture
+
+__all__ = [
+    "Outcome",
+    "SamplingPlan",
+    "Watcher",
+    "draws",
+    "first_chain",
+    "log_densities",
+    "sample",
+]
+
+# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# many steps it is enough if each stays where it is: in modes far apart differential evolution would
+# keep them for ever, and a proposal fitted to all of them will not.
+PILOT_RHAT = 1.1
+APART_STEPS = 500
+
+TUNING_BLOCKS = 2
+
+# Blocks before the first check, and how much longer the chain is at the next one at most, or at
+# least if it is not draws that are missing.
+FIRST_CHECK = 4
+LARGEST_STRETCH = 3.0
+LEAST_STRETCH = 1.2
+
+# How much longer a chain is at the second of the two checks that it must pass: checks of nearly
+# the same draws would be one. For the first, a part of the draws that are to be reached is enough:
+# so that they are reached at the second.
+APART = 1.2
+FIRST_PART = 0.5
+
+# Called after each block of one ensemble (phase, None) and after each check (phase, check).
+Watcher = Callable[[Phase, Check | None], None]
+
+
+def _unwatched(phase: Phase, found: Check | None) -> None:
+    """Watch nothing."""
+
+
+@dataclass(frozen=True)
+class SamplingPlan:
+    """How to sample, and when to stop.
+
+    Parameters
+    ----------
+    ess
+        Effective draws of every parameter, bulk and tail, to reach.
+    ensembles
+        Independent ensembles, at least four: R-hat compares them.
+    walkers
+        Walkers of one ensemble, even, at least twice the free parameters.
+    block
+        Steps that are made and stored at a time; checks come after whole blocks.
+    most_steps, most_pilot_steps
+        The budget: steps of each ensemble that count, and before.
+    least_pilot_steps
+        Steps of the pilot in any case.
+    """
+
+    ess: float = 2000.0
+    ensembles: int = 4
+    walkers: int = 24
+    block: int = 50
+    most_steps: int = 20_000
+    least_pilot_steps: int = 100
+    most_pilot_steps: int = 3_000
+
+    def __post_init__(self) -> None:
+        if self.ensembles < 4:
+            raise InputError("sampling.ensembles: needs at least 4; R-hat compares them")
+        if self.walkers % 2:
+            raise InputError("sampling.walkers: must be even; emcee moves one half at a time")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
+
+    converged: bool
+    stop_reason: str
+    check: Check
+    remarks: tuple[str, ...] = ()
+
+
+def first_chain(
+    posterior: Posterior, point: PointFit, plan: SamplingPlan, generator: np.random.Generator
+) -> Chain:
+    """Return a chain without blocks, its ensembles at their starts.
+
+    Raises
+    ------
+    InputError
+        Fewer walkers than twice the free parameters.
+    """
+    if plan.walkers < 2 * posterior.prior.dimensions:
+        raise InputError(
+            f"sampling.walkers: {plan.walkers} are too few for {posterior.prior.dimensions} free "
+            f"parameters; use at least {2 * posterior.prior.dimensions}"
+        )
+    seeds = generator.spawn(plan.ensembles)
+    return Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
+
+
+def sample(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    chain: Chain,
+    executor: Executor,
+    watcher: Watcher = _unwatched,
+) -> Outcome:
+    """Extend ``chain`` until it has converged or the budget is used up.
+
+    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of
+    the result.
+    """
+    while not chain.blocks("tuning") and not _pilot_done(posterior, plan, chain):
+        _extend(posterior, plan, chain, "pilot", executor, watcher)
+    while not chain.blocks("sampling") and chain.blocks("tuning") < TUNING_BLOCKS:
+        if not chain.blocks("tuning"):
+            chain.freeze("tuning", _fitted(chain, "pilot"))
+        _extend(posterior, plan, chain, "tuning", executor, watcher)
+    if not chain.history("sampling"):
+        chain.freeze("sampling", _fitted(chain, "tuning"))
+    while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
+        chain.fall_back(chain.blocks("sampling"))
+    return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
+
+
+def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
+
+    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
+    """
+    thin = thinning(chain.draws(phase))
+    return _constrained(posterior, chain.coordinates(phase, thin))
+
+
+def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return the log density of :func:`draws`, (steps, ensembles, walkers), nats."""
+    return chain.log_density(phase, thinning(chain.draws(phase)))
+
+
+def _sampled(
+    posterior: Posterior, plan: SamplingPlan, chain: Chain, executor: Executor, watcher: Watcher
+) -> Outcome | None:
+    """Sample to the end, or until the proposal turns out not to cover the draws: then None.
+
+    A chain that has blocks already is judged where it was, or would have been, on its way.
+    """
+    judge = _Judge(posterior, plan, chain)
+    # A chain may be longer than its budget, if that was made smaller.
+    most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+    blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
+    while True:
+        blocks = min(blocks, most)
+        while chain.blocks("sampling") < blocks:
+            _extend(posterior, plan, chain, "sampling", executor, watcher)
+        now = judge(blocks)
+        watcher("sampling", now)
+        missing = now.shortcomings(plan.ess)
+        at_end = blocks == chain.blocks("sampling")
+        # One whose target was made smaller has converged before its end.
+        done = not missing and 0 < APART * passed <= blocks
+        if done and at_end:
+            return Outcome(True, "converged on two checks in a row", now)
+        if blocks == most:
+            why = "; ".join(missing) or "only the last check passed"
+            return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
+        if not now.covered and at_end:
+            return None
+        first = not now.shortcomings(plan.ess, FIRST_PART)
+        passed = (passed or blocks) if first else 0
+        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
+
+
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
+    """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
+
+    Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
+    else is missing. After the first check that ``passed``, at so many blocks, comes the second.
+    """
+    part = 1.0 if passed else FIRST_PART
+    fewest = np.min([found.ess_bulk, found.ess_tail])
+    with np.errstate(divide="ignore"):
+        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
+    wanted = max(part * steps / plan.block, APART * passed)
+    if not wanted > blocks:  # nan too
+        wanted = LEAST_STRETCH * blocks
+    return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
+
+
+class _Judge:
+    """Judges the first blocks that count, each of which it prepares once; more of them each time.
+
+    Of many draws it takes every second step, or every fourth, and so on, to bound its memory. How
+    many is a function of the blocks that it judges, so that a run that goes on judges the same.
+    """
+
+    def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain) -> None:
+        self.posterior, self.plan, self.chain = posterior, plan, chain
+        self.proposal = chain.proposal_in_use("sampling")
+        self.prepared, self.thin = 0, 1
+        self.draws: list[FloatArray] = []
+        self.log_weights: list[FloatArray] = []
+
+    def __call__(self, blocks: int) -> Check:
+        """Judge the first ``blocks`` blocks."""
+        plan = self.plan
+        # Far more draws than are to be effective, so that none is missed.
+        most = max(MOST_DRAWS, round(4 * plan.ess))
+        thin = thinning(blocks * plan.block * plan.ensembles * plan.walkers, most)
+        while self.thin < thin:
+            self.thin *= 2
+            for kept in (self.draws, self.log_weights):
+                kept[:] = [values[1::2] for values in self._joined(kept)]
+        for number in range(self.prepared, blocks):
+            self._prepare(number)
+        self.prepared = blocks
+        (every,) = self.draws = self._joined(self.draws)
+        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
+        if self.proposal is None:
+            return found
+        (weights,) = self.log_weights = self._joined(self.log_weights)
+        return replace(found, pareto_k=pareto_k(weights.ravel()))
+
+    @staticmethod
+    def _joined(kept: list[FloatArray]) -> list[FloatArray]:
+        return [np.concatenate(kept)] if kept else []
+
+    def _prepare(self, number: int) -> None:
+        blocks = self.chain.block_of("sampling", number)
+        steps = slice(-(number * self.plan.block + 1) % self.thin, None, self.thin)
+        coordinates = np.stack([block.coordinates[steps] for block in blocks], axis=1)
+        self.draws.append(_constrained(self.posterior, coordinates))
+        if self.proposal is not None:
+            flat = coordinates.reshape(-1, coordinates.shape[-1])
+            density = np.stack([block.log_density[steps] for block in blocks], axis=1)
+            proposed = self.proposal.log_density(flat).reshape(density.shape)
+            self.log_weights.append(density - proposed)
+
+
+def _remarks(chain: Chain) -> tuple[str, ...]:
+    """Say what a user should know of the moves."""
+    alone = "differential evolution and snooker moves alone made the draws that count"
+    proposal = chain.proposals["sampling"]
+    if proposal is None:
+        return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
+    if not chain.set_aside:
+        return ()
+    aside = chain.history("sampling")[: chain.set_aside]
+    each = [block for blocks in aside for block in blocks]
+    coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in each])
+    density = np.concatenate([b.log_density.ravel() for b in each])
+    shape = pareto_k(density - proposal.log_density(coordinates))
+    steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
+    return (
+        f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
+        f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
+    )
+
+
+def _thinned(chain: Chain) -> tuple[str, ...]:
+    """Say that a long chain is not used as a whole."""
+    thin = thinning(chain.draws("sampling"))
+    if thin == 1:
+        return ()
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
+
+
+def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
+    """Return coordinates (steps, ensembles, walkers, free) in their own units."""
+    flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
+    return flat.reshape(coordinates.shape)
+
+
+def _extend(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    chain: Chain,
+    phase: Phase,
+    executor: Executor,
+    watcher: Watcher,
+) -> None:
+    """Advance every ensemble by a block, wherever the executor likes."""
+    proposal = chain.proposal_in_use(phase)
+    # Moves of its own for each: some of emcee's write to themselves.
+    futures = [
+        executor.submit(advance, posterior, sampling_moves(proposal), end, plan.block)
+        for end in chain.ends
+    ]
+    blocks: list[Block] = []
+    for future in futures:
+        blocks.append(future.result())
+        watcher(phase, None)
+    chain.append(phase, blocks)
+
+
+def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
+    steps = chain.steps("pilot")
+    if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
+        return steps >= plan.most_pilot_steps
+    second_half = _constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
+    if (nested_rhat(second_half) < PILOT_RHAT).all():
+        return True
+    return steps >= APART_STEPS and all(_stays(each) for each in np.moveaxis(second_half, 1, 0))
+
+
+def _stays(draws: FloatArray) -> bool:
+    """Tell whether the halves of an ensemble's draws (steps, walkers, free) agree."""
+    half = len(draws) // 2
+    halves = np.stack([draws[:half], draws[len(draws) - half :]], axis=1)
+    return bool((nested_rhat(halves) < PILOT_RHAT).all())
+
+
+def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:
+    """Fit a proposal to the later half of a phase's draws, if they span the space."""
+    later = chain.coordinates(phase)[chain.steps(phase) // 2 :]
+    try:
+        return StudentMixture.fitted(later.reshape(-1, later.shape[-1]))
+    except np.linalg.LinAlgError:
+        return None

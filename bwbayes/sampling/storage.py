@@ -1,0 +1,395 @@
+"""The chain on disk: appended block by block, whole at every moment.
+
+An HDF5 file in single-writer mode, whose datasets all exist from the start: a block is written and
+flushed, then the number of blocks that count, and only what is counted is ever read. A process
+killed in between loses the block in hand and nothing else. All numbers carry checksums: of a file
+that was cut or changed on the disk the blocks before the damage are read. Going on from a file
+first copies what counts into a fresh one. This module alone knows the layout:
+
+    /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
+    /proposal/PHASE                      weights, centres, factors of that phase's proposal
+    /point                               the point fit
+    /committed                           blocks of each phase; proposals of each phase (0 or 1);
+                                         blocks of the sampling that were set aside
+
+and what was run (config, versions, seed, hash of the data) as the file's attributes.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from hashlib import file_digest
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from bwbayes.arrays import IntArray
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
+from bwbayes.sampling.hdf5 import DAMAGE, Image, reserve
+from bwbayes.sampling.moves import MOVES
+from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
+
+__all__ = ["ChainFile"]
+
+FORMAT = 2
+
+# Where /committed says how many blocks were set aside.
+SET_ASIDE = 2 * len(PHASES)
+
+
+class ChainFile(Chain):
+    """A chain that is written to a file as it grows. Use it as a context manager.
+
+    Open one with :meth:`create` or :meth:`resume`. One process may write a file; that is for the
+    caller to see to (a run locks its folder). Readers need no permission: see :meth:`read`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        point: PointFit,
+        starts: Sequence[EnsembleState],
+        block: int,
+        attributes: Mapping[str, str | int],
+    ) -> None:
+        super().__init__(starts)
+        self.path, self.point, self.block = path, point, block
+        self._attributes = dict(attributes)
+        self._file: Any = None
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        chain: Chain,
+        point: PointFit,
+        block: int,
+        attributes: Mapping[str, str | int],
+    ) -> ChainFile:
+        """Write a chain, blocks of ``block`` steps or none yet, as a new file and open it.
+
+        Raises
+        ------
+        InputError
+            There is no room for it.
+        """
+        made = cls(path, point, chain.starts, block, attributes)
+        temporary = path.with_suffix(".partial")
+        # Laid out in memory: HDF5 does not survive a disk that is full.
+        layout = BytesIO()
+        with h5py.File(layout, "w", libver="latest") as file:
+            _lay_out(file, point, chain.starts, block)
+            file.attrs["format"] = FORMAT
+            for name, value in attributes.items():
+                file.attrs[name] = value
+        with _told(path), made._or_nothing(temporary):
+            temporary.write_bytes(layout.getbuffer())
+            _replace(temporary, path)
+        with made._or_nothing(path):
+            made._open()
+            for phase in PHASES:
+                made.freeze(phase, chain.proposals[phase])
+                for blocks in chain.history(phase):
+                    made.append(phase, blocks)
+            if chain.set_aside:
+                made.fall_back(chain.set_aside)
+        return made
+
+    @classmethod
+    def read(cls, path: Path) -> ChainFile:
+        """Read a chain, finished, interrupted or being written; it cannot be extended.
+
+        Raises
+        ------
+        InputError
+            The file is missing, not a chain, or damaged where it says what it is.
+
+        Warns
+        -----
+        InputWarning
+            It is damaged further on; the blocks before that are read.
+        """
+        before = None
+        while True:
+            try:
+                chain, damage = cls._load(path)
+                # One that was written while it was read may look damaged; at rest it does not.
+                if not damage or before == (before := _digest(path)):
+                    break
+            except FileNotFoundError:
+                raise InputError(f"{path}: the chain does not exist; run again") from None
+            except OSError as error:
+                raise InputError(f"{path}: {error.strerror}; make it readable") from None
+        if chain is None:
+            raise InputError(f"{path}: the chain cannot be read ({damage}); run again")
+        if damage:
+            whole = sum(len(chain.history(phase)) for phase in PHASES)
+            warnings.warn(
+                f"{path}: damaged ({damage}); the {whole} whole blocks before that are used, and "
+                "`bwbayes resume` makes the others again",
+                InputWarning,
+                stacklevel=2,
+            )
+        return chain
+
+    @classmethod
+    def resume(
+        cls, path: Path, check: Callable[[Mapping[str, str | int]], None] | None = None
+    ) -> ChainFile:
+        """Read a chain and open it to go on, from the last block that counts.
+
+        ``check`` is given the attributes first, and may refuse them: the file then stays as it is.
+
+        Raises
+        ------
+        InputError
+            As :meth:`read`, or there is no room for the copy that it makes.
+
+        Warns
+        -----
+        InputWarning
+            As :meth:`read`.
+        """
+        old = cls.read(path)
+        if check is not None:
+            check(old.attributes())
+        fresh = path.with_suffix(".fresh")
+        made = cls.create(fresh, old, old.point, old.block, old.attributes())
+        # The name changes under the open file: it is the same file all along.
+        _replace(fresh, path)
+        made.path = path
+        return made
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return what was run: config, versions, platform, seed, hash of the data."""
+        return dict(self._attributes)
+
+    def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
+        """Add the next block of every ensemble; when this returns it is in the file.
+
+        Raises
+        ------
+        InputError
+            There is no room for it; the file is whole without it.
+        """
+        rows: dict[str, NDArray[Any]] = {
+            "coordinates": np.stack([b.coordinates for b in blocks], axis=1),
+            "log_density": np.stack([b.log_density for b in blocks], axis=1),
+            "accepted": np.stack([b.accepted for b in blocks])[np.newaxis],
+            "moves": np.stack([_padded(b.moves) for b in blocks])[np.newaxis],
+            "random_state": np.stack([b.end.random_state for b in blocks])[np.newaxis],
+        }
+        with _told(self.path):
+            reserve(self._file, sum(values.nbytes for values in rows.values()))
+        number = len(self.history(phase))
+        for name, values in rows.items():
+            _put(self._file[phase][name], number * len(values), values)
+        self._commit(PHASES.index(phase), number + 1)
+        super().append(phase, blocks)
+
+    def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
+        """Fix the proposal of a phase, in the file too."""
+        if proposal is not None:
+            group = self._file[f"proposal/{phase}"]
+            group["weights"][:] = proposal.weights
+            group["centres"][:] = np.stack([c.centre for c in proposal.components])
+            group["factors"][:] = np.stack([c.factor for c in proposal.components])
+            self._commit(len(PHASES) + PHASES.index(phase), 1)
+        super().freeze(phase, proposal)
+
+    def fall_back(self, blocks: int) -> None:
+        """Set the first blocks of the sampling aside, in the file too."""
+        self._commit(SET_ASIDE, blocks)
+        super().fall_back(blocks)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> ChainFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> None:
+        self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
+        self._file.swmr_mode = True
+
+    @contextmanager
+    def _or_nothing(self, path: Path) -> Iterator[None]:
+        """Leave nothing of a file that could not be written to its end."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            path.unlink(missing_ok=True)
+            raise
+
+    def _commit(self, place: int, count: int) -> None:
+        """Let ``count`` count, once everything before has reached the file."""
+        self._file.flush()
+        self._file["committed"][:, place] = count
+        self._file.flush()
+
+    @classmethod
+    def _load(cls, path: Path) -> tuple[ChainFile | None, str]:
+        """Return what can be read of a file, and what ails the rest, if anything."""
+        loaded, damage, set_aside = None, "", 0
+        with Image(path) as image:
+            try:
+                with h5py.File(image, "r") as file:
+                    loaded = cls._begun(path, file)
+                    committed = _either(file["committed"])
+                    set_aside = int(committed[SET_ASIDE])
+                    for place, phase in enumerate(PHASES):
+                        if committed[len(PHASES) + place]:
+                            loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
+                        for number in range(committed[place]):
+                            Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
+            except DAMAGE as error:
+                damage = " ".join(str(error.args[-1] if error.args else error).split())
+        if loaded is not None and set_aside <= len(loaded.history("sampling")):
+            loaded.set_aside = set_aside
+        return loaded, damage
+
+    @classmethod
+    def _begun(cls, path: Path, file: Any) -> ChainFile:
+        """Return the chain of a file without its blocks."""
+        attributes = {n: v if isinstance(v, str) else int(v) for n, v in file.attrs.items()}
+        number = attributes.pop("format")
+        if number != FORMAT:
+            raise ValueError(f"its format is {number}, this version reads {FORMAT}")
+        point = PointFit(
+            **{name: _either(file["point"][name]) for name in _POINT[:-1]},
+            log_density=float(_either(file["point"]["log_density"])),
+        )
+        parts = [_either(file["start"][n]) for n in ("coordinates", "log_density", "random_state")]
+        block = int(file["pilot"]["coordinates"].chunks[0])
+        return cls(
+            path, point, [EnsembleState(*s) for s in zip(*parts, strict=True)], block, attributes
+        )
+
+
+def _digest(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").digest()
+
+
+def _either(dataset: Any) -> Any:
+    """Read what is written twice: the first copy that is whole."""
+    try:
+        return dataset[0]
+    except DAMAGE:
+        return dataset[1]
+
+
+_POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
+
+
+def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block: int) -> None:
+    """Create every dataset, so that none has to be later."""
+    ensembles = len(starts)
+    walkers, free = starts[0].coordinates.shape
+    whole: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
+    for name in ("coordinates", "log_density", "random_state"):
+        whole[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
+    for phase in PHASES:
+        whole[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
+        whole[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
+        whole[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
+    whole["committed"] = np.zeros(SET_ASIDE + 1, dtype=np.int64)
+    for name, values in whole.items():
+        # Twice, since nothing else could stand in for it; only chunks carry checksums.
+        data = np.stack([values, values])
+        file.create_dataset(name, data=data, chunks=(1, *np.shape(values)), fletcher32=True)
+    shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+        "coordinates": ((block, ensembles, walkers, free), np.float64),
+        "log_density": ((block, ensembles, walkers), np.float64),
+        "accepted": ((1, ensembles, walkers), np.int64),
+        "moves": ((1, ensembles, len(MOVES), 2), np.int64),
+        "random_state": ((1, ensembles, RANDOM_STATE_WORDS), np.uint32),
+    }
+    for phase in PHASES:
+        for name, (shape, dtype) in shapes.items():
+            file.create_dataset(
+                f"{phase}/{name}",
+                shape=(0, *shape[1:]),
+                maxshape=(None, *shape[1:]),
+                chunks=shape,
+                dtype=dtype,
+                fletcher32=True,
+            )
+
+
+def _put(dataset: Any, first: int, values: NDArray[Any]) -> None:
+    """Write values (rows, ...) to the end of a dataset, from row ``first`` on."""
+    dataset.resize(first + len(values), axis=0)
+    dataset[first:] = values
+
+
+def _padded(counts: IntArray) -> IntArray:
+    """Return the counts of a block's moves with a row for each of MOVES."""
+    padded = np.zeros((len(MOVES), 2), dtype=np.int64)
+    padded[: len(counts)] = counts
+    return padded
+
+
+def _proposal(group: Any) -> StudentMixture:
+    """Read a frozen proposal."""
+    pairs = zip(_either(group["centres"]), _either(group["factors"]), strict=True)
+    return StudentMixture(
+        _either(group["weights"]), tuple(StudentProposal(*pair) for pair in pairs)
+    )
+
+
+def _blocks(group: Any, number: int, block: int) -> list[Block]:
+    """Read one block of every ensemble."""
+    steps = slice(number * block, (number + 1) * block)
+    coordinates, log_density = group["coordinates"][steps], group["log_density"][steps]
+    accepted, states = group["accepted"][number], group["random_state"][number]
+    moves = group["moves"][number]
+    # Where a disk lost what it was given there are zeros, which pass the checksum.
+    if not all(part.any() for part in (coordinates, log_density, states)):
+        raise ValueError("a block is empty")
+    return [
+        Block(
+            coordinates[:, e],
+            log_density[:, e],
+            accepted[e],
+            moves[e],
+            EnsembleState(coordinates[-1, e], log_density[-1, e], states[e]),
+        )
+        for e in range(len(states))
+    ]
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say in one line that a chain cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: fix "
+            "that, then go on with `bwbayes resume`"
+        ) from None
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Give a finished file its name, in one step, after it has reached the disk."""
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    temporary.replace(path)

@@ -1,0 +1,1 @@
+"""Tests of bwbayes.sampling: ensembles, chains in memory and on disk, convergence."""

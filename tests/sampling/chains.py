@@ -1,0 +1,129 @@
+"""Chain files to test with: what is written is made up, and always the same."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
+from bwbayes.sampling.moves import MOVES
+from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
+from bwbayes.sampling.storage import ChainFile
+
+__all__ = [
+    "ATTRIBUTES",
+    "ENSEMBLES",
+    "PLAN",
+    "STEPS",
+    "arrays",
+    "assert_same",
+    "blocks",
+    "committed",
+    "finish",
+    "new",
+    "proposal",
+]
+
+ENSEMBLES, WALKERS, FREE, STEPS = 4, 16, 8, 50
+ATTRIBUTES: dict[str, str | int] = {
+    "config": '[record]\nfile = "µm.csv"\n',
+    "data_sha256": "94fd",
+    "versions": '{"numpy": "2.0"}',
+    "platform": "Linux",
+    "seed": 7,
+}
+# What a writer does, in order, and where it may be interrupted.
+PLAN: tuple[tuple[Phase, int], ...] = (("pilot", 2), ("tuning", 2), ("sampling", 10))
+
+
+def state(generator: np.random.Generator) -> EnsembleState:
+    words = generator.integers(2**32, size=RANDOM_STATE_WORDS, dtype=np.uint32)
+    coordinates = generator.standard_normal((WALKERS, FREE))
+    return EnsembleState(coordinates, generator.standard_normal(WALKERS), words)
+
+
+@cache
+def blocks(phase: Phase, number: int) -> list[Block]:
+    """Make up the block of every ensemble: always the same one."""
+    generator = np.random.default_rng([PHASES.index(phase), number])
+    made = []
+    for _ in range(ENSEMBLES):
+        end = state(generator)
+        coordinates = generator.standard_normal((STEPS, WALKERS, FREE))
+        density = generator.standard_normal((STEPS, WALKERS))
+        coordinates[-1], density[-1] = end.coordinates, end.log_density
+        accepted = generator.integers(STEPS, size=WALKERS)
+        moves = generator.integers(STEPS, size=(len(MOVES), 2))
+        made.append(Block(coordinates, density, accepted, moves, end))
+    return made
+
+
+def proposal(phase: Phase) -> StudentMixture:
+    generator = np.random.default_rng(PHASES.index(phase))
+    factors = np.tril(generator.standard_normal((COMPONENTS, FREE, FREE)))
+    centres = generator.standard_normal((COMPONENTS, FREE))
+    parts = tuple(StudentProposal(*pair) for pair in zip(centres, factors, strict=True))
+    return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts)
+
+
+def new(path: Path, blocks_before: int = 0, steps: int = STEPS) -> ChainFile:
+    generator = np.random.default_rng(0)
+    mode = generator.standard_normal(FREE)
+    point = PointFit(mode, np.eye(FREE), -3.5, np.stack([mode, -mode]), 4 * np.eye(FREE))
+    chain = Chain([state(generator) for _ in range(ENSEMBLES)])
+    for number in range(blocks_before):
+        chain.append("pilot", blocks("pilot", number))
+    return ChainFile.create(path, chain, point, steps, ATTRIBUTES)
+
+
+def finish(chain: Chain) -> None:
+    """Do what is left of the plan, as a sampling does."""
+    for phase, count in PLAN:
+        if phase != "pilot" and not chain.blocks(phase):
+            chain.freeze(phase, proposal(phase))
+        while chain.blocks(phase) < count:
+            chain.append(phase, blocks(phase, chain.blocks(phase)))
+
+
+def arrays(chain: ChainFile) -> dict[str, Any]:
+    """Return all that a chain holds, by name."""
+    held: dict[str, Any] = {"point density": np.array(chain.point.log_density)}
+    for name in ("mode", "covariance", "optima", "prior_covariance"):
+        held[f"point {name}"] = getattr(chain.point, name)
+    for phase in PHASES:
+        held[f"{phase} blocks"] = np.array(chain.blocks(phase))
+        held[f"{phase} moves"] = np.array(list(chain.moves(phase).values()))
+        if chain.blocks(phase):
+            for name in ("coordinates", "log_density", "accepted"):
+                held[f"{phase} {name}"] = getattr(chain, name)(phase)
+        for number in range(chain.blocks(phase)):
+            ends = [block.end.random_state for block in chain.block_of(phase, number)]
+            held[f"{phase} {number} random states"] = np.stack(ends)
+        mixture = chain.proposals[phase]
+        if mixture is not None:
+            held[f"{phase} weights"] = mixture.weights
+            held[f"{phase} centres"] = np.stack([c.centre for c in mixture.components])
+            held[f"{phase} factors"] = np.stack([c.factor for c in mixture.components])
+    for kind, states in (("start", chain.starts), ("end", chain.ends)):
+        for name in ("coordinates", "log_density", "random_state"):
+            held[f"{kind} {name}"] = np.stack([getattr(one, name) for one in states])
+    return held
+
+
+def assert_same(expected: dict[str, Any], got: dict[str, Any]) -> None:
+    assert expected.keys() == got.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(value, got[name], err_msg=name)
+
+
+def committed(path: Path) -> list[int]:
+    """Return how many blocks of each phase a file has."""
+    if not path.exists():
+        return [0] * len(PHASES)
+    chain = ChainFile.read(path)
+    return [chain.blocks(phase) for phase in PHASES]

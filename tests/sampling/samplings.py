@@ -1,0 +1,116 @@
+"""A sampling of a small Gaussian to its end, to be interrupted, watched and compared."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.sampling.sampler import Outcome, SamplingPlan, first_chain, sample
+from tests.inference.problems import gaussian
+
+__all__ = [
+    "LONG",
+    "PLAN",
+    "POINT",
+    "POSTERIOR",
+    "InterruptedRunError",
+    "PluggedExecutor",
+    "Watched",
+    "assert_same_chain",
+    "assert_same_outcome",
+    "assert_same_proposal",
+    "new_chain",
+    "run",
+]
+
+PLAN = SamplingPlan(
+    ess=400,
+    walkers=12,
+    block=20,
+    least_pilot_steps=100,
+    most_pilot_steps=400,
+    most_steps=1000,
+)
+LONG = replace(PLAN, most_steps=10_000)
+POSTERIOR, POINT = gaussian(3)
+
+
+def new_chain(plan: SamplingPlan = PLAN, seed: int = 1) -> Chain:
+    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(seed))
+
+
+def run(plan: SamplingPlan = PLAN, seed: int = 1, workers: int = 1) -> tuple[Chain, Outcome]:
+    chain = new_chain(plan, seed)
+    with ThreadPoolExecutor(workers) as executor:
+        return chain, sample(POSTERIOR, plan, chain, executor)
+
+
+class Watched:
+    """What a watcher hears."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Phase] = []
+        self.checks: list[Check] = []
+
+    def __call__(self, phase: Phase, found: Check | None) -> None:
+        """Hear of a block, or of a check."""
+        if found is None:
+            self.blocks.append(phase)
+        else:
+            assert "sampling" == phase
+            self.checks.append(found)
+
+
+def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None) -> None:
+    if one is None or two is None:
+        assert one is two
+        return
+    np.testing.assert_array_equal(one.weights, two.weights)
+    for mine, yours in zip(one.components, two.components, strict=True):
+        assert mine.freedom == yours.freedom
+        np.testing.assert_array_equal(mine.centre, yours.centre)
+        np.testing.assert_array_equal(mine.factor, yours.factor)
+
+
+def assert_same_chain(one: Chain, two: Chain) -> None:
+    for phase in PHASES:
+        assert one.blocks(phase) == two.blocks(phase)
+        for name in ("coordinates", "log_density", "accepted"):
+            np.testing.assert_array_equal(getattr(one, name)(phase), getattr(two, name)(phase))
+        assert one.moves(phase) == two.moves(phase)
+    for mine, yours in zip(one.ends, two.ends, strict=True):
+        np.testing.assert_array_equal(mine.random_state, yours.random_state)
+        assert_same_proposal(one.proposals[phase], two.proposals[phase])
+
+
+def assert_same_outcome(one: Outcome, two: Outcome) -> None:
+    assert (one.converged, one.stop_reason) == (two.converged, two.stop_reason)
+    assert (one.remarks, one.check.pareto_k) == (two.remarks, two.check.pareto_k)
+    np.testing.assert_array_equal(one.check.rhat, two.check.rhat)
+    np.testing.assert_array_equal(one.check.ess_bulk, two.check.ess_bulk)
+
+
+class InterruptedRunError(Exception):
+    """Somebody pulled the plug."""
+
+
+class PluggedExecutor(Executor):
+    """Runs calls at once, a given number of them, and then fails."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run, or fail."""
+        if self.left == 0:
+            raise InterruptedRunError
+        self.left -= 1
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future

@@ -1,0 +1,123 @@
+"""The same seed gives the same bits: threads or processes, one or two, straight or in five pieces.
+
+The pieces end in the middle of a block, each in another phase or place, and each goes on from the
+file alone, as a run does that was interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.sampling.chain import PHASES, Phase
+from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.sampler import Outcome, SamplingPlan, first_chain, sample
+from bwbayes.sampling.storage import ChainFile
+from tests.forks import FORKS
+from tests.inference.problems import gaussian
+from tests.sampling.chains import arrays, assert_same
+
+POSTERIOR, POINT = gaussian(2)
+PLAN = SamplingPlan(
+    ess=200, walkers=8, block=10, least_pilot_steps=40, most_pilot_steps=200, most_steps=500
+)
+PIECES = 5
+
+
+class StoppedError(Exception):
+    """Somebody stopped the run."""
+
+
+class Stopper:
+    """Watches a sampling, and stops it when so many blocks of single ensembles are done."""
+
+    def __init__(self, blocks: int) -> None:
+        self.left = blocks
+
+    def __call__(self, _: Phase, found: Check | None) -> None:
+        """Hear of a block, or of a check."""
+        if found is None:
+            self.left -= 1
+            if self.left == 0:
+                raise StoppedError
+
+
+def begin(path: Path, seed: int = 1) -> None:
+    chain = first_chain(POSTERIOR, POINT, PLAN, np.random.default_rng(seed))
+    ChainFile.create(path, chain, POINT, PLAN.block, {}).close()
+
+
+def go_on(path: Path, executor: Executor, blocks: int = 0) -> Outcome:
+    with ChainFile.resume(path) as chain:
+        return sample(POSTERIOR, PLAN, chain, executor, Stopper(blocks))
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Outcome]:
+    path = tmp_path_factory.mktemp("straight") / "chain.h5"
+    begin(path)
+    with ThreadPoolExecutor(1) as executor:
+        outcome = go_on(path, executor)
+    return arrays(ChainFile.read(path)), outcome
+
+
+@pytest.fixture(scope="module", params=["thread", "2 threads", "process", "2 processes"])
+def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
+    workers = 2 if "2" in request.param else 1
+    pool: Executor = ThreadPoolExecutor(workers)
+    if "process" in request.param:
+        pool = ProcessPoolExecutor(workers, mp_context=FORKS)
+    with pool:
+        yield pool
+
+
+def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any], Outcome]) -> None:
+    assert_same(expected[0], arrays(ChainFile.read(path)))
+    assert (expected[1].converged, expected[1].stop_reason) == (
+        outcome.converged,
+        outcome.stop_reason,
+    )
+    for name in ("rhat", "ess_bulk", "ess_tail", "autocorrelation", "acceptance", "stuck"):
+        np.testing.assert_array_equal(
+            getattr(expected[1].check, name), getattr(outcome.check, name)
+        )
+
+
+def test_straight(
+    tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], Outcome]
+) -> None:
+    begin(tmp_path / "chain.h5")
+    outcome = go_on(tmp_path / "chain.h5", executor)
+    assert_same_end(tmp_path / "chain.h5", outcome, expected)
+
+
+def test_in_five_pieces(
+    tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], Outcome]
+) -> None:
+    path = tmp_path / "chain.h5"
+    begin(path)
+    total = sum(int(expected[0][f"{phase} blocks"]) for phase in PHASES)
+    piece = total // PIECES
+    for number in range(1, PIECES):
+        with suppress(StoppedError):
+            go_on(path, executor, 4 * piece + 2)
+        done = ChainFile.read(path)
+        assert number * piece == sum(done.blocks(phase) for phase in PHASES)
+    assert_same_end(path, go_on(path, executor), expected)
+
+
+def test_twin_another_seed_gives_other_bits(
+    tmp_path: Path, expected: tuple[dict[str, Any], Outcome]
+) -> None:
+    path = tmp_path / "chain.h5"
+    begin(path, seed=2)
+    with ThreadPoolExecutor(1) as executor:
+        go_on(path, executor)
+    got = arrays(ChainFile.read(path))["pilot coordinates"]
+    assert not np.isin(got, expected[0]["pilot coordinates"]).any()

@@ -1,0 +1,201 @@
+"""What has not converged is never called so, and what has is.
+
+The hard cases are chains broken in one way each (:mod:`tests.sampling.hard_chains`), judged with a
+target of one effective draw, so that no large target hides a fault that the other criteria miss;
+and targets that the sampler itself must not call sampled, within a budget that is ample for a good
+one. Each chain fails by a wide margin, whatever its seed.
+
+The good runs are a hundred, on three targets that differ in shape, in short blocks, where walkers
+often rest for all of one. They need 100 to 300 steps and have a budget of 1,500. None may fail;
+so the rate of false alarms is below 3 % (at 95 % confidence).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling import sampler
+from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.diagnostics import check
+from bwbayes.sampling.sampler import Outcome, SamplingPlan, first_chain, sample
+from tests.inference.problems import TARGETS, gaussian, target
+from tests.sampling.hard_chains import BLOCK, HARD, good, moved
+
+PLAN = SamplingPlan(
+    ess=200, walkers=12, block=25, least_pilot_steps=50, most_pilot_steps=200, most_steps=400
+)
+
+
+# Chains
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_chain_never_passes(name: str) -> None:
+    for seed in range(3):
+        draws = HARD[name](np.random.default_rng(seed), 2)
+        assert [] != check(draws, moved(draws), BLOCK).shortcomings(1), seed
+
+
+def test_twin_good_chain_passes_with_a_much_larger_target() -> None:
+    for seed in range(10):
+        draws = good(np.random.default_rng(seed))
+        assert [] == check(draws, moved(draws), BLOCK).shortcomings(1000), seed
+
+
+@pytest.mark.parametrize("block", [1, 5, 25])
+def test_walker_that_rests_for_a_short_block_is_not_stuck(block: int) -> None:
+    """It is after 25 autocorrelation times, of three steps here, in whatever blocks they come."""
+    draws = good(np.random.default_rng(1))
+    kept = np.full((len(draws), *draws.shape[1:3]), 1)
+    kept[-40:, 1, 3] = 0
+    blocks = kept.reshape(-1, block, *kept.shape[1:]).sum(axis=1)
+    assert 0 == check(draws, blocks, block).stuck
+    kept[-120:, 1, 3] = 0
+    blocks = kept.reshape(-1, block, *kept.shape[1:]).sum(axis=1)
+    assert 1 == check(draws, blocks, block).stuck
+
+
+# Targets
+
+
+def sampled(
+    posterior: Posterior, point: PointFit, plan: SamplingPlan, seed: int
+) -> tuple[Chain, Outcome]:
+    chain = first_chain(posterior, point, plan, np.random.default_rng(seed))
+    with ThreadPoolExecutor(1) as executor:
+        return chain, sample(posterior, plan, chain, executor)
+
+
+def point_at(*optima: list[float], width: float = 1.0) -> PointFit:
+    places = np.array(optima)
+    covariance = width**2 * np.eye(places.shape[1])
+    return PointFit(places[0], covariance, 0.0, places, 25 * covariance)
+
+
+def two_far_modes(x: FloatArray) -> FloatArray:
+    """Give 80 % of the probability to the second of them."""
+    first, second = (-0.5 * np.sum((x - m) ** 2, axis=1) for m in (-30.0, 30.0))
+    density: FloatArray = np.logaddexp(np.log(0.2) + first, np.log(0.8) + second)
+    return density
+
+
+def improper_ridge(x: FloatArray) -> FloatArray:
+    """Flat along x₀ = x₁, without end."""
+    density: FloatArray = -0.5 * ((x[:, 0] - x[:, 1]) / 0.1) ** 2
+    return density
+
+
+def improper_plain(x: FloatArray) -> FloatArray:
+    return np.zeros(len(x))
+
+
+def improper_tails(x: FloatArray) -> FloatArray:
+    """So heavy that there is no integral."""
+    density: FloatArray = -0.7 * np.log1p(np.sum(x**2, axis=1))
+    return density
+
+
+def improper_peak(x: FloatArray) -> FloatArray:
+    """Grows without limit towards the origin, and has no integral there."""
+    density: FloatArray = -6 * np.log(np.linalg.norm(x, axis=1))
+    return density
+
+
+FAR_STARTS = ([-1000.0, 0.0], [0.0, -1000.0], [0.0, 1000.0], [1000.0, 0.0])
+
+
+def number_near_its_starts_alone(x: FloatArray) -> FloatArray:
+    """As a posterior has it whose likelihood is nan everywhere else."""
+    near = [np.linalg.norm(x - np.array(start), axis=1) < 12 for start in FAR_STARTS]
+    return np.where(np.any(near, axis=0), 0.0, -np.inf)
+
+
+MODES = point_at([-30.0, -30.0], [30.0, 30.0])
+HARD_TARGETS = {
+    "improper ridge": (improper_ridge, point_at([0.0, 0.0])),
+    "improper plain": (improper_plain, point_at([0.0, 0.0])),
+    "improper tails": (improper_tails, point_at([0.0, 0.0])),
+    "improper peak": (improper_peak, point_at([1.0, 1.0])),
+    "nan almost everywhere": (number_near_its_starts_alone, point_at(*FAR_STARTS)),
+}
+
+
+@pytest.mark.parametrize("name", HARD_TARGETS)
+def test_hard_target_never_converges(name: str) -> None:
+    density, point = HARD_TARGETS[name]
+    _, outcome = sampled(target(density, 2), point, PLAN, seed=1)
+    assert not outcome.converged
+    assert outcome.stop_reason.startswith(f"budget of {PLAN.most_steps} steps used up: ")
+
+
+def test_far_modes_converge_to_their_weights() -> None:
+    """The proposal is fitted to both, so that walkers change between them."""
+    chain, outcome = sampled(
+        target(two_far_modes, 2), MODES, replace(PLAN, most_steps=4000), seed=2
+    )
+    assert outcome.converged
+    share = np.mean(chain.coordinates("sampling")[..., 0] > 0)
+    error = np.sqrt(0.8 * 0.2 / np.min(outcome.check.ess_bulk))
+    assert 0.8 == pytest.approx(share, abs=4 * error)
+
+
+def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Differential evolution alone never changes between them."""
+    monkeypatch.setattr(sampler, "_fitted", lambda *_: None)
+    chain, outcome = sampled(target(two_far_modes, 2), MODES, PLAN, seed=2)
+    assert not outcome.converged
+    assert {0.5} == set(np.mean(chain.coordinates("sampling")[..., 0] > 0, axis=(1, 2)))
+
+
+def test_likelihood_that_turns_into_nan_never_converges() -> None:
+    """Every walker stays where it was, in the cloud that all had come to."""
+    posterior, point = gaussian(2)
+    chain, _ = sampled(posterior, point, replace(PLAN, most_steps=25), seed=1)
+    nowhere = target(lambda x: np.full(len(x), -np.inf), 2)
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(nowhere, PLAN, chain, executor)
+    assert not outcome.converged
+    assert "48 walkers are stuck" in outcome.stop_reason
+
+
+def test_density_that_is_nowhere_finite_is_said() -> None:
+    nowhere = target(lambda x: np.full(len(x), -np.inf), 2)
+    with pytest.raises(InputError, match="sampling: no place for walkers around the point fit"):
+        first_chain(nowhere, point_at([0.0, 0.0]), PLAN, np.random.default_rng(1))
+
+
+def test_budget_of_one_block_never_converges() -> None:
+    for seed in range(3):
+        _, outcome = sampled(*gaussian(2), replace(PLAN, most_steps=25, ess=1), seed)
+        assert not outcome.converged
+
+
+# Good runs
+
+GOOD = {
+    "gaussian": (gaussian(3), 60),
+    "bounded": ((target(TARGETS["bounded"].log_density, 2), point_at([0.5, 0.5], width=0.3)), 20),
+    "bimodal": ((target(TARGETS["bimodal"].log_density, 3), point_at([0.5] * 3, width=0.3)), 20),
+}
+
+
+@pytest.mark.parametrize("block", [5, 10])
+@pytest.mark.parametrize("name", GOOD)
+def test_good_run_converges(name: str, block: int) -> None:
+    (posterior, point), runs = GOOD[name]
+    plan = replace(PLAN, block=block, most_steps=1500)
+    for seed in range(runs // 2):
+        _, outcome = sampled(posterior, point, plan, seed)
+        assert outcome.converged, (seed, outcome.stop_reason)
+
+
+def test_good_runs_are_a_hundred() -> None:
+    assert 100 == sum(runs for _, runs in GOOD.values())

@@ -1,0 +1,121 @@
+"""A chain of the default budget is judged, stored and read within a laptop's memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.sampling import sampler
+from bwbayes.sampling.chain import thinning
+from bwbayes.sampling.diagnostics import check
+from bwbayes.sampling.sampler import draws, log_densities
+from tests.sampling.samplings import PLAN, POSTERIOR, run
+
+# Ten parameters, the default's 64 walkers; ensembles that disagree, so that all checks are made.
+SCRIPT = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.ensemble import Block
+from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, log_densities, sample
+from tests.inference.problems import gaussian
+
+posterior, point = gaussian(10)
+plan = SamplingPlan(walkers=64)
+generator = np.random.default_rng(1)
+chain = first_chain(posterior, point, plan, generator)
+mixture = StudentMixture.fitted(generator.standard_normal((2000, 10)))
+path = Path(sys.argv[1])
+moved, moves = np.full(64, 20), np.full((3, 2), 20)
+with ChainFile.create(path, chain, point, plan.block, {}) as file:
+    file.freeze("sampling", mixture)
+    for phase, blocks in (("pilot", 60), ("tuning", 2), ("sampling", plan.most_steps // 50)):
+        for _ in range(blocks):
+            places = generator.standard_normal((4, 50, 64, 10)) + np.arange(4.0).reshape(4, 1, 1, 1)
+            density = -0.5 * np.sum(places**2, axis=-1)
+            ends = [replace(s, coordinates=p[-1], log_density=d[-1])
+                    for s, p, d in zip(chain.starts, places, density)]
+            file.append(phase, [Block(*each, moved, moves, end)
+                                for *each, end in zip(places, density, ends)])
+del file
+with ChainFile.resume(path) as again, ThreadPoolExecutor(1) as executor:
+    outcome = sample(posterior, plan, again, executor)
+assert not outcome.converged
+assert outcome.check.steps == plan.most_steps == again.steps("sampling")
+kept = draws(posterior, again)
+assert kept.shape[:3] == log_densities(again).shape
+# Not ru_maxrss, which a process takes over from the one that starts it.
+status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+print(status["VmHWM"].split()[0])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
+def test_the_default_budget_takes_less_than_a_gibibyte(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(tmp_path / "chain.h5")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert 0 == done.returncode, done.stderr
+    assert int(done.stdout) < 2**20
+
+
+@pytest.mark.parametrize("count", [1, 100, 101, 200, 201, 12_345])
+def test_thinning_is_the_least_power_of_two_that_is_enough(count: int) -> None:
+    thin = thinning(count, 100)
+    assert count <= 100 * thin
+    assert thin == 1 or count > 100 * thin / 2
+    assert 1 == bin(thin).count("1")
+
+
+def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As its steps counted from one are, however often it was thinned on the way; and says so."""
+    plan, most = replace(PLAN, ess=200), 800
+    monkeypatch.setattr(sampler, "MOST_DRAWS", most)
+    monkeypatch.setattr(sampler, "thinning", lambda count, most=most: thinning(count, most))
+    chain, outcome = run(plan)
+    assert outcome.check.steps == chain.steps("sampling")
+    thin = thinning(chain.draws("sampling"), most)
+    assert thin > 2
+    steps = np.arange(1, chain.steps("sampling") + 1)
+    kept: FloatArray = chain.coordinates("sampling")[steps % thin == 0]
+    np.testing.assert_array_equal(kept, draws(POSTERIOR, chain))
+    density = chain.log_density("sampling")[steps % thin == 0]
+    np.testing.assert_array_equal(density, log_densities(chain))
+    expected = check(kept, chain.accepted("sampling"), plan.block, thin)
+    for name in ("rhat", "ess_bulk", "ess_tail", "ess_mean", "autocorrelation", "stuck"):
+        np.testing.assert_array_equal(getattr(expected, name), getattr(outcome.check, name))
+    assert f"one in {thin} is reported" in outcome.remarks[-1]
+
+
+def test_a_thinned_series_has_its_autocorrelation_in_steps() -> None:
+    """Of an AR(1) with φ = 0.95, 39 steps; half as many draws are hardly fewer effective ones."""
+    generator = np.random.default_rng(2)
+    series = np.empty((4000, 4, 16, 1))
+    series[0] = generator.standard_normal((4, 16, 1))
+    for step in range(1, 4000):
+        shocks = np.sqrt(1 - 0.95**2) * generator.standard_normal((4, 16, 1))
+        series[step] = 0.95 * series[step - 1] + shocks
+    accepted = np.full((80, 4, 16), 20)
+    whole, half = check(series, accepted, 50), check(series[3::4], accepted, 50, 4)
+    assert whole.steps == half.steps == 4000
+    assert whole.autocorrelation[0] == pytest.approx(half.autocorrelation[0], rel=0.1)
+    assert whole.ess_bulk[0] == pytest.approx(half.ess_bulk[0], rel=0.1)
+
+
+def test_a_chain_of_a_usual_length_is_used_as_a_whole() -> None:
+    chain, outcome = run()
+    assert len(draws(POSTERIOR, chain)) == chain.steps("sampling")
+    assert not any("reported" in remark for remark in outcome.remarks)
