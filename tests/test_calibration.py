@@ -30,8 +30,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands.calibrate import experiment
 from bwbayes.app.config.config import load, parse
+from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray, IntArray

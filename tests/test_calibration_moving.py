@@ -32,8 +32,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.app.commands.calibrate import experiment
 from bwbayes.app.config.config import parse
+from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands.calibrate import experiment
 from bwbayes.app.config.config import parse
+from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray

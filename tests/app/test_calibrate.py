@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bwbayes.app.commands import calibrate as module
-from bwbayes.app.commands.calibrate import carry_on, start
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import parse
+from bwbayes.app.jobs import calibrate as module
+from bwbayes.app.jobs.calibrate import carry_on, start
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.app.running.progress import ReplicateProgress
 from bwbayes.errors import InputError

@@ -10,8 +10,8 @@ from pathlib import Path
 import h5py
 import pytest
 
-from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.jobs.predict import predict
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import UNSAID, fingerprint, require_same, version_remarks

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import load
 from bwbayes.app.config.model_settings import StandConfig
 from bwbayes.app.fit import fitted
 from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands

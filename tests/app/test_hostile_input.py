@@ -27,9 +27,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands import check as app_check
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
+from bwbayes.app.jobs import check as app_check
 from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import load_run

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.jobs.predict import predict
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.results.prediction import Start

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from bwbayes.app.commands import cli
+from bwbayes.app.commands import cli, run
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import Proposal, propose
 from bwbayes.app.problem.problem import resolve
@@ -268,7 +268,7 @@ def test_run_without_a_config_runs_the_proposed_one(
         ran.append(folder)
         return 0
 
-    monkeypatch.setattr(cli, "_finish", finish)
+    monkeypatch.setattr(run, "finish", finish)
     done = command("run", path, "--out", tmp_path / "out", "--quiet")
     assert 0 == done.return_value
     assert "" == done.output

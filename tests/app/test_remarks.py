@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bwbayes.app.commands.check import check
+from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import assemble, finished
 from bwbayes.app.screen import show_priors

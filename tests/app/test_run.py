@@ -17,7 +17,7 @@ import pytest
 import xarray
 from rich.console import Console
 
-from bwbayes.app.commands.cli import _finish
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
@@ -314,7 +314,7 @@ def test_interrupted_command_says_how_to_go_on(
 ) -> None:
     made = small.begun(tmp_path / "a")
     watch_until(monkeypatch, "pilot", 5)
-    assert 130 == _finish(made.path, 1, quiet=True)
+    assert 130 == finish(made.path, 1, quiet=True)
     printed = capsys.readouterr()
     assert f"interrupted; go on with `bwbayes resume {made.path}`\n" == printed.err
     assert "" == printed.out
@@ -431,7 +431,7 @@ def test_fit_that_misses_its_own_readings_does_not_hold(
     assert row["remedy"]
     page = (copy.path / "report.html").read_text(encoding="utf-8")
     assert 0 < page.index("DOES NOT HOLD") < page.index("Parameters")
-    assert 3 == _finish(copy.path, 1, quiet=True)
+    assert 3 == finish(copy.path, 1, quiet=True)
 
 
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:

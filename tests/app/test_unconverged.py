@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands.cli import _finish
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
+from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
@@ -37,7 +37,7 @@ def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]
     """Return a run that used up its budget, and the exit status of its command."""
     path = tmp_path_factory.mktemp("short") / "small"
     made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
-    return made, _finish(made.path, 1, quiet=True)
+    return made, finish(made.path, 1, quiet=True)
 
 
 def test_run_without_convergence_speaks_of_no_interval(
@@ -65,7 +65,7 @@ def test_line_on_the_screen_says_what_to_do(
     cut_short: tuple[RunFolder, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(cut_short[0].path, tmp_path / "a")
-    assert 4 == _finish(tmp_path / "a", 1, quiet=True)
+    assert 4 == finish(tmp_path / "a", 1, quiet=True)
     printed = capsys.readouterr()
     assert "" == printed.out
     assert 1 == printed.err.count("\n")
@@ -138,7 +138,7 @@ def test_hard_case_ends_with_status_4_and_without_parameters(
 ) -> None:
     monkeypatch.setattr(module, "draw_all", lambda _: {})
     folder = run_with(run, tmp_path / "a", HARD[name](np.random.default_rng(1), 8))
-    assert 4 == _finish(folder.path, 1, quiet=True, ess=1)
+    assert 4 == finish(folder.path, 1, quiet=True, ess=1)
     found = small.numbers(folder.path)
     assert (False, None, None) == (found["converged"], found["parameters"], found["validation"])
     assert not (folder.path / "bands.csv").exists()
@@ -149,7 +149,7 @@ def test_twin_good_draws_end_with_status_0_and_parameters(
 ) -> None:
     monkeypatch.setattr(module, "draw_all", lambda _: {})
     folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8))
-    assert 0 == _finish(folder.path, 1, quiet=True, ess=1)
+    assert 0 == finish(folder.path, 1, quiet=True, ess=1)
     assert small.numbers(folder.path)["parameters"]
 
 
@@ -164,7 +164,7 @@ def test_likelihood_that_turns_into_nan_ends_with_status_4(
     monkeypatch.setattr(module, "draw_all", lambda _: {})
     folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8)[:BLOCK])
     monkeypatch.setattr(Posterior, "log_likelihood", not_a_number)
-    assert 4 == _finish(folder.path, 1, quiet=True, ess=1, steps=4 * BLOCK)
+    assert 4 == finish(folder.path, 1, quiet=True, ess=1, steps=4 * BLOCK)
     assert small.numbers(folder.path)["parameters"] is None
 
 
@@ -174,5 +174,5 @@ def test_likelihood_that_is_nan_everywhere_is_said(
     folder = small.begun(tmp_path / "a")
     monkeypatch.setattr(Posterior, "log_likelihood", not_a_number)
     with pytest.raises(InputError, match="no draw has a finite posterior density"):
-        _finish(folder.path, 1, quiet=True)
+        finish(folder.path, 1, quiet=True)
     assert not folder.summary.exists()

@@ -1,1 +1,1 @@
-"""The command line: a module for each job, and the thin layer of options over them."""
+"""The command line: a module for each command, which reads options and calls its job."""

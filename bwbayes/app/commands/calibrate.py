@@ -1,253 +1,97 @@
-"""Simulation-based calibration of a config's posterior, from first replicate to last file.
-
-:func:`start` makes the folder: the config with every prior an explicit number, the same for all
-replicates. :func:`carry_on` makes whatever replicates are missing, side by side, writes a line for
-each, and judges them all. Each replicate depends on the config, the seed and its number alone, so
-it does not matter in how many pieces or with how many workers a calibration is done. Replicates of
-another config or record are refused.
-"""
+"""``bwbayes calibrate``: is the posterior what it says? Simulated records tell."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-from collections.abc import Mapping, Sequence
-from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
+import click
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, dump, load
-from bwbayes.app.figures import save
-from bwbayes.app.figures.calibration import draw_calibration
-from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.calibration_report import render
-from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import ReplicateProgress
-from bwbayes.app.running.run import versions
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.commands.shared import (
+    FILE,
+    INTERRUPTED,
+    NOT_CONVERGED,
+    quiet_option,
+)
+from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.errors import InputError
-from bwbayes.results.calibration import Calibration, judge, summary
-from bwbayes.results.outputs import write_summary
-from bwbayes.results.replicates import RANKED, Entry, Experiment, replicates
-from bwbayes.results.simulated import OtherRecord
 
-__all__ = ["carry_on", "experiment", "start"]
+if TYPE_CHECKING:
+    from bwbayes.app.running.folder import CalibrationFolder
 
-# Draws of the prior that show whether there is one.
-TRIED = 64
+__all__ = ["calibrate"]
 
-
-class _Request(BaseModel):
-    """The first line, and any that asks for more: how many replicates, of what."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    replicates: PositiveInt
-    of: str
-
-    @property
-    def line(self) -> bytes:
-        return self.model_dump_json().encode() + b"\n"
+# Replicates of a calibration, unless told otherwise.
+REPLICATES = 500
 
 
-def start(
-    config: Config, where: Path, out: Path, count: int, *, overwrite: bool = False
-) -> CalibrationFolder:
-    """Make the folder of a new calibration with ``count`` replicates.
-
-    The config's files are relative to the folder ``where``.
-
-    Raises
-    ------
-    InputError
-        The config, its records or the folder cannot be used.
-    """
-    problem = resolve(config, where)
-    experiment(problem)
-    request = _Request(replicates=count, of=_identity(problem))
-    return CalibrationFolder.create(out, problem, overwrite, request.line)
-
-
-def experiment(problem: Problem) -> Experiment:
-    """Return what the replicates of a problem have in common.
-
-    Held out are the validation windows of its own record; other records are made anew with each
-    replicate's truth, at the times and with the voltage that they have.
-
-    Raises
-    ------
-    InputError
-        Its voltage shows no loop, or its prior leaves hardly anything.
-    """
-    problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
-    windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    others = {
-        name: OtherRecord(v.record, v.start, v.judged)
-        for name, v in problem.validations.items()
-        if v.record is not None
-    }
-    return Experiment(problem.posterior, problem.plan, windows, others)
-
-
-def carry_on(
-    folder: CalibrationFolder,
-    console: Console,
-    *,
-    workers: int | None = None,
-    count: int | None = None,
-) -> Calibration:
-    """Make the missing replicates, judge all, and write the calibration's files.
-
-    Parameters
-    ----------
-    folder
-        The calibration's folder.
-    console
-        Where progress goes.
-    workers
-        Replicates side by side, in processes if more than one; by default as many as cores. The
-        result does not depend on it.
-    count
-        A new number of replicates, if given; none is thrown away.
-
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
-    """
-    with folder.locked(), one_thread():
-        problem = resolve(load(folder.config), folder.path)
-        common = experiment(problem)
-        request, entries = _read(folder, common, _identity(problem))
-        if count is not None and count != request.replicates:
-            request = request.model_copy(update={"replicates": count})
-            _append(folder, request.line)
-        missing = [number for number in range(request.replicates) if number not in entries]
-        # What is written last is the sign that all is there; now something is to come.
-        _clear(folder)
-        if missing:
-            _make(folder, common, problem.config.seed, missing, entries, workers, console)
-        console.print("judging and drawing ...", highlight=False)
-        ordered = [entries[number] for number in sorted(entries)]
-        calibration = judge(ordered, generator(problem.config.seed, "ranks"))
-        _write(folder, problem, calibration)
-    return calibration
-
-
-def _identity(problem: Problem) -> str:
-    """Return a digest of everything that replicates depend on."""
-    return sha256((dump(problem.config) + problem.record.sha256).encode()).hexdigest()
-
-
-def _make(
-    folder: CalibrationFolder,
-    common: Experiment,
-    seed: int,
-    missing: Sequence[int],
-    entries: dict[int, Entry],
+@click.command()
+@click.argument("config", type=FILE, required=False)
+@click.option("--resume", "begun", type=FILE, help="Go on with the calibration in this folder.")
+@click.option(
+    "--replicates", type=click.IntRange(1), help=f"How many; default: {REPLICATES}, or as begun."
+)
+@click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
+@click.option("--overwrite", is_flag=True, help="Replace a calibration that is there already.")
+@click.option("--workers", type=click.IntRange(1), help="Replicates side by side; default: cores.")
+@quiet_option
+def calibrate(
+    config: Path | None,
+    begun: Path | None,
+    replicates: int | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
     workers: int | None,
-    console: Console,
-) -> None:
-    """Add the missing replicates to the entries, and write each as soon as it is there."""
-    count = min(workers or os.cpu_count() or 1, len(missing))
-    unconverged = sum(not entry["converged"] for entry in entries.values())
-    # Processes, also for the compiled engine: most of a replicate's time goes into Python.
-    with (
-        executor(count) as pool,
-        ReplicateProgress(console, len(entries), len(missing), unconverged) as progress,
-    ):
-        for made in replicates(common, seed, missing, pool, count):
-            entry = entries[made.number] = made.entry()
-            _append(folder, json.dumps(entry).encode() + b"\n")
-            progress(made.converged)
+    quiet: bool,
+) -> int:
+    """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
 
+    Each replicate draws parameters from the config's prior, simulates its record anew and fits it
+    as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
+    replicates did not converge.
 
-def _append(folder: CalibrationFolder, line: bytes) -> None:
-    """Write a line that is there after a crash."""
-    with folder.replicates.open("ab") as file:
-        file.write(line)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _read(
-    folder: CalibrationFolder, common: Experiment, identity: str
-) -> tuple[_Request, dict[int, Entry]]:
-    """Read how many replicates are wanted, and those that are there; cut off half a line."""
-    content = folder.replicates.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        os.truncate(folder.replicates, whole)
-    first, *others = content[:whole].splitlines() or [b""]
-    request = _request(folder, first, identity)
-    entries: dict[int, Entry] = {}
-    for number, line in enumerate(others, start=2):
-        if line.startswith(b'{"replicates"'):
-            request = _request(folder, line, identity)
-            continue
-        try:
-            entry = _entry(line, common, entries)
-        except ValueError:
-            raise InputError(
-                f"{folder.replicates}:{number}: is no replicate of these; delete this line"
-            ) from None
-        entries[entry["number"]] = entry
-    return request, entries
-
-
-def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
-    """Read the line that says how many replicates are wanted, and check that they are these."""
-    try:
-        request = _Request.model_validate_json(line)
-    except ValueError:
-        raise InputError(
-            f"{folder.replicates}: does not say how many replicates there are to be; "
-            "calibrate anew with --overwrite"
-        ) from None
-    if request.of != identity:
-        raise InputError(
-            f"{folder.replicates}: these are replicates of another config or record than the "
-            "folder's; put that back, or calibrate anew with --overwrite"
-        )
-    return request
-
-
-def _entry(line: bytes, common: Experiment, others: Mapping[int, Entry]) -> Entry:
-    """Read a line, and check that it is a replicate of this experiment, and a new one."""
-    entry = TypeAdapter(Entry).validate_json(line)
-    stored = [*entry["ranks"]], [*entry["covered"]]
-    if stored not in (([*common.statistics], [*common.bands]), ([], [])):
-        raise ValueError("has other statistics")
-    if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
-        raise ValueError("has a rank that there is not")
-    if entry["number"] in others:
-        raise ValueError("is there already")
-    return entry
-
-
-def _clear(folder: CalibrationFolder) -> None:
-    """Remove what an earlier end has left."""
-    for path in (folder.summary, folder.path / "calibration.html"):
-        path.unlink(missing_ok=True)
-    shutil.rmtree(folder.path / "figures", ignore_errors=True)
-
-
-def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration) -> None:
-    """Write everything that a calibration leaves; the summary last, as the sign that all is there.
-
-    Nothing in it depends on when or how it was computed.
+    Example: bwbayes calibrate runs/calibration.toml --replicates 500
     """
-    numbers = summary(calibration) | {
-        "seed": problem.config.seed,
-        "data_sha256": problem.record.sha256,
-        "versions": versions(problem.posterior.engine),
-    }
-    figures = draw_calibration(calibration, problem.parameters)
-    pictures = save(figures, folder.path / "figures")
-    page = render(problem, calibration, numbers, pictures)
-    (folder.path / "calibration.html").write_text(page, encoding="utf-8")
-    write_summary(folder.summary, numbers)
+    from bwbayes.app.jobs.calibrate import start
+    from bwbayes.app.running.folder import CalibrationFolder
+
+    if (config is None) == (begun is None):
+        raise InputError("calibrate: give either a CONFIG or --resume FOLDER")
+    if begun is not None:
+        if out is not None or seed is not None or overwrite:
+            raise InputError("calibrate: --resume goes on as begun; leave the other options out")
+        return _calibrate(CalibrationFolder.open(begun), replicates, workers, quiet)
+    assert config is not None
+    changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
+    from bwbayes.app.config.config import load
+
+    wanted = load(config)
+    wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
+    where = out or Path("results") / f"{config.stem}-calibration"
+    folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
+    return _calibrate(folder, None, workers, quiet)
+
+
+def _calibrate(
+    folder: CalibrationFolder, replicates: int | None, workers: int | None, quiet: bool
+) -> int:
+    from bwbayes.app.jobs.calibrate import carry_on
+    from bwbayes.app.screen import show_calibration
+
+    console = Console(stderr=True, quiet=quiet)
+    try:
+        calibration = carry_on(folder, console, workers=workers, count=replicates)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; go on with `{folder.GO_ON} {folder.path}`", err=True)
+        return INTERRUPTED
+    if not quiet:
+        show_calibration(calibration, folder, Console())
+    if calibration.passed:
+        return 0
+    first, *others = calibration.shortcomings
+    more = f", and {len(others)} more" if others else ""
+    click.echo(f"NOT PASSED: {first}{more}; see {folder.path}/calibration.html", err=True)
+    return NOT_CONVERGED

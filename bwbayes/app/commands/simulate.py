@@ -1,63 +1,65 @@
-"""``bwbayes simulate``: a record of the virtual test stand, with its truth beside it."""
+"""``bwbayes simulate``: a record of the virtual test stand."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
-from typing import Literal, cast
 
-from bwbayes.app.problem.problem import generator
-from bwbayes.data import write_record
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Sine, Waveform
-from bwbayes.data.waveforms import signal as named
+import click
+
+from bwbayes.app.commands.shared import FILE, overwrite_option
+from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.errors import InputError
 
 __all__ = ["simulate"]
 
 
+@click.command()
+@click.argument("out", type=FILE)
+@click.option(
+    "--signal",
+    "wanted",
+    default="identification",
+    show_default=True,
+    help="identification, verification, step10, step50, step100, or sine (see the next options).",
+)
+@click.option("--amplitude", type=float, help="Of the sine, V; default: 100.")
+@click.option("--frequency", type=float, help="Of the sine, Hz; default: 1.")
+@click.option("--duration", type=float, help="Of the sine, s; default: 16.")
+@click.option(
+    "--discrepancy",
+    type=click.Choice(["none", "process", "structural"]),
+    default="process",
+    show_default=True,
+    help="How the stand's actuator departs from the model.",
+)
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), default=1, show_default=True)
+@click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
+@overwrite_option
 def simulate(
     out: Path,
-    signal: str,
-    sine: tuple[float, float, float],
+    wanted: str,
+    amplitude: float | None,
+    frequency: float | None,
+    duration: float | None,
     discrepancy: str,
     seed: int,
     rate: float,
-    *,
-    overwrite: bool = False,
-) -> list[Path]:
-    """Write a record, and beside it its true parameters; return what was written.
+    overwrite: bool,
+) -> int:
+    """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
 
-    Parameters
-    ----------
-    out
-        The record's file. The noise-free displacement goes into ``NAME.truth.csv`` for a CSV and
-        into the file itself for HDF5 and MATLAB; the true parameters into ``NAME.truth.json``.
-    signal
-        A signal's name, or ``"sine"``: constant amplitude (V), frequency (Hz), duration (s).
-    discrepancy, seed, rate
-        Of the stand; the rate in samples a second.
-
-    Raises
-    ------
-    InputError
-        An unknown signal, impossible values, or a file that is there already or cannot be written.
+    Example: bwbayes simulate ring.csv --signal verification --seed 7
     """
-    parameters = out.with_name(f"{out.stem}.truth.json")
-    beside = out.with_name(f"{out.stem}.truth{out.suffix}")
-    for path in (out, beside, parameters):
-        if path.exists() and not overwrite:
-            raise InputError(f"{path}: exists; choose another name, or give --overwrite")
-    amplitude, frequency, duration = sine
-    waveform = Waveform(Sine(amplitude, frequency), duration) if signal == "sine" else named(signal)
-    kind = cast("Literal['none', 'process', 'structural']", discrepancy)
-    stand = VirtualTestStand(kind, rate)
-    record = stand.run(waveform, generator(seed, "record"))
-    record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
-    write_record(record, out)
-    try:
-        parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
-    return [out, *([beside] if beside.exists() else []), parameters]
+    from bwbayes.app.jobs.simulate import simulate as write
+
+    given = (amplitude, frequency, duration)
+    if wanted != "sine" and any(value is not None for value in given):
+        raise InputError("simulate: amplitude, frequency and duration need --signal sine")
+    first, second, third = (
+        default if value is None else value
+        for value, default in zip(given, (100.0, 1.0, 16.0), strict=True)
+    )
+    sine = (first, second, third)
+    for path in write(out, wanted, sine, discrepancy, seed, rate, overwrite=overwrite):
+        click.echo(f"wrote {path}")
+    return 0

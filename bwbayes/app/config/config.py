@@ -17,6 +17,7 @@ import tomlkit
 from pydantic import Field, ValidationError, field_validator
 
 from bwbayes.app.config.keys import Table, described, one_line
+from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.app.config.model_settings import ActuatorConfig, ModelConfig, StandConfig
 from bwbayes.app.config.settings import (
     Name,
@@ -29,7 +30,6 @@ from bwbayes.app.config.settings import (
 from bwbayes.errors import InputError
 
 __all__ = [
-    "LARGEST_SEED",
     "ActuatorConfig",
     "Config",
     "ModelConfig",
@@ -42,9 +42,6 @@ __all__ = [
     "load",
     "parse",
 ]
-
-# What files hold as a whole number.
-LARGEST_SEED = 2**63 - 1
 
 # Python's TOML reader takes time and memory by the square of what it reads, or worse.
 LARGEST_FILE = 1_000_000  # bytes

@@ -9,10 +9,10 @@ import click
 from rich.console import Console
 from rich.markup import escape
 
-from bwbayes.app.config.config import Config, load
 from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
+    from bwbayes.app.config.config import Config
     from bwbayes.app.config.proposal import Proposal
 
 __all__ = ["config_or_proposal", "init"]
@@ -37,7 +37,7 @@ def init(record: Path, units: tuple[str, ...], out: Path | None) -> int:
 
     Example: bwbayes init my_record.csv --unit displacement=nm
     """
-    from bwbayes.app.config.proposal import propose  # noqa: PLC0415  # --help need not wait for scipy
+    from bwbayes.app.config.proposal import propose
 
     out = out or record.with_suffix(CONFIG)
     if out.exists():
@@ -66,11 +66,13 @@ def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> 
     InputError
         The file cannot be used; or, if that is to be refused, a fit of the record is pointless.
     """
-    from bwbayes.data.io.formats import SUFFIXES  # noqa: PLC0415  # --help need not wait for scipy
+    from bwbayes.data.io.formats import SUFFIXES
 
     if path.suffix.lower() not in SUFFIXES:
+        from bwbayes.app.config.config import load
+
         return load(path)
-    from bwbayes.app.config.proposal import propose  # noqa: PLC0415
+    from bwbayes.app.config.proposal import propose
 
     made = propose(path, path.parent)
     if refuse and made.pointless is not None:

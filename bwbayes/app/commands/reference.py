@@ -14,7 +14,7 @@ def config(key: str | None) -> int:
 
     Example: bwbayes config record.train
     """
-    from bwbayes.app.config.reference import config_reference  # noqa: PLC0415  # --help need not wait
+    from bwbayes.app.config.reference import config_reference
 
     click.echo(config_reference(key))
     return 0
@@ -27,7 +27,7 @@ def models(name: str | None) -> int:
 
     Example: bwbayes models prandtl-ishlinskii
     """
-    from bwbayes.app.config.reference import parts_reference  # noqa: PLC0415
+    from bwbayes.app.config.reference import parts_reference
 
     click.echo(parts_reference(name))
     return 0

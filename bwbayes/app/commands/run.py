@@ -1,0 +1,76 @@
+"""``bwbayes run`` and ``bwbayes resume``: sample a posterior, or go on with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import click
+from rich.console import Console
+
+from bwbayes.app.commands.init import config_or_proposal
+from bwbayes.app.commands.shared import FILE, finish, quiet_option, workers_option
+from bwbayes.app.config.limits import LARGEST_SEED
+from bwbayes.inference.engine import Engine
+
+__all__ = ["resume", "run"]
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@click.option("--record", type=FILE, help="Fit this record instead of the config's.")
+@click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
+@click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
+@click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
+@workers_option
+@quiet_option
+def run(
+    config: Path,
+    record: Path | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
+    workers: int | None,
+    quiet: bool,
+) -> int:
+    """Sample a posterior and predict, from a CONFIG in TOML, or from a record without one.
+
+    Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
+    """
+    from bwbayes.app.running.run import load_run, start
+    from bwbayes.app.screen import show_priors
+
+    wanted = config_or_proposal(config, Console(quiet=quiet))
+    if record is not None:
+        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
+        wanted = wanted.model_copy(update={"record": source})
+    if seed is not None:
+        wanted = wanted.model_copy(update={"seed": seed})
+    if wanted.name is None:
+        wanted = wanted.model_copy(update={"name": config.stem})
+    folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+    if not quiet:
+        show_priors(load_run(folder).posterior.prior, Console())
+    return finish(folder.path, workers, quiet)
+
+
+@click.command()
+@click.argument("folder", type=FILE)
+@click.option("--ess", type=click.FloatRange(1), help="A new target of effective draws.")
+@click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
+@click.option("--engine", type=click.Choice(get_args(Engine)), help="Go on with this engine.")
+@workers_option
+@quiet_option
+def resume(
+    folder: Path,
+    ess: float | None,
+    steps: int | None,
+    engine: Engine | None,
+    workers: int | None,
+    quiet: bool,
+) -> int:
+    """Go on with the run in FOLDER, interrupted or short of its target.
+
+    Example: bwbayes resume results/ring_bender --steps 40000
+    """
+    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine)

@@ -1,0 +1,78 @@
+"""What several commands share: options, exit statuses, and one way to say that a run has ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from bwbayes.inference.engine import Engine
+
+__all__ = [
+    "BAD_INPUT",
+    "DOES_NOT_HOLD",
+    "FILE",
+    "INTERRUPTED",
+    "NOT_CONVERGED",
+    "finish",
+    "overwrite_option",
+    "quiet_option",
+    "workers_option",
+]
+
+BAD_INPUT = 2
+DOES_NOT_HOLD = 3
+NOT_CONVERGED = 4
+INTERRUPTED = 130
+
+FILE = click.Path(path_type=Path)
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), help="Ensembles side by side; default: all cores."
+)
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace files that are there already."
+)
+quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+
+
+def finish(
+    path: Path,
+    workers: int | None,
+    quiet: bool,
+    *,
+    ess: float | None = None,
+    steps: int | None = None,
+    engine: Engine | None = None,
+) -> int:
+    """Sample the run in a folder to its end, say how it went, and return the exit status."""
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.run import carry_on, going_on, load_run
+    from bwbayes.app.screen import show_result
+
+    folder = RunFolder.open(path)
+    console = Console(stderr=True, quiet=quiet)
+    try:
+        result = carry_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
+        return INTERRUPTED
+    if not quiet:
+        show_result(result, folder, Console())
+    if result.failed:
+        first, *others = result.failed
+        more = f", and {len(others)} more" if others else ""
+        # The screen begins with all of them.
+        said = first.line if quiet else f"{first.name}{more}"
+        click.echo(f"DOES NOT HOLD: {said}; see {path}/report.html", err=True)
+        return DOES_NOT_HOLD
+    if result.outcome.converged:
+        return 0
+    click.echo(
+        f"NOT CONVERGED: {result.outcome.stop_reason}; no interval is given. Go on with "
+        f"`{going_on(path, load_run(folder))}`, and look at the traces in {path}/report.html",
+        err=True,
+    )
+    return NOT_CONVERGED

@@ -1,0 +1,99 @@
+"""``bwbayes predict``: displacement bands of a finished run for another record or voltage.
+
+Three files come of it: the bands (CSV), and beside them under the same name their scores and
+verdict (JSON) and a picture (PNG). No file is replaced unless that is asked for.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.figures import save_one
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.predictions import predict_another
+from bwbayes.app.running.run import finished
+from bwbayes.app.screen import show_scores, show_verdicts
+from bwbayes.data import Record
+from bwbayes.data.waveforms import signal
+from bwbayes.errors import InputError
+from bwbayes.results.outputs import write_bands, write_summary
+from bwbayes.results.prediction import Start
+from bwbayes.sampling.sampler import draws
+
+__all__ = ["DOES_NOT_HOLD", "predict"]
+
+DOES_NOT_HOLD = 3
+NOT_CONVERGED = 4
+
+
+def predict(
+    path: Path,
+    record: Path | None,
+    waveform: str | None,
+    start: Start,
+    out: Path | None,
+    console: Console,
+    *,
+    window: tuple[float, float] | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Predict a record or a signal, write and show what came of it; return the exit status.
+
+    Raises
+    ------
+    InputError
+        No such run, a record that cannot be used, or a file that is there already.
+    """
+    folder = RunFolder.open(path)
+    name = record.stem if record is not None else str(waveform)
+    table = out or folder.path / "predictions" / f"{name}.csv"
+    numbers, picture = table.with_suffix(".json"), table.with_suffix(".png")
+    if table in (numbers, picture):
+        raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
+    for target in (table, numbers, picture):
+        if target.exists() and not overwrite:
+            raise InputError(f"{target}: exists; choose another name, or give --overwrite")
+    problem, chain, outcome = finished(folder)
+    if not outcome.converged:
+        click.echo(
+            f"NOT CONVERGED: {path} gives no interval; go on with `bwbayes resume {path}`", err=True
+        )
+        return NOT_CONVERGED
+    other = _record(problem, record, waveform)
+    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    bands = predict_another(problem, flat, other, start, name, window)
+    scores, verdict = bands.scores, bands.verdict
+    if verdict is not None:
+        show_verdicts([verdict], console)
+    for remark in bands.remarks:
+        click.echo(f"bwbayes: {name}: {remark}", err=True)
+    try:
+        table.parent.mkdir(parents=True, exist_ok=True)
+        write_bands(table, [bands])
+        write_summary(numbers, bands.numbers())
+        save_one(bands.plot(), picture)
+    except OSError as error:
+        raise InputError(f"{table}: {error.strerror}; choose another place with --out") from None
+    if scores is not None and verdict is not None:
+        show_scores({name: scores}, console, {name: verdict})
+    for target in (table, numbers, picture):
+        console.print(f"wrote {target}", highlight=False, soft_wrap=True)
+    if verdict is not None and verdict.holds is False:
+        click.echo(f"DOES NOT HOLD: {name}; see {picture}", err=True)
+        return DOES_NOT_HOLD
+    return 0
+
+
+def _record(problem: Problem, path: Path | None, waveform: str | None) -> Record:
+    """Read the record, or sample the signal as the training record was sampled."""
+    if path is not None:
+        return read_recognised(path)
+    assert waveform is not None
+    interval = problem.record.interval
+    _, voltage = signal(waveform).sample(1 / interval)
+    return Record(voltage, None, interval, origin=f"{waveform} signal")
