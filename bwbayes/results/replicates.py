@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from typing import NamedTuple, TypedDict
@@ -321,12 +321,7 @@ def _simulated(
 
 def _with_readings(posterior: Posterior, made: Mapping[str, Simulated]) -> Posterior:
     """Return a posterior with the readings of simulated records."""
-    datasets = []
-    for one in posterior.datasets:
-        displacement = made[one.name].record.displacement
-        assert displacement is not None
-        datasets.append(replace(one, displacement=displacement))
-    return replace(posterior, datasets=tuple(datasets))
+    return posterior.with_readings({name: one.reading for name, one in made.items()})
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:

@@ -52,7 +52,8 @@ class Result:
     verdicts
         Whether the bands hold, by their name, for those with a measurement.
     innovations
-        What each fitted reading brings anew, at the most probable draw; None unless converged.
+        What each fitted reading brings anew, at the most probable draw, by the record; empty unless
+        converged.
     loops
         The loops of the actuator, measured; None unless converged.
     steps
@@ -75,7 +76,7 @@ class Result:
     bands: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
-    innovations: Innovations | None = None
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -130,8 +131,10 @@ def summary(result: Result) -> dict[str, object]:
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
-        if result.innovations is not None:
-            known["innovations"] = innovations.numbers(result.innovations)
+        every = {name: innovations.numbers(one) for name, one in result.innovations.items()}
+        if every:
+            # Those of one record stand alone, those of several by their names.
+            known["innovations"] = every if len(every) > 1 else next(iter(every.values()))
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
         known["step_responses"] = steps.numbers(result.steps)

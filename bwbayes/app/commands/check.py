@@ -26,7 +26,6 @@ def check(config: Path, record: Path | None, out: Path | None) -> int:
 
     wanted = config_or_proposal(config, Console(quiet=True), refuse=False)
     if record is not None:
-        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        wanted = wanted.model_copy(update={"record": source})
+        wanted = wanted.with_record(record)
     look(wanted, config.parent, out or Path("results") / f"{config.stem}-check", Console())
     return 0

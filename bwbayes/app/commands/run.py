@@ -42,8 +42,7 @@ def run(
 
     wanted = config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
-        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        wanted = wanted.model_copy(update={"record": source})
+        wanted = wanted.with_record(record)
     if seed is not None:
         wanted = wanted.model_copy(update={"seed": seed})
     if wanted.name is None:

@@ -34,8 +34,9 @@ def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
     ``loop``, ``loops``, ``steps``, ``bands_NAME`` for each of the result's bands, ``coverage``,
-    ``innovations``, ``corner``, ``trace`` and ``ranks``. Without convergence only the last two;
-    without bands or a measurement to hold them against, what needs them is left out.
+    ``innovations`` (of several records ``innovations_NAME``), ``corner``, ``trace`` and ``ranks``.
+    Without convergence only the last two; without bands or a measurement to hold them against,
+    what needs them is left out.
     """
     figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
@@ -51,8 +52,11 @@ def draw_all(result: Result) -> dict[str, Figure]:
             figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
             if result.scores:
                 figures["coverage"] = draw_coverage(result.bands, result.scores)
-            if result.innovations is not None:
-                figures["innovations"] = draw_innovations(result.innovations)
+            for name, innovations in result.innovations.items():
+                several = len(result.innovations) > 1
+                figures[f"innovations_{name}" if several else "innovations"] = draw_innovations(
+                    innovations
+                )
             figures["corner"] = draw_corner(result)
         figures["trace"] = draw_trace(result)
         figures["ranks"] = draw_ranks(result)

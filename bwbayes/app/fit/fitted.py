@@ -44,7 +44,7 @@ from bwbayes.app.screen import (
     show_result,
 )
 from bwbayes.data import Record
-from bwbayes.errors import InputWarning, NotConvergedError
+from bwbayes.errors import InputError, InputWarning, NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -125,7 +125,7 @@ class Fit:
         Its attribute ``converged`` is 1 or 0.
         """
         density = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, density, self.problem.record)
+        return posterior_tree(self.result, density, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -169,22 +169,26 @@ class Fit:
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted, and where there is no reading.
+        nan where nothing was predicted, and where there is no reading. Those of several records
+        are those of their bands: ``fit.bands["step_10"].residuals``.
 
         Raises
         ------
         NotConvergedError
             The sampling has not converged.
+        InputError
+            Several records were fitted.
         """
         import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
 
+        if len(self.problem.records) > 1:
+            raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
         record = self.problem.record
         values = np.full(record.samples, np.nan)
-        for name, bands in self.bands.items():
-            other = self.problem.validations.get(name)
-            if other is None or other.window is not None:
-                first = round((float(bands.time[0]) - record.start) / record.interval)
-                values[first : first + bands.time.size] = bands.residuals
+        for name in self.problem.windows("record"):
+            bands = self.bands[name]
+            first = round((float(bands.time[0]) - record.start) / record.interval)
+            values[first : first + bands.time.size] = bands.residuals
         time = ("time", record.time, {"units": "s"})
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
