@@ -14,7 +14,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import innovations, loops, steps
+from bwbayes.results import agreement, innovations, loops, steps
+from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.loops import Loops
@@ -59,6 +60,8 @@ class Result:
     steps
         The responses to the steps among the records that were predicted, by name; empty unless
         converged.
+    agreement
+        Of several records, how each agrees with the others, by name; empty unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -79,6 +82,7 @@ class Result:
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
+    agreement: Mapping[str, Agreement] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -103,7 +107,7 @@ def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
     ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
-    None unless the sampling has converged.
+    None unless the sampling has converged; ``agreement`` is there for several records alone.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -135,6 +139,8 @@ def summary(result: Result) -> dict[str, object]:
         if every:
             # Those of one record stand alone, those of several by their names.
             known["innovations"] = every if len(every) > 1 else next(iter(every.values()))
+        if result.agreement:
+            known["agreement"] = agreement.numbers(result.agreement)
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
         known["step_responses"] = steps.numbers(result.steps)

@@ -16,6 +16,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bwbayes.app.figures.agreement import draw_agreement
 from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.innovations import draw_innovations
@@ -33,7 +34,8 @@ __all__ = ["draw_all", "draw_alone", "save", "save_one"]
 def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
-    ``loop``, ``loops``, ``steps``, ``bands_NAME`` for each of the result's bands, ``coverage``,
+    ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME`` for each of
+    the result's bands, ``coverage``,
     ``innovations`` (of several records ``innovations_NAME``), ``corner``, ``trace`` and ``ranks``.
     Without convergence only the last two; without bands or a measurement to hold them against,
     what needs them is left out.
@@ -45,6 +47,8 @@ def draw_all(result: Result) -> dict[str, Figure]:
             looped = [bands for bands in result.bands if bands.name not in result.steps]
             if looped:
                 figures["loop"] = draw_loop(looped)
+            if result.agreement:
+                figures["agreement"] = draw_agreement(result.agreement)
             if result.loops is not None:
                 figures["loops"] = draw_loops(result.loops)
             if result.steps:

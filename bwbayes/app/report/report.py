@@ -41,6 +41,12 @@ CAPTIONS = {
         "Displacement against voltage; below, the marked tip enlarged. The sensor band is where "
         "new readings lie, the parameter band where the model lies.",
     ),
+    "agreement": (
+        "Do the records agree?",
+        "What each record's readings are off the joint fit, and off a fit of that record alone. "
+        "The chi-square compares where both fits have the shared parameters with how far apart "
+        "chance may put them.",
+    ),
     "loops": (
         "Major loop, minor loop and initial curve",
         "The model driven slowly, without dynamics, creep and offset. Left: displacement against "

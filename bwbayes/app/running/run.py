@@ -36,7 +36,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import conflict, pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results import identifiability, innovations
+from bwbayes.results import agreement, identifiability, innovations
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import thinned
@@ -310,6 +310,10 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         )
         for name, record in problem.records.items()
     }
+    begin = {name: record.start for name, record in problem.records.items()}
+    compared = agreement.agreements(
+        posterior, chain.point, generator(problem.config.seed, "agreement"), begin
+    )
     several = len(problem.records) > 1
     odd = [
         f"{name}: {remark}" if several else remark
@@ -329,7 +333,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         innovations=found,
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, stepped(problem)),
-        remarks=(*result.remarks, *odd),
+        agreement=compared,
+        remarks=(*result.remarks, *agreement.remarks(compared), *odd),
     )
 
 
