@@ -24,6 +24,7 @@ LAYERS = (
     ("bwbayes.inference",),
     ("bwbayes.sampling",),
     ("bwbayes.results",),
+    ("bwbayes.comparison",),
     ("bwbayes.app",),
 )
 
