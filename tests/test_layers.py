@@ -25,6 +25,7 @@ LAYERS = (
     ("bwbayes.sampling",),
     ("bwbayes.results",),
     ("bwbayes.comparison",),
+    ("bwbayes.population",),
     ("bwbayes.app",),
 )
 
@@ -34,7 +35,12 @@ KEEPERS = {
     "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_stats": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_stats": (
+        "bwbayes.sampling.diagnostics",
+        "bwbayes.results.*",
+        "bwbayes.population.population",
+        "bwbayes.app.*",
+    ),
     "matplotlib": (
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",

@@ -11,7 +11,7 @@ made; :mod:`bwbayes.results.calibration` judges many of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -30,7 +30,16 @@ from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
 
-__all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
+__all__ = [
+    "EXTRA",
+    "RANKED",
+    "Entry",
+    "Experiment",
+    "Replicate",
+    "as_done",
+    "replicate",
+    "replicates",
+]
 
 # Draws that a truth is ranked among.
 RANKED = 199
@@ -246,11 +255,26 @@ def replicates(
     Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
     be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
     """
-    waiting = iter(numbers)
-    running: set[Future[Replicate]] = set()
+    return as_done(
+        executor, together, replicate, ((experiment, seed, number) for number in numbers)
+    )
+
+
+def as_done[T](
+    executor: Executor,
+    together: int,
+    call: Callable[..., T],
+    arguments: Iterable[tuple[object, ...]],
+) -> Iterator[T]:
+    """Call a function with each of the arguments, and yield each result as soon as it is there.
+
+    Only so many ``together`` are under way, so that whoever stops waits for those alone.
+    """
+    waiting = iter(arguments)
+    running: set[Future[T]] = set()
     while True:
-        for number in islice(waiting, together - len(running)):
-            running.add(executor.submit(replicate, experiment, seed, number))
+        for each in islice(waiting, together - len(running)):
+            running.add(executor.submit(call, *each))
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)

@@ -15,6 +15,7 @@ from concurrent.futures import BrokenExecutor
 import click
 
 from bwbayes.app.commands.calibrate import calibrate
+from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -47,6 +48,7 @@ for command in (
     report,
     simulate,
     calibrate,
+    campaign,
     config,
     models,
 ):

@@ -57,6 +57,7 @@ __all__ = [
     "go_on",
     "judged",
     "load_run",
+    "numbers_of",
     "predictions",
     "redraw",
     "start",
@@ -357,15 +358,22 @@ def going_on(path: Path, problem: Problem) -> str:
     return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
-def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
-    numbers = summary(result) | {
+def numbers_of(
+    folder: RunFolder, problem: Problem, result: Result, seconds: float
+) -> dict[str, object]:
+    """Return a run's numbers as its summary holds them."""
+    return summary(result) | {
         "seed": problem.config.seed,
         "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
+
+
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.record)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
