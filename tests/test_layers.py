@@ -24,6 +24,7 @@ LAYERS = (
     ("bwbayes.inference",),
     ("bwbayes.sampling",),
     ("bwbayes.results",),
+    ("bwbayes.control",),
     ("bwbayes.app",),
 )
 
@@ -42,7 +43,7 @@ KEEPERS = {
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
-    "jinja2": ("bwbayes.app.*",),
+    "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),
     "pydantic": ("bwbayes.app.*",),
     "tomlkit": ("bwbayes.app.*",),
 }
