@@ -17,6 +17,7 @@ import click
 from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
+from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
 from bwbayes.app.commands.reference import config, models
@@ -49,6 +50,7 @@ for command in (
     simulate,
     calibrate,
     campaign,
+    export,
     config,
     models,
 ):

@@ -35,6 +35,7 @@ from bwbayes.results.replicates import as_done
 
 __all__ = ["carry_on", "config_text", "start"]
 
+
 def config_text(path: Path) -> str:
     """Return the config of all records as TOML, every default explicit.
 
@@ -89,15 +90,11 @@ def start(
         No records, or a folder of something else.
     """
     records_in(records)
-    origin = Origin(
-        records=str(records.absolute()), where=str(where.absolute()), pictures=pictures
-    )
+    origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
-def carry_on(
-    folder: CampaignFolder, console: Console, *, workers: int | None = None
-) -> Campaign:
+def carry_on(folder: CampaignFolder, console: Console, *, workers: int | None = None) -> Campaign:
     """Fit the records that are missing, and write table and page over all.
 
     Parameters

@@ -1,0 +1,113 @@
+"""``bwbayes export``: the posterior's mean model for a controller, as JSON and as C.
+
+Two files come of it: ``model.json`` has the parts, all coefficients with units, and the linear part
+as matrices; ``actuator.c`` is the model and its inverse, one sample a call.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.problem.problem import Problem
+from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import Exported, exported
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Hold
+
+__all__ = ["at_rate", "export", "exported_of", "write"]
+
+# Fastest sampling of a controller, Hz.
+LARGEST_RATE = 1e7
+
+
+def export(
+    path: Path,
+    out: Path | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+    rate: float | None = None,
+    hold: Hold | None = None,
+    overwrite: bool = False,
+) -> tuple[Exported, list[Path]]:
+    """Write the mean model of the run in a folder; return it, and what was written.
+
+    Parameters
+    ----------
+    path
+        The run's folder.
+    out
+        Where the files go; by default ``export`` in it.
+    limits
+        Voltages that the inverse may give, V; by default those of the record.
+    rate
+        The controller's samples a second; by default the record's.
+    hold
+        What the voltage does between samples; by default as in the record.
+    overwrite
+        Whether files may be replaced.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        No such run, options that make no sense, or files that exist or cannot be written.
+    """
+    problem, flat = drawn(path)
+    made = exported_of(problem, flat, limits, rate, hold)
+    return made, write(made, out or path / "export", overwrite=overwrite)
+
+
+def exported_of(
+    problem: Problem,
+    flat: FloatArray,
+    limits: tuple[float, float] | None = None,
+    rate: float | None = None,
+    hold: Hold | None = None,
+) -> Exported:
+    """Return the mean model of draws (draws, free), as :func:`export` does."""
+    posterior = problem.posterior
+    theta = posterior.table.actuator(posterior.prior.theta(flat))
+    actuator = at_rate(posterior.actuator, rate, hold)
+    sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
+    name = problem.config.name or problem.record.origin
+    span = limits_of(problem, limits)
+    return exported(name, actuator, theta.mean(axis=0), span, sds)
+
+
+def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuator:
+    """Return an actuator at a controller's pace: so many samples a second, with this hold.
+
+    Raises
+    ------
+    InputError
+        A rate that is none.
+    """
+    if rate is not None and not 0 < rate <= LARGEST_RATE:
+        raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")
+    interval = actuator.interval if rate is None else 1 / rate
+    return replace(actuator, interval=interval, hold=hold or actuator.hold)
+
+
+def write(made: Exported, folder: Path, *, overwrite: bool = False) -> list[Path]:
+    """Write the files of a model that is ready for a controller, and return them.
+
+    Raises
+    ------
+    InputError
+        They exist, or cannot be written.
+    """
+    numbers, code = folder / "model.json", folder / "actuator.c"
+    refuse_existing([numbers, code], overwrite)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(made.numbers(), indent=2, allow_nan=False)
+        numbers.write_text(f"{text}\n", encoding="utf-8")
+        code.write_text(made.c_code(), encoding="ascii")
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; choose another place with --out") from None
+    return [numbers, code]
