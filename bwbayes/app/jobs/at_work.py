@@ -1,4 +1,4 @@
-"""A finished run to be put to work: its problem and its draws, refused where it has not converged."""
+"""A finished run to be put to work: its problem and its draws, or why it cannot be."""
 
 from __future__ import annotations
 
