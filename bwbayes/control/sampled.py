@@ -109,7 +109,7 @@ class SampledModel:
     @property
     def models(self) -> int:
         """How many there are."""
-        return self.sections.gains.shape[0]
+        return int(self.sections.gains.shape[0])
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""

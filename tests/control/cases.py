@@ -66,7 +66,7 @@ def drive(samples: int = 3000, interval: float = 1e-3) -> FloatArray:
     """Return a voltage (samples,) with sines, small loops, jumps and rests, within the span."""
     generator = np.random.default_rng(5)
     time = interval * np.arange(samples)
-    voltage = 60 * np.sin(2 * np.pi * 1.3 * time) + 25 * np.sin(2 * np.pi * 11 * time)
+    voltage: FloatArray = 60 * np.sin(2 * np.pi * 1.3 * time) + 25 * np.sin(2 * np.pi * 11 * time)
     voltage[samples // 2 : samples // 2 + 50] = 40.0
     jumps = generator.uniform(-95, 95, samples // 10)
     voltage[-2 * jumps.size :] = np.repeat(jumps, 2)

@@ -37,6 +37,11 @@ def of(name: str, hold: Hold, limits: Span = cases.SPAN) -> Exported:
     return exported(name, actuator, cases.theta(actuator, 1, name)[0], limits)
 
 
+def simulated(system: Any, drive: FloatArray) -> FloatArray:
+    """Return what scipy makes of a drive (samples, inputs), um."""
+    return np.asarray(dlsim(system, drive)[1])
+
+
 class Compiled:
     """The C file as functions of arrays."""
 
@@ -119,7 +124,7 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     drives = np.stack(inputs, axis=1)
     system = linear_part(actuator, theta[0])
     assert isinstance(system, StateSpace)
-    moved = dlsim(system, drives - drives[0])[1][:, 0]
+    moved = simulated(system, drives - drives[0])[:, 0]
     expected = actuator.displacement(theta, voltage, from_rest=True)[0]
     np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
 
@@ -127,7 +132,7 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
 @pytest.mark.parametrize(("hold", "method"), [("first", "foh"), ("zero", "zoh")])
 @pytest.mark.parametrize("dynamics", ["lag", "second-order"])
 def test_the_linear_part_is_scipys_own_discretisation(
-    dynamics: str, hold: Hold, method: str
+    dynamics: str, hold: Hold, method: Any
 ) -> None:
     """Compared by the response to an impulse; a lag's poles are slow enough for matrix exps."""
     actuator = Actuator(dynamics, hold, 1e-3)
@@ -142,11 +147,12 @@ def test_the_linear_part_is_scipys_own_discretisation(
     else:
         k = column["stiffness"][0]
         continuous = [1.0], [column["mass"][0] / k, column["damping"][0] / k, 1.0]
-    discrete = cont2discrete(tf2ss(*continuous), 1e-3, method)
+    system: Any = tf2ss(*continuous)
+    discrete = cont2discrete(system, 1e-3, method)
     impulse = np.zeros(200)
     impulse[3] = 1.0
-    expected = dlsim(discrete, impulse)[1]
-    got = dlsim(linear_part(actuator, theta[0]), impulse)[1]
+    expected = simulated(discrete, impulse)
+    got = simulated(linear_part(actuator, theta[0]), impulse)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
 
 

@@ -25,8 +25,7 @@ from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.plots import Plots
-from bwbayes.app.jobs.export import exported_of
-from bwbayes.app.jobs.export import write as write_export
+from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.report import template
 from bwbayes.app.running.folder import RunFolder
@@ -49,7 +48,6 @@ from bwbayes.control.exported import Exported
 from bwbayes.data import Record
 from bwbayes.errors import InputWarning, NotConvergedError
 from bwbayes.inference.engine import Engine
-from bwbayes.model.linear import Hold
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
@@ -252,31 +250,15 @@ class Fit:
             warn([made.verdict.line], 3)
         return made
 
-    def export(
-        self,
-        folder: str | Path,
-        *,
-        limits: tuple[float, float] | None = None,
-        rate: float | None = None,
-        hold: Hold | None = None,
-        overwrite: bool = False,
-    ) -> Exported:
+    def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-        Parameters are as in :func:`bwbayes.app.jobs.export.export`. What is returned has the
-        ``linear`` part as a discrete ``scipy.signal`` system.
-
-        Raises
-        ------
-        NotConvergedError
-            The sampling has not converged.
-        InputError
-            A hysteresis that has no step of bounded time, or files that exist.
+        ``options`` (limits, rate, hold, overwrite) and errors are as of
+        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
+        discrete ``scipy.signal`` system.
         """
         draws = self._converged().flat_draws
-        made = exported_of(self.problem, draws, limits, rate, hold)
-        write_export(made, Path(folder), overwrite=overwrite)
-        return made
+        return export_draws(self.problem, draws, Path(folder), **options)[0]
 
     def resume(
         self,

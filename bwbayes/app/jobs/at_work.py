@@ -1,4 +1,4 @@
-"""A finished run to be put to work: its problem and its draws, or why it cannot be."""
+"""A finished run to be put to work: its problem, its draws, and the voltages that it may use."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
 from bwbayes.app.problem.problem import Problem
@@ -18,58 +19,58 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 
-__all__ = ["at_rate", "export", "exported_of", "write"]
+__all__ = ["at_rate", "export", "export_draws"]
 
 # Fastest sampling of a controller, Hz.
 LARGEST_RATE = 1e7
 
 
-def export(
-    path: Path,
-    out: Path | None = None,
+def export(path: Path, out: Path | None = None, **options: Any) -> tuple[Exported, list[Path]]:
+    """Write the mean model of the run in a folder, by default to ``export`` in it.
+
+    Options, errors and what is returned are as of :func:`export_draws`; a run that has not
+    converged is refused.
+    """
+    problem, flat = drawn(path)
+    return export_draws(problem, flat, out or path / "export", **options)
+
+
+def export_draws(
+    problem: Problem,
+    flat: FloatArray,
+    folder: Path,
     *,
     limits: tuple[float, float] | None = None,
     rate: float | None = None,
     hold: Hold | None = None,
     overwrite: bool = False,
 ) -> tuple[Exported, list[Path]]:
-    """Write the mean model of the run in a folder; return it, and what was written.
+    """Write the mean model of draws for a controller; return it, and the files.
 
     Parameters
     ----------
-    path
-        The run's folder.
-    out
-        Where the files go; by default ``export`` in it.
+    problem
+        What was fitted.
+    flat
+        Its draws, (draws, free), parameters in their own units.
+    folder
+        Where the files go.
     limits
         Voltages that the inverse may give, V; by default those of the record.
     rate
         The controller's samples a second; by default the record's.
     hold
-        What the voltage does between samples; by default as in the record.
+        ``"zero"`` if the voltage is held between samples, ``"first"`` if it goes straight; by
+        default as in the record.
     overwrite
         Whether files may be replaced.
 
     Raises
     ------
-    NotConvergedError
-        The sampling has not converged.
     InputError
-        No such run, options that make no sense, or files that exist or cannot be written.
+        A hysteresis that has no step of bounded time, options that make no sense, or files that
+        exist or cannot be written.
     """
-    problem, flat = drawn(path)
-    made = exported_of(problem, flat, limits, rate, hold)
-    return made, write(made, out or path / "export", overwrite=overwrite)
-
-
-def exported_of(
-    problem: Problem,
-    flat: FloatArray,
-    limits: tuple[float, float] | None = None,
-    rate: float | None = None,
-    hold: Hold | None = None,
-) -> Exported:
-    """Return the mean model of draws (draws, free), as :func:`export` does."""
     posterior = problem.posterior
     # Of several records the first: what belongs to a record matters little to a controller.
     one = posterior.datasets[0]
@@ -77,8 +78,8 @@ def exported_of(
     actuator = at_rate(one.actuator, rate, hold)
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    span = limits_of(problem, limits)
-    return exported(name, actuator, theta.mean(axis=0), span, sds)
+    made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, limits), sds)
+    return made, _written(made, folder, overwrite)
 
 
 def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuator:
@@ -95,14 +96,8 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuat
     return replace(actuator, interval=interval, hold=hold or actuator.hold)
 
 
-def write(made: Exported, folder: Path, *, overwrite: bool = False) -> list[Path]:
-    """Write the files of a model that is ready for a controller, and return them.
-
-    Raises
-    ------
-    InputError
-        They exist, or cannot be written.
-    """
+def _written(made: Exported, folder: Path, overwrite: bool) -> list[Path]:
+    """Write the two files, and return them."""
     numbers, code = folder / "model.json", folder / "actuator.c"
     refuse_existing([numbers, code], overwrite)
     try:
