@@ -12,7 +12,7 @@ from rich.table import Table
 
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
-from bwbayes.app.running.campaign_result import Campaign
+from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
@@ -170,7 +170,7 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     )
 
 
-def show_campaign(campaign: Campaign, folder: CampaignFolder, console: Console) -> None:
+def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Console) -> None:
     """Show the population and how many records ended in which way."""
     if campaign.population is not None:
         table = Table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")

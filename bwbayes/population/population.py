@@ -30,7 +30,7 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in
 from scipy import stats
 from scipy.special import logsumexp
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
 from bwbayes.population.specimen import Specimen, likelihoods, shared
@@ -199,15 +199,19 @@ def _spread(
     scale = np.exp if logarithmic else _same
     among = {}
     for i, (one, k, taken) in enumerate(zip(specimens, found.shapes, found.normal, strict=True)):
-        shrunk = np.quantile(found.shrunk[i], [0.025, 0.5, 0.975])
-        own = np.quantile(draws[i][0], [0.025, 0.5, 0.975])
+        lower, median, upper = scale(np.quantile(found.shrunk[i], [0.025, 0.5, 0.975])).tolist()
+        own = scale(np.quantile(draws[i][0], [0.025, 0.5, 0.975])).tolist()
         among[one.name] = Among(
-            *scale(shrunk).tolist(),
-            *scale(own).tolist(),
-            float(p[i]),
-            bool(p[i] * tests < FALSE_ALARM),
-            float(k),
-            bool(taken),
+            lower,
+            median,
+            upper,
+            own_lower=own[0],
+            own_median=own[1],
+            own_upper=own[2],
+            p=float(p[i]),
+            outlier=bool(p[i] * tests < FALSE_ALARM),
+            pareto_k=float(k),
+            normal=bool(taken),
         )
     new = found.mean + found.spread * generator.standard_normal(DRAWS)
     return Spread(
@@ -230,7 +234,7 @@ class _Reweighted:
     spread: FloatArray
     shrunk: FloatArray
     shapes: FloatArray
-    normal: FloatArray
+    normal: BoolArray
     pareto_k: float
 
 
@@ -270,7 +274,7 @@ def _reweighted(
 
 def _judged(
     draws: Sequence[tuple[FloatArray, FloatArray]], mean: float, spread: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, BoolArray]:
     """Pareto k of each specimen's draws reweighted to a typical population; and which fail."""
     shapes = np.empty(len(draws))
     effective = np.empty(len(draws))
@@ -283,7 +287,7 @@ def _judged(
 
 def _marginals(
     draws: Sequence[tuple[FloatArray, FloatArray]],
-    taken: FloatArray,
+    taken: BoolArray,
     normal: NormalLikelihoods,
     mean: FloatArray,
     spread: FloatArray,

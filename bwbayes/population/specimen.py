@@ -82,7 +82,7 @@ class Specimen:
     @classmethod
     def load(cls, name: str, path: Path) -> Specimen:
         """Read it back."""
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(path) as file:
             return cls(
                 name,
                 tuple(file["names"].tolist()),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.shared import FILE, INTERRUPTED, quiet_option
+from bwbayes.app.commands.shared import FILE, INTERRUPTED, executor_option, quiet_option
 from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ __all__ = ["campaign"]
 @click.option("--overwrite", is_flag=True, help="Replace a campaign that is there already.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
 @click.option("--workers", type=click.IntRange(1), help="Records side by side; default: cores.")
+@executor_option
 @quiet_option
 def campaign(
     folder: Path | None,
@@ -34,6 +35,7 @@ def campaign(
     overwrite: bool,
     no_pictures: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Fit every record of a FOLDER as a run does, and put them side by side.
@@ -52,7 +54,7 @@ def campaign(
     if begun is not None:
         if out is not None or config is not None or overwrite or no_pictures:
             raise InputError("campaign: --resume goes on as begun; leave the other options out")
-        return _carry_on(CampaignFolder.open(begun), workers, quiet)
+        return _carry_on(CampaignFolder.open(begun), workers, how, quiet)
     assert folder is not None
     text = "" if config is None else config_text(config)
     where = folder if config is None else config.parent
@@ -64,16 +66,16 @@ def campaign(
         pictures=not no_pictures,
         overwrite=overwrite,
     )
-    return _carry_on(made, workers, quiet)
+    return _carry_on(made, workers, how, quiet)
 
 
-def _carry_on(folder: CampaignFolder, workers: int | None, quiet: bool) -> int:
+def _carry_on(folder: CampaignFolder, workers: int | None, how: str | None, quiet: bool) -> int:
     from bwbayes.app.jobs.campaign import carry_on
     from bwbayes.app.screen import show_campaign
 
     console = Console(stderr=True, quiet=quiet)
     try:
-        ended = carry_on(folder, console, workers=workers)
+        ended = carry_on(folder, console, workers=workers, how=how)
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes campaign --resume {folder.path}`", err=True)
         return INTERRUPTED

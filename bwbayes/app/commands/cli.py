@@ -11,6 +11,7 @@ import signal
 import sys
 import warnings
 from concurrent.futures import BrokenExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 import click
 
@@ -81,8 +82,11 @@ def main() -> None:
         where = f"{error.filename}: " if error.filename else ""
         click.echo(f"bwbayes: {where}{error.strerror or error}; fix it and resume", err=True)
         status = BAD_INPUT
-    except BrokenExecutor:
-        click.echo("bwbayes: a worker process was ended; mind the memory, and resume", err=True)
+    except BrokenExecutor as error:
+        # Python's own says nothing of use.
+        said = "" if isinstance(error, BrokenProcessPool) else str(error)
+        said = said or "a worker process was ended; mind the memory, and resume"
+        click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:
         click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)

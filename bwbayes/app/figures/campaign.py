@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bwbayes.app.figures.style import BAND_COLOURS, COLOURS, STYLE, hide_unused, plain, unit_text
-from bwbayes.app.running.campaign_result import Campaign
+from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.population.population import Spread
 
 __all__ = ["draw_campaign"]
@@ -20,7 +23,7 @@ NAMED = 24
 OWN_COLOUR = "#999999"
 
 
-def draw_campaign(campaign: Campaign) -> dict[str, Figure]:
+def draw_campaign(campaign: CampaignResult) -> dict[str, Figure]:
     """Draw the figure ``parameters``, if any record has converged.
 
     A panel for each parameter: the records' 95 % intervals in the order of their names, grey alone
@@ -62,7 +65,7 @@ def _draw_population(panel: Axes, told: Spread) -> None:
 
 
 def _draw_record(
-    panel: Axes, place: int, one: dict[str, float], told: Spread | None, name: str
+    panel: Axes, place: int, one: Mapping[str, Any], told: Spread | None, name: str
 ) -> None:
     panel.vlines(place, one["lower_95"], one["upper_95"], color=OWN_COLOUR, lw=0.8)
     among = told.specimens.get(name) if told is not None else None

@@ -13,6 +13,7 @@ import os
 import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
 from rich.console import Console
@@ -23,10 +24,10 @@ from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.campaign_report import render
 from bwbayes.app.running.campaign_folder import CampaignFolder, Finished, Origin, records_in
-from bwbayes.app.running.campaign_result import Campaign, Row, summary, table
+from bwbayes.app.running.campaign_result import CampaignResult, Row, summary, table
 from bwbayes.app.running.one_record import SPECIMEN, Ended, Task, fit_one
 from bwbayes.app.running.progress import CampaignProgress
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.population.population import FEWEST, population
 from bwbayes.population.specimen import Specimen
@@ -94,7 +95,13 @@ def start(
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
-def carry_on(folder: CampaignFolder, console: Console, *, workers: int | None = None) -> Campaign:
+def carry_on(
+    folder: CampaignFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    how: str | Executor | None = None,
+) -> CampaignResult:
     """Fit the records that are missing, and write table and page over all.
 
     Parameters
@@ -106,6 +113,9 @@ def carry_on(folder: CampaignFolder, console: Console, *, workers: int | None = 
     workers
         Records side by side, in processes if more than one; by default as many as cores. The result
         does not depend on it.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`. The machines of a
+        cluster must all see the campaign's folder and that of the records by the same path.
 
     Raises
     ------
@@ -121,7 +131,7 @@ def carry_on(folder: CampaignFolder, console: Console, *, workers: int | None = 
         folder.summary.unlink(missing_ok=True)
         if missing:
             done = len(fitted) - len(missing)
-            refused |= _fit(folder, origin, missing, done, workers, console)
+            refused |= _fit(folder, origin, missing, done, workers, console, how)
         console.print("putting the records together ...", highlight=False)
         campaign = _together(folder, files, refused)
         _write(folder, campaign)
@@ -145,6 +155,7 @@ def _fit(
     done: int,
     workers: int | None,
     console: Console,
+    how: str | Executor | None,
 ) -> dict[str, str]:
     """Fit records side by side, note each that is done, and return the refusals by file name."""
     config = folder.config.read_text(encoding="utf-8")
@@ -163,11 +174,12 @@ def _fit(
     count = min(workers or os.cpu_count() or 1, len(tasks))
     refused: dict[str, str] = {}
     with (
-        executor(count) as pool,
+        executor(count, how=how) as pool,
         CampaignProgress(console, done, len(missing)) as progress,
     ):
         one: Ended
-        for one in as_done(pool, count, fit_one, ((task,) for task in tasks)):
+        together = side_by_side(pool, workers, len(tasks))
+        for one in as_done(pool, together, fit_one, ((task,) for task in tasks)):
             if one.refusal:
                 refused[names[one.name]] = one.refusal
             else:
@@ -178,18 +190,18 @@ def _fit(
 
 def _together(
     folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]
-) -> Campaign:
+) -> CampaignResult:
     """Read what the runs have left."""
     rows = [_row(folder, file, refused.get(file.name, "")) for file in files]
     specimens = [
         Specimen.load(row.name, folder.run(row.name) / SPECIMEN) for row in rows if row.parameters
     ]
     if len(specimens) < FEWEST:
-        return Campaign(tuple(rows), None, f"a population needs {FEWEST} records or more")
+        return CampaignResult(tuple(rows), None, f"a population needs {FEWEST} records or more")
     try:
-        return Campaign(tuple(rows), population(specimens, generator(1, "population")))
+        return CampaignResult(tuple(rows), population(specimens, generator(1, "population")))
     except InputError as error:
-        return Campaign(tuple(rows), None, str(error))
+        return CampaignResult(tuple(rows), None, str(error))
 
 
 def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
@@ -208,7 +220,7 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
     return Row(file.stem, file.name, "done", "", numbers)
 
 
-def _write(folder: CampaignFolder, campaign: Campaign) -> None:
+def _write(folder: CampaignFolder, campaign: CampaignResult) -> None:
     """Write the campaign's files; the summary last, as the sign that all is there.
 
     Nothing in them depends on when or how it was computed.

@@ -9,7 +9,7 @@ import numpy as np
 
 from bwbayes.app.figures.style import unit_text
 from bwbayes.app.report.report import digits, picture, template
-from bwbayes.app.running.campaign_result import Campaign, Row
+from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.arrays import FloatArray
 from bwbayes.population.population import Spread
 
@@ -25,7 +25,7 @@ CAPTIONS = {
 }
 
 
-def render(name: str, campaign: Campaign, pictures: Mapping[str, bytes]) -> str:
+def render(name: str, campaign: CampaignResult, pictures: Mapping[str, bytes]) -> str:
     """Return the page of a campaign of that name, with PNG files by the name of their figure."""
     told = campaign.population
     units: dict[str, str] = {}

@@ -231,7 +231,9 @@ class CampaignFolder:
 
 
 def records_in(folder: Path) -> list[Path]:
-    """Return the files of a folder that may be records, by name; hidden ones are none.
+    """Return the files of a folder that may be records, by name.
+
+    Hidden ones are none, nor is the truth (``NAME.truth.csv``) beside a simulated record.
 
     Raises
     ------
@@ -243,7 +245,9 @@ def records_in(folder: Path) -> list[Path]:
     files = [
         path
         for path in sorted(folder.iterdir())
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        if path.suffix.lower() in SUFFIXES
+        and not path.name.startswith(".")
+        and not path.stem.endswith(".truth")
     ]
     if not files:
         raise InputError(f"{folder}: has no record; records end in {', '.join(SUFFIXES)}")

@@ -15,7 +15,7 @@ from typing import Any
 
 from bwbayes.population.population import Among, Population
 
-__all__ = ["Campaign", "Row", "summary", "table"]
+__all__ = ["CampaignResult", "Row", "summary", "table"]
 
 # How a record ended, in the order in which they matter, and the exit status of each.
 STATUSES = {"refused": 2, "not converged": 4, "does not hold": 3, "done": 0}
@@ -41,7 +41,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Campaign:
+class CampaignResult:
     """All records of a campaign, and their population if there are enough of them.
 
     ``untold`` says why there is none.
@@ -78,7 +78,7 @@ class Campaign:
         return self.population.parameters[parameter].specimens.get(record)
 
 
-def summary(campaign: Campaign) -> dict[str, object]:
+def summary(campaign: CampaignResult) -> dict[str, object]:
     """Return a campaign's numbers as ``campaign.json`` holds them."""
     told = campaign.population
     return {
@@ -91,8 +91,9 @@ def summary(campaign: Campaign) -> dict[str, object]:
     }
 
 
-def _numbers(campaign: Campaign, row: Row) -> dict[str, object]:
-    known = {key: row.numbers.get(key) for key in ("steps", "validation", "remarks", "data_sha256")}
+def _numbers(campaign: CampaignResult, row: Row) -> dict[str, object]:
+    kept = ("steps", "validation", "remarks", "data_sha256")
+    known = {key: row.numbers.get(key) for key in kept}
     parameters = {}
     for name, one in row.parameters.items():
         parameters[name] = dict(one)
@@ -115,7 +116,7 @@ def _numbers(campaign: Campaign, row: Row) -> dict[str, object]:
     } | known
 
 
-def table(campaign: Campaign) -> str:
+def table(campaign: CampaignResult) -> str:
     """Return the table as CSV: a line for each record, columns named ``QUANTITY_what_UNIT``."""
     units: dict[str, str] = {}
     for row in campaign.rows:

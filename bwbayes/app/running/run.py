@@ -12,6 +12,7 @@ import platform
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -105,9 +106,12 @@ def carry_on(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: str | Executor | None = None,
 ) -> Result:
     """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
-    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+    return go_on(
+        folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+    ).result
 
 
 def go_on(
@@ -119,6 +123,7 @@ def go_on(
     steps: int | None = None,
     engine: Engine | None = None,
     files: bool = True,
+    how: str | Executor | None = None,
 ) -> Run:
     """Do what is left of a run.
 
@@ -137,6 +142,8 @@ def go_on(
         here on not the same bits.
     files
         Write what a run leaves besides its config, records and chain.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -150,7 +157,7 @@ def go_on(
         problem = load_run(folder)
         with (
             _chain(folder, problem, console, engine) as chain,
-            executor(workers, problem.posterior.engine) as pool,
+            executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
             # It is written last, as the sign that all is there; now something is to come.
