@@ -16,6 +16,7 @@ import click
 
 from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.check import check
+from bwbayes.app.commands.compare import compare
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
 from bwbayes.app.commands.reference import config, models
@@ -47,6 +48,7 @@ for command in (
     report,
     simulate,
     calibrate,
+    compare,
     config,
     models,
 ):
