@@ -296,7 +296,8 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     if config:
         path = path.with_suffix(".toml")
         path.write_text('[record]\nfile = "mine.csv"\n[model]\ndynamics = "lag"\n')
-    done = command(name, path, *([] if name == "init" else ["--out", tmp_path / "out"]))
+    out: list[str | Path] = [] if name == "init" else ["--out", tmp_path / "out"]
+    done = command(name, path, *out)
     assert 0 == done.return_value
     assert 1 == done.output.count(remark), done.output
     if name == "run":
