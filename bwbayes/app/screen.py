@@ -38,6 +38,7 @@ __all__ = [
     "show_comparison",
     "show_loops",
     "show_priors",
+    "show_remarks",
     "show_result",
     "show_scores",
     "show_verdicts",
@@ -70,10 +71,15 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
         if result.loops is not None:
             show_loops(result.loops, console)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
-    for remark in result.remarks:
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    show_remarks(result.remarks, console)
     if folder is not None:
         console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_remarks(remarks: Iterable[str], console: Console) -> None:
+    """Show what a user should know, a line for each."""
+    for remark in remarks:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
@@ -203,6 +209,8 @@ def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Con
         highlight=False,
         soft_wrap=True,
     )
+
+
 def show_comparison(comparison: Comparison, folder: Path | None, console: Console) -> None:
     """Show what is recommended, what speaks against it, and the models' numbers."""
     first, *others = comparison.lines
