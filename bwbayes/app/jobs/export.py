@@ -72,8 +72,10 @@ def export_draws(
         exist or cannot be written.
     """
     posterior = problem.posterior
-    theta = posterior.table.actuator(posterior.prior.theta(flat))
-    actuator = at_rate(posterior.actuator, rate, hold)
+    # Of several records the first: what belongs to a record matters little to a controller.
+    one = posterior.datasets[0]
+    theta = one.table.actuator(posterior.table.of(posterior.prior.theta(flat), one.name))
+    actuator = at_rate(one.actuator, rate, hold)
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
     made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, limits), sds)
