@@ -27,7 +27,7 @@ from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.run import (
