@@ -200,8 +200,10 @@ class _One:
         states = sections.begin(None) if self.state is None else self.state.filter
 
         def drive_of(what: FloatArray) -> FloatArray:
-            rest = float(what[0] if self.state is None else self.state.rest[0][0])
-            return rest + undone(dynamics, what - rest, states[0])
+            if self.state is None:
+                return what[0] + undone(dynamics, what - what[0])
+            rest = self.state.rest[0][0]
+            return np.asarray(rest + undone(dynamics, what - rest, states[0]))
 
         creep = self.actuator.creep
         if creep is None:
@@ -255,10 +257,10 @@ class _One:
             limit = whole
             # The first voltage of a record is not a step from anything.
             if first + done > 0 or self.state is not None:
-                limit = _Path(
-                    max(path.low, start - path.step), min(path.high, start + path.step)
-                )
-            part = self._stretch(joined[first + 1 : last + 1], float(here[-1]), start, memory, limit)
+                limit = _Path(max(path.low, start - path.step), min(path.high, start + path.step))
+            part = self._stretch(
+                joined[first + 1 : last + 1], float(here[-1]), start, memory, limit
+            )
             result[done + first : done + last] = part
             here, memory = self._along(part, memory)
             start = float(part[-1])
@@ -310,4 +312,3 @@ class _One:
         if s * off(far) < 0:
             return far
         return float(brentq(off, middle, far, xtol=1e-15 * max(abs(far), 1.0), rtol=1e-14))
-

@@ -25,7 +25,9 @@ from bwbayes.model.linear import Recursion
 __all__ = ["undone"]
 
 
-def undone(recursion: Recursion, displacement: FloatArray, state: FloatArray) -> FloatArray:
+def undone(
+    recursion: Recursion, displacement: FloatArray, state: FloatArray | None = None
+) -> FloatArray:
     """Return the drive (samples,), um, after which one model has this displacement.
 
     Parameters
@@ -35,22 +37,27 @@ def undone(recursion: Recursion, displacement: FloatArray, state: FloatArray) ->
     displacement
         (samples,), um, from rest.
     state
-        (1, taps - 1), that of the recursion before the first sample.
+        (1, taps - 1), that of the recursion before the first sample; by default a record starts
+        at rest, and its first drive is zero.
     """
     numerator, denominator = recursion.numerator[0], recursion.denominator[0]
-    free = np.zeros((1, displacement.size))
-    forced = displacement - recursion.run(free, state.copy())[0]
+    forced = displacement.copy()
+    if state is not None:
+        forced -= recursion.run(np.zeros((1, forced.size)), state.copy())[0]
     if numerator[0] == 0.0 and numerator.size > 1:
-        forced[0] = 0.0
+        # What the drive before the first sample, or at rest that of the first one, has settled.
+        forced[: 2 if state is None else 1] = 0.0
         later: FloatArray = lfilter(denominator, numerator[1:], forced)[1:]
         last = later[-1:] if later.size else np.zeros(1)
         return np.concatenate([later, last])
     zeros = np.roots(numerator)
     outside = zeros[np.abs(zeros) > 1]
     if not outside.size:
-        drive: FloatArray = lfilter(denominator, numerator, forced)
-        return drive
-    return _looking_ahead(numerator[0], zeros, denominator, forced)
+        return np.asarray(lfilter(denominator, numerator, forced))
+    drive = _looking_ahead(numerator[0], zeros, denominator, forced)
+    if state is None:
+        drive[0] = 0.0
+    return drive
 
 
 def _looking_ahead(
@@ -65,7 +72,4 @@ def _looking_ahead(
         end = drive[-1] / (1 - zero)
         before, _ = lfilter([-1 / zero], [1.0, -1 / zero], drive[:0:-1], zi=[end / zero])
         drive = np.concatenate([before[::-1], [end]])
-    result: FloatArray = drive.real.copy()
-    result[0] = 0.0
-    return result
-
+    return np.asarray(drive.real.copy())

@@ -63,7 +63,9 @@ def reached(
     s = 1.0 if edge >= start else -1.0
     here = float(along(np.array([start]))[0])
     goal = np.maximum.accumulate(np.maximum(s * (target - here), 0.0))
-    far, room = _far_enough(along, start, edge, s, min(first, abs(edge - start)), here + s * goal[-1])
+    far, room = _far_enough(
+        along, start, edge, s, min(first, abs(edge - start)), here + s * goal[-1]
+    )
     if room == 0.0:
         return np.full(target.shape, far)
     points = start + s * room * np.linspace(0.0, 1.0, GRID)
@@ -170,7 +172,5 @@ def travel(steepness: float, missing: float, rate: float, rise: FloatArray) -> F
         v = (goal + wrightomega(np.log(-part) - goal)) / rate
     for _ in range(POLISHED):
         gone = np.expm1(-rate * v)
-        v = v - (steepness * v + missing * gone / rate - rise) / (
-            steepness - missing * (1 + gone)
-        )
+        v = v - (steepness * v + missing * gone / rate - rise) / (steepness - missing * (1 + gone))
     return np.maximum(v, 0.0)

@@ -124,9 +124,7 @@ def relaxed(
         moved = travel(d, alpha - against * g, against, part)
         late = rise > part
         moved[late] = crossing + travel(d, alpha, ahead, rise[late] - part[late])
-    return np.clip(
-        memory.voltage + s * moved, min(edge, memory.voltage), max(edge, memory.voltage)
-    )
+    return np.clip(memory.voltage + s * moved, min(edge, memory.voltage), max(edge, memory.voltage))
 
 
 def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:

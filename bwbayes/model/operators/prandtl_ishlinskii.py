@@ -115,7 +115,6 @@ class PrandtlIshlinskii(RemembersExtrema):
 
         return everett
 
-
     def travels(self, column: Values) -> Callable[[FloatArray], FloatArray]:
         """Return the inverse of the loading curve, by Lambert's W."""
         steepest, alpha = float((column["d"] + column["alpha"])[0]), float(column["alpha"][0])
