@@ -24,7 +24,9 @@ LAYERS = (
     ("bwbayes.inference",),
     ("bwbayes.sampling",),
     ("bwbayes.results",),
+    ("bwbayes.comparison",),
     ("bwbayes.population",),
+    ("bwbayes.control",),
     ("bwbayes.app",),
 )
 
@@ -48,7 +50,7 @@ KEEPERS = {
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
-    "jinja2": ("bwbayes.app.*",),
+    "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),
     "pydantic": ("bwbayes.app.*",),
     "tomlkit": ("bwbayes.app.*",),
 }

@@ -112,7 +112,12 @@ def specimen_of(
         Chooses them, and draws of the prior.
     """
     prior = posterior.prior
-    own = set(posterior.actuator.parameters) & set(posterior.table.of_scope("actuator"))
+    table = posterior.table
+    own = {
+        column.name
+        for column in table.layout
+        if column.name in table.physical and column.declaration.scope == "actuator"
+    }
     columns = [i for i, p in enumerate(prior.free) if p.name in own]
     chosen = draws
     if len(draws) > DRAWS:

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.report import template
 from bwbayes.app.running.folder import RunFolder
@@ -43,6 +44,7 @@ from bwbayes.app.screen import (
     score_texts,
     show_result,
 )
+from bwbayes.control.exported import Exported
 from bwbayes.data import Record
 from bwbayes.errors import InputWarning, NotConvergedError
 from bwbayes.inference.engine import Engine
@@ -247,6 +249,16 @@ class Fit:
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
         return made
+
+    def export(self, folder: str | Path, **options: Any) -> Exported:
+        """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
+
+        ``options`` (limits, rate, hold, overwrite) and errors are as of
+        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
+        discrete ``scipy.signal`` system.
+        """
+        draws = self._converged().flat_draws
+        return export_draws(self.problem, draws, Path(folder), **options)[0]
 
     def resume(
         self,

@@ -283,7 +283,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *identifiability.remarks(posterior, chain.point, flat),
     ]
     columns = posterior.table.columns(posterior.prior.theta(flat))
-    remarks += posterior.actuator.hysteresis.remarks(columns, posterior.names)
+    remarks += posterior.only.actuator.hysteresis.remarks(columns, posterior.names)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
@@ -330,7 +330,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
     record, config = problem.record, problem.config
     windows = ", ".join(
-        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
+        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
+        for w in posterior.only.training
     )
     accepted = {
         phase: ", ".join(
