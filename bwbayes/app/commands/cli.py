@@ -18,8 +18,8 @@ import click
 from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
-from bwbayes.app.commands.export import export
 from bwbayes.app.commands.compare import compare
+from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
 from bwbayes.app.commands.reference import config, models
