@@ -53,7 +53,8 @@ def paired(one: FloatArray, other: FloatArray, generator: np.random.Generator) -
     generator
         Draws the blocks.
     """
-    series = one - other
+    with np.errstate(invalid="ignore"):
+        series = one - other
     if not np.isfinite(series).all():
         # A reading that one model holds for impossible settles it, unless both do.
         sides = np.isneginf(one).any(), np.isneginf(other).any()

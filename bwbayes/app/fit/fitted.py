@@ -24,6 +24,7 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.report import template
@@ -247,6 +248,26 @@ class Fit:
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
         return made
+
+    def compare(self, *others: Fit, future: bool = True, workers: int | None = None) -> Compared:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        Parameters
+        ----------
+        others
+            The other fits, of other models; the names are their configs'.
+        future
+            Whether to predict the later half of the training readings from the earlier ones too,
+            which takes short fits.
+        workers
+            Ensembles of those side by side.
+
+        Raises
+        ------
+        InputError
+            Fits of different readings.
+        """
+        return compared((self, *others), future=future, workers=workers)
 
     def resume(
         self,

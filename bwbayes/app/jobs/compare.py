@@ -45,7 +45,7 @@ from bwbayes.results.verdict import Background, assess
 from bwbayes.sampling.sampler import Outcome, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "write"]
+__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "require_same", "write"]
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,9 @@ def compare_models(
     for name, problem in problems.items():
         folder = _folder(out / slug(name), problem, overwrite)
         console.print(f"{name} ...", highlight=False)
-        run = go_on(folder, console, workers=workers)
-        runs.append(Fitted(name, run.problem, run.chain, run.outcome))
+        if not folder.summary.is_file():
+            go_on(folder, console, workers=workers)
+        runs.append(Fitted(name, *finished(folder)))
         require_same(runs[0], runs[-1])
     made = compare(runs, console, workers=workers, with_future=with_future)
     write(made, runs, out)
