@@ -25,6 +25,8 @@ LAYERS = (
     ("bwbayes.sampling",),
     ("bwbayes.results",),
     ("bwbayes.comparison",),
+    ("bwbayes.population",),
+    ("bwbayes.control",),
     ("bwbayes.app",),
 )
 
@@ -34,7 +36,12 @@ KEEPERS = {
     "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_stats": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_stats": (
+        "bwbayes.sampling.diagnostics",
+        "bwbayes.results.*",
+        "bwbayes.population.population",
+        "bwbayes.app.*",
+    ),
     "matplotlib": (
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",
@@ -43,7 +50,7 @@ KEEPERS = {
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
-    "jinja2": ("bwbayes.app.*",),
+    "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),
     "pydantic": ("bwbayes.app.*",),
     "tomlkit": ("bwbayes.app.*",),
 }

@@ -6,11 +6,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.comparison.choice import Comparison
 from bwbayes.comparison.table import COLUMNS as COMPARED
@@ -31,9 +34,11 @@ __all__ = [
     "parameter_rows",
     "score_texts",
     "show_calibration",
+    "show_campaign",
     "show_comparison",
     "show_loops",
     "show_priors",
+    "show_remarks",
     "show_result",
     "show_scores",
     "show_verdicts",
@@ -66,10 +71,15 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
         if result.loops is not None:
             show_loops(result.loops, console)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
-    for remark in result.remarks:
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    show_remarks(result.remarks, console)
     if folder is not None:
         console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_remarks(remarks: Iterable[str], console: Console) -> None:
+    """Show what a user should know, a line for each."""
+    for remark in remarks:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
@@ -170,6 +180,32 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     console.print(
         f"{calibration.replicates} replicates, {len(calibration.unconverged)} not converged\n"
         f"report: {folder.path / 'calibration.html'}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Console) -> None:
+    """Show the population and how many records ended in which way."""
+    if campaign.population is not None:
+        table = Table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")
+        for one in campaign.population.parameters.values():
+            low, high = np.quantile(one.new, [0.025, 0.975])
+            spread = float(np.median(one.spread))
+            table.add_row(
+                one.name,
+                one.unit,
+                f"{np.median(one.mean):.4g}",
+                f"{spread:.1%}" if one.logarithmic else f"{spread:.3g}",
+                f"{low:.4g} to {high:.4g}",
+                escape(", ".join(one.outliers)),
+            )
+        console.print(table)
+    else:
+        console.print(f"note: {escape(campaign.untold)}", highlight=False, soft_wrap=True)
+    ended = ", ".join(f"{count} {status}" for status, count in campaign.counts.items() if count)
+    console.print(
+        f"{len(campaign.rows)} records: {ended}\nreport: {folder.page}",
         highlight=False,
         soft_wrap=True,
     )

@@ -95,8 +95,8 @@ def choose(candidates: Sequence[Candidate], generator: np.random.Generator) -> C
     )
     measure = _measure(usable)
     if not usable:
-        lines = ("no model has converged, so none is recommended",)
-        return Comparison(tuple(candidates), measure, None, {}, None, (), lines, left_out)
+        none = ("no model has converged, so none is recommended",)
+        return Comparison(tuple(candidates), measure, None, {}, None, (), none, left_out)
     ordered = sorted(usable, key=lambda one: -_value(one, measure))
     best = ordered[0]
     differences = {one.name: _differences(one, best, generator) for one in ordered}

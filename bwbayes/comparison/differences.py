@@ -57,7 +57,7 @@ def paired(one: FloatArray, other: FloatArray, generator: np.random.Generator) -
         series = one - other
     if not np.isfinite(series).all():
         # A reading that one model holds for impossible settles it, unless both do.
-        sides = np.isneginf(one).any(), np.isneginf(other).any()
+        sides = bool(np.isneginf(one).any()), bool(np.isneginf(other).any())
         value = {(True, False): -np.inf, (False, True): np.inf}.get(sides, np.nan)
         return Difference(value, 0.0 if sides[0] != sides[1] else np.inf)
     block = block_length(series)

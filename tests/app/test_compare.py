@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def measured(alpha: float = 0.36) -> Record:
     return Record.from_arrays(voltage, displacement, interval=0.02)
 
 
-def fitted(record: Record, hysteresis: str, **keys: object) -> Fit:
+def fitted(record: Record, hysteresis: str, **keys: Any) -> Fit:
     keys = {"train": (0, 4), "validation": {"later": (4, 6)}} | keys
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # bands of a wrong model do not hold

@@ -46,7 +46,9 @@ def model(
     if log_evidence is not None:
         one = replace(one, evidence=Evidence(log_evidence, 0.02, 0.0, 1000.0))
     if future is not None:
-        one = replace(one, future=Future(future, np.arange(future.size), (0.3,), 1, True))
+        one = replace(
+            one, future=Future(future, np.arange(future.size, dtype=np.int64), (0.3,), 1, True)
+        )
     return one
 
 

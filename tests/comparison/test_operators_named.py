@@ -54,7 +54,7 @@ def voltage() -> FloatArray:
     size = 1 - 0.045 * time + 0.3 * np.sin(2 * np.pi * time / 11)
     drive = size * np.sin(2 * np.pi * 0.4 * time) + 0.2 * np.sin(2 * np.pi * 0.93 * time)
     drive *= 100 / np.max(np.abs(drive))
-    return cast(FloatArray, drive)
+    return drive
 
 
 def problem(record: Record, operator: str) -> Problem:
@@ -85,7 +85,7 @@ def simulated(operator: str, seed: int) -> Record:
     of = problem(typical, operator).posterior
     theta = of.prior.theta(of.prior.draw(source, 1))
     actuator = of.likelihood.actuator
-    clean = actuator.displacement(of.table.actuator(theta), drive, from_rest=True)[0]
+    clean = actuator.displacement(of.only.table.actuator(theta), drive, from_rest=True)[0]
     reading = clean + NOISE * np.ptp(clean) * source.normal(size=SAMPLES)
     return Record.from_arrays(drive, reading, interval=INTERVAL)
 
@@ -148,7 +148,7 @@ def test_a_bouc_wen_record_is_told_from_other_operators_and_from_none() -> None:
 
 def test_a_record_without_hysteresis_is_said_to_have_none() -> None:
     record = simulated("linear", 1)
-    assert isinstance(problem(record, "linear").posterior.actuator.hysteresis, NoHysteresis)
+    assert isinstance(problem(record, "linear").posterior.only.actuator.hysteresis, NoHysteresis)
     found = compared(record, ("bouc-wen", "linear"))
     assert found.recommended == "linear"
     assert any("no hysteresis" in line for line in found.lines)

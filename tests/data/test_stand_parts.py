@@ -59,7 +59,7 @@ def reproduced(problem: Problem) -> FloatArray:
     actuator = posterior.likelihood.actuator
     true = {"initial": 0.0} | truth
     theta = np.array([[true[name] for name in actuator.parameters]])
-    output = Amplifier().output(posterior.voltage, actuator.interval)
+    output = Amplifier().output(posterior.only.voltage, actuator.interval)
     from_rest = "initial" not in truth
     displacement: FloatArray = actuator.displacement(theta, output, from_rest=from_rest)[0]
     return displacement
@@ -94,7 +94,7 @@ def test_so_it_does_for_the_part_of_a_record_that_is_kept(tmp_path: Path) -> Non
     """Gain and creep count from the range of the voltage that is fitted."""
     parts = "dynamics = 'lag'\ngain = ['quadratic', 'cubic']\ncreep = true\ncreep_growth = true\n"
     problem = of(parts, parts, tmp_path, record="stop = 0.5\n")
-    assert problem.posterior.voltage.min() > -1
+    assert problem.posterior.only.voltage.min() > -1
     assert_reproduced(problem)
 
 

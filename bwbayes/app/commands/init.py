@@ -95,8 +95,9 @@ def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> 
 
 def _show(made: Proposal, console: Console) -> None:
     """Show what was said of the record, with what to do."""
-    for remark in made.remarks:
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    from bwbayes.app.screen import show_remarks
+
+    show_remarks(made.remarks, console)
     for one in made.findings:
         text = f"{one.kind}: {one.text}\n    what to do: {one.remedy}"
         console.print(escape(text), highlight=False, soft_wrap=True)

@@ -160,6 +160,13 @@ class RecordConfig(_Source):
             example="[3.105, 7.42]",
         ),
     ] = None
+    remarks: Annotated[
+        list[str] | None,
+        described(
+            "What was noted when the record's files were read; a run writes it and shows it again.",
+            example='["my_record.csv:1: ignored columns: temperature_C"]',
+        ),
+    ] = None
     decimate: Annotated[
         int, Field(ge=1), described("Every how many-th reading is used.", example="5")
     ] = 1

@@ -77,8 +77,18 @@ class Compared:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
-def compared(fits: Sequence[Fit], *, future: bool, workers: int | None) -> Compared:
+def compared(fits: Sequence[Fit], *, future: bool = True, workers: int | None = None) -> Compared:
     """Compare fits, named as their configs are, or by number where that is not enough.
+
+    Parameters
+    ----------
+    fits
+        Fits of the same readings, of different models.
+    future
+        Whether to predict the later half of the training readings from the earlier ones too, which
+        takes short fits.
+    workers
+        Ensembles of those side by side; by default one a core.
 
     Raises
     ------

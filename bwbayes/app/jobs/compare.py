@@ -174,7 +174,7 @@ def require_same(one: Fitted, other: Fitted) -> None:
             f"{pair}: fitted to different records, or in different units; compare fits of one "
             "record, with the same readings left out"
         )
-    if ours.posterior.training != theirs.posterior.training:
+    if ours.posterior.only.training != theirs.posterior.only.training:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
     held = [_held_out(problem) for problem in (ours, theirs)]
     if held[0] != held[1]:
@@ -225,8 +225,8 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         run.outcome.converged,
         run.outcome.stop_reason,
         posterior.prior.dimensions,
-        posterior.readings.rows.size,
-        not isinstance(posterior.actuator.hysteresis, NoHysteresis),
+        posterior.only.readings.rows.size,
+        not isinstance(posterior.only.actuator.hysteresis, NoHysteresis),
     )
     if not run.outcome.converged:
         return plain
