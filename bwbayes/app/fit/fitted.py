@@ -24,6 +24,7 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
@@ -249,6 +250,14 @@ class Fit:
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
         return made
+
+    def compare(self, *others: Fit, **options: Any) -> Compared:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        ``options`` (future, workers) and errors are as of
+        :func:`bwbayes.app.fit.compared.compared`.
+        """
+        return compared((self, *others), **options)
 
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
