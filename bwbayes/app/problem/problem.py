@@ -48,7 +48,7 @@ from bwbayes.inference.table import Table
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.sampler import SamplingPlan, best_together
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -349,6 +349,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
+        together=best_together(given.ensembles, walkers, posterior.readings.samples),
     )
 
 
