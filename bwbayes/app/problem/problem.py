@@ -28,15 +28,7 @@ from bwbayes.data import Record, Split, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Carrier,
-    Decay,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    signal,
-)
+from bwbayes.data.waveforms import Carrier, Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
