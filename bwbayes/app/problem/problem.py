@@ -23,15 +23,7 @@ from bwbayes.data import Record, Split, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Carrier,
-    Decay,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    signal,
-)
+from bwbayes.data.waveforms import Carrier, Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -43,7 +35,7 @@ from bwbayes.inference.table import Table
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.sampler import SamplingPlan, best_together
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -340,6 +332,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
+        together=best_together(given.ensembles, walkers, posterior.readings.samples),
     )
 
 
