@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
@@ -26,6 +29,7 @@ __all__ = [
     "parameter_rows",
     "score_texts",
     "show_calibration",
+    "show_campaign",
     "show_loops",
     "show_priors",
     "show_remarks",
@@ -167,6 +171,32 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     console.print(
         f"{calibration.replicates} replicates, {len(calibration.unconverged)} not converged\n"
         f"report: {folder.path / 'calibration.html'}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Console) -> None:
+    """Show the population and how many records ended in which way."""
+    if campaign.population is not None:
+        table = Table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")
+        for one in campaign.population.parameters.values():
+            low, high = np.quantile(one.new, [0.025, 0.975])
+            spread = float(np.median(one.spread))
+            table.add_row(
+                one.name,
+                one.unit,
+                f"{np.median(one.mean):.4g}",
+                f"{spread:.1%}" if one.logarithmic else f"{spread:.3g}",
+                f"{low:.4g} to {high:.4g}",
+                escape(", ".join(one.outliers)),
+            )
+        console.print(table)
+    else:
+        console.print(f"note: {escape(campaign.untold)}", highlight=False, soft_wrap=True)
+    ended = ", ".join(f"{count} {status}" for status, count in campaign.counts.items() if count)
+    console.print(
+        f"{len(campaign.rows)} records: {ended}\nreport: {folder.page}",
         highlight=False,
         soft_wrap=True,
     )

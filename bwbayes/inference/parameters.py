@@ -39,7 +39,8 @@ class Parameter:
     """One parameter: names for people, and a prior or a fixed value.
 
     ``lower`` and ``upper`` cut the prior; the bounds that its part ``declared`` hold besides.
-    ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures.
+    ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures. ``record``
+    is the one of several records that the parameter belongs to, empty if to all.
 
     Raises
     ------
@@ -56,6 +57,7 @@ class Parameter:
     lower: float = -np.inf
     upper: float = np.inf
     declared: Declaration | None = field(default=None, compare=False, repr=False)
+    record: str = ""
 
     @classmethod
     def of(cls, declared: Declaration, known: Distribution | float) -> Parameter:
@@ -81,6 +83,11 @@ class Parameter:
             raise InputError(f"{self.name}: fixed at {value:g}; must be {least} {self.floor:g}")
 
     @property
+    def plain(self) -> str:
+        """Its name without that of its record."""
+        return self.name if self.declared is None else self.declared.name
+
+    @property
     def floor(self) -> float:
         """What the parameter cannot be lower than."""
         return -np.inf if self.declared is None else self.declared.floor
@@ -96,7 +103,10 @@ class Parameter:
         return np.asarray(x >= self.floor if reaches else x > self.floor)
 
     def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Bounds (models,) given the values of other parameters; infinite without a constraint."""
+        """Bounds (models,) given the values of other parameters; infinite without a constraint.
+
+        By the names that the parts declare; see :meth:`JointPrior.seen`.
+        """
         if self.declared is None or self.declared.bounds is None:
             return np.asarray(-np.inf), np.asarray(np.inf)
         low, high = self.declared.bounds(values)
@@ -126,7 +136,7 @@ class JointPrior:
         All parameters of the model and the noise, in the order of θ's columns. Bounds depend on
         those that come before and on fixed ones.
     constraint
-        What must hold besides.
+        What must hold besides, in each of several records.
     """
 
     def __init__(
@@ -138,6 +148,11 @@ class JointPrior:
         self.free = tuple(p for p in self.parameters if p.fixed is None)
         self.free_names = tuple(p.name for p in self.free)
         self._fixed = {p.name: p.fixed for p in self.parameters if p.fixed is not None}
+        self.records = tuple(dict.fromkeys(p.record for p in self.parameters if p.record))
+        self._own = {
+            record: [(p.plain, p.name) for p in self.parameters if p.record == record]
+            for record in self.records
+        }
         # What the bounds of each parameter may know.
         self._known = {
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
@@ -151,13 +166,13 @@ class JointPrior:
             if parameter.fixed is None or parameter.declared is None:
                 continue
             others = {name: value for name, value in fixed.items() if name != parameter.name}
-            low, high = parameter.limits(others)
+            low, high = self._between(parameter, others)
             stated = parameter.declared.stated_bounds
             if stated and not (low <= parameter.fixed) & (parameter.fixed <= high):
                 raise InputError(
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
-        if self.constraint is not None and not np.all(self.constraint(fixed)):
+        if not np.all(self._possible(fixed)):
             raise InputError(f"priors: what is fixed must have {self._stated()}")
 
     def _stated(self) -> str:
@@ -187,8 +202,7 @@ class JointPrior:
             assert parameter.prior is not None
             result += parameter.prior.frozen.logpdf(values[parameter.name])
             inside &= self._inside(parameter, values)
-        if self.constraint is not None:
-            inside &= self.constraint(values)
+        inside &= self._possible(values)
         return np.where(inside, result, -np.inf)
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
@@ -240,8 +254,7 @@ class JointPrior:
             # Rounding may put a positive parameter on its open bound, where there is no model.
             room = room * np.where(parameter.above_floor(x), between, 0)
             values[parameter.name] = x
-        if self.constraint is not None:
-            room = np.where(self.constraint(values), room, 0)
+        room = np.where(self._possible(values), room, 0)
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
         log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
@@ -260,11 +273,46 @@ class JointPrior:
         if parameter.declared is None or parameter.declared.bounds is None:
             return low, high
         known = {name: values[name] for name in self._known[parameter.name]}
-        least, most = parameter.limits(known)
+        least, most = self._between(parameter, known)
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
         low = low if np.all(np.isneginf(least)) else np.maximum(low, least)
         high = high if np.all(np.isposinf(most)) else np.minimum(high, most)
         return low, high
+
+    def seen(self, values: Values, record: str) -> Values:
+        """Return values by the names that the parts declare, as one record has them.
+
+        ``values`` are by the parameters' names, and some may be missing; ``record`` is empty if
+        there is one alone.
+        """
+        if not record:
+            return values
+        mine = {plain: values[name] for plain, name in self._own[record] if name in values}
+        return {**values, **mine}
+
+    def _views(self, parameter: Parameter) -> tuple[str, ...]:
+        """Return the records whose values a parameter's bounds depend on; empty for any."""
+        if parameter.record or not self.records:
+            return (parameter.record,)
+        return self.records
+
+    def _between(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds (models,) that other values set; of several records, the tightest."""
+        if parameter.declared is None or parameter.declared.bounds is None:
+            return np.asarray(-np.inf), np.asarray(np.inf)
+        every = [parameter.limits(self.seen(values, one)) for one in self._views(parameter)]
+        low, high = every[0]
+        for least, most in every[1:]:
+            low, high = np.maximum(low, least), np.minimum(high, most)
+        return low, high
+
+    def _possible(self, values: Values) -> BoolArray:
+        """Tell which models (models,) meet the constraint."""
+        possible = np.asarray(True)
+        if self.constraint is not None:
+            for record in self.records or ("",):
+                possible = possible & self.constraint(self.seen(values, record))
+        return possible
 
     def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
         low, high = self._limits(parameter, values)

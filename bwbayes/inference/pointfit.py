@@ -112,19 +112,29 @@ class _LeastSquares:
 
     def __init__(self, posterior: Posterior, centre: FloatArray, spread: FloatArray) -> None:
         self.posterior, self.centre, self.spread = posterior, centre, spread
-        self.physical = np.array([n in posterior.actuator.parameters for n in posterior.names])
-        rows = posterior.readings.rows
-        self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
-        self.target = posterior.displacement[self.rows]
-        # A hundredth of the range is about what a Bouc-Wen model misses.
-        self.scale = 0.01 * float(np.ptp(self.target)) * np.sqrt(self.rows.size)
+        self.physical = np.array([n in posterior.table.physical for n in posterior.names])
+        most = RESIDUALS // len(posterior.datasets)
+        every = [one.readings.rows for one in posterior.datasets]
+        self.rows = [rows[:: max(rows.size // most, 1)] for rows in every]
+        total = sum(rows.size for rows in self.rows)
+        self.targets, self.scales = [], []
+        for one, rows in zip(posterior.datasets, self.rows, strict=True):
+            self.targets.append(one.displacement[rows])
+            # A hundredth of the range is about what a Bouc-Wen model misses.
+            self.scales.append(0.01 * float(np.ptp(self.targets[-1])) * np.sqrt(total))
 
     def residuals(self, coordinates: FloatArray) -> FloatArray:
         """Residuals (models, rows + physical) at coordinates (models, free)."""
         free, _ = self.posterior.prior.constrain(coordinates)
-        simulated = self.posterior.simulate(self.posterior.prior.theta(free), self.rows)
+        theta = self.posterior.prior.theta(free)
         pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
-        return np.concatenate([(simulated - self.target) / self.scale, 1e-2 * pull], axis=1)
+        missed = [
+            (self.posterior.simulate(theta, rows, one.name) - target) / scale
+            for one, rows, target, scale in zip(
+                self.posterior.datasets, self.rows, self.targets, self.scales, strict=True
+            )
+        ]
+        return np.concatenate([*missed, 1e-2 * pull], axis=1)
 
     def costs(self, coordinates: FloatArray) -> FloatArray:
         """Sum of squares (models,)."""

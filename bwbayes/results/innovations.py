@@ -108,19 +108,21 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
 
     ``begin`` is the time of the record's first sample, s.
     """
-    readings = posterior.readings
+    readings = posterior.only.readings
     theta = posterior.prior.theta(free[np.newaxis])
     simulated = posterior.simulate(theta, readings.rows)
     residual = readings.values - simulated
-    noise = posterior.table.noise(theta)
-    white, _ = posterior.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
-    interval = posterior.actuator.interval
+    noise = posterior.only.table.noise(theta)
+    white, _ = posterior.only.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
+    interval = posterior.only.actuator.interval
     # A measured voltage is noisy, and its change noisier: a five-hundredth of the record.
-    smooth = max(1, posterior.voltage.size // 500)
-    slow = ndimage.uniform_filter1d(posterior.voltage, smooth, mode="nearest")
+    smooth = max(1, posterior.only.voltage.size // 500)
+    slow = ndimage.uniform_filter1d(posterior.only.voltage, smooth, mode="nearest")
     rate = np.gradient(slow) / interval if slow.size > 1 else np.zeros_like(slow)
     time = begin + interval * readings.rows.astype(np.float64)
-    return Innovations(time, white[0, 0], posterior.voltage[readings.rows], rate[readings.rows])
+    return Innovations(
+        time, white[0, 0], posterior.only.voltage[readings.rows], rate[readings.rows]
+    )
 
 
 def remarks(found: Innovations) -> tuple[str, ...]:

@@ -157,7 +157,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     Parameters
     ----------
     posterior
-        The posterior that was sampled; its record's voltage gives the range.
+        The posterior that was sampled; its records' voltages give the range.
     draws
         (draws, free), parameters in their own units.
     points
@@ -168,9 +168,12 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     InputError
         A voltage that does not change, or an even number of points.
     """
-    actuator = posterior.actuator.within(posterior.voltage)
-    column = posterior.table.columns(posterior.prior.theta(draws))
-    span = Span(float(np.min(posterior.voltage)), float(np.max(posterior.voltage)))
+    _, alone, its = next(posterior.each(draws))
+    one = alone.only
+    actuator = one.actuator.within(one.voltage)
+    column = one.table.columns(alone.prior.theta(its))
+    every = [record.voltage for record in posterior.datasets]
+    span = Span(min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every))
     middle, half = span.middle, span.half
     voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
     return Loops(

@@ -93,7 +93,9 @@ def predict_windows(
     mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     bands = []
     for name, window in windows.items():
-        training = any(w.start < window.stop and window.start < w.stop for w in posterior.training)
+        training = any(
+            w.start < window.stop and window.start < w.stop for w in posterior.only.training
+        )
         bands.append(replace(_bands(name, mixed, record, window), training=training))
     return bands
 
@@ -180,7 +182,7 @@ def predict_record(
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    return _Draws(start, *posterior.noise.marginal_sd(posterior.table.noise(theta)))
+    return _Draws(start, *posterior.only.noise.marginal_sd(posterior.only.table.noise(theta)))
 
 
 def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:

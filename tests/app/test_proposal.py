@@ -114,7 +114,7 @@ def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:
     assert load(config) == made.config
     problem = resolve(load(config), path.parent)
     assert ["held_out"] == list(problem.validations)
-    assert problem.posterior.training == (slice(0, 450),)
+    assert problem.posterior.only.training == (slice(0, 450),)
     assert problem.validations["held_out"].window == slice(450, 600)
     assert problem.config.record.columns is None  # the run's own copy has the package's names
 

@@ -12,6 +12,7 @@ from bwbayes.app.commands.shared import (
     FILE,
     INTERRUPTED,
     NOT_CONVERGED,
+    executor_option,
     quiet_option,
 )
 from bwbayes.app.config.limits import LARGEST_SEED
@@ -36,6 +37,7 @@ REPLICATES = 500
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
 @click.option("--overwrite", is_flag=True, help="Replace a calibration that is there already.")
 @click.option("--workers", type=click.IntRange(1), help="Replicates side by side; default: cores.")
+@executor_option
 @quiet_option
 def calibrate(
     config: Path | None,
@@ -45,6 +47,7 @@ def calibrate(
     seed: int | None,
     overwrite: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
@@ -63,7 +66,7 @@ def calibrate(
     if begun is not None:
         if out is not None or seed is not None or overwrite:
             raise InputError("calibrate: --resume goes on as begun; leave the other options out")
-        return _calibrate(CalibrationFolder.open(begun), replicates, workers, quiet)
+        return _calibrate(CalibrationFolder.open(begun), replicates, workers, how, quiet)
     assert config is not None
     changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
     from bwbayes.app.config.config import load
@@ -72,18 +75,22 @@ def calibrate(
     wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
     where = out or Path("results") / f"{config.stem}-calibration"
     folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
-    return _calibrate(folder, None, workers, quiet)
+    return _calibrate(folder, None, workers, how, quiet)
 
 
 def _calibrate(
-    folder: CalibrationFolder, replicates: int | None, workers: int | None, quiet: bool
+    folder: CalibrationFolder,
+    replicates: int | None,
+    workers: int | None,
+    how: str | None,
+    quiet: bool,
 ) -> int:
     from bwbayes.app.jobs.calibrate import carry_on
     from bwbayes.app.screen import show_calibration
 
     console = Console(stderr=True, quiet=quiet)
     try:
-        calibration = carry_on(folder, console, workers=workers, count=replicates)
+        calibration = carry_on(folder, console, workers=workers, count=replicates, how=how)
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `{folder.GO_ON} {folder.path}`", err=True)
         return INTERRUPTED

@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from bwbayes.app.commands.init import config_or_proposal
-from bwbayes.app.commands.shared import FILE, finish, quiet_option, workers_option
+from bwbayes.app.commands.shared import FILE, executor_option, finish, quiet_option, workers_option
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.inference.engine import Engine
 
@@ -23,6 +23,7 @@ __all__ = ["resume", "run"]
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
 @click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
 @workers_option
+@executor_option
 @quiet_option
 def run(
     config: Path,
@@ -31,6 +32,7 @@ def run(
     seed: int | None,
     overwrite: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Sample a posterior and predict, from a CONFIG in TOML, or from a record without one.
@@ -55,7 +57,7 @@ def run(
         if config.suffix.lower() not in SUFFIXES:  # of a record alone they are shown already
             show_remarks(problem.remarks, Console())
         show_priors(problem.posterior.prior, Console())
-    return finish(folder.path, workers, quiet)
+    return finish(folder.path, workers, quiet, how=how)
 
 
 @click.command()
@@ -64,6 +66,7 @@ def run(
 @click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
 @click.option("--engine", type=click.Choice(get_args(Engine)), help="Go on with this engine.")
 @workers_option
+@executor_option
 @quiet_option
 def resume(
     folder: Path,
@@ -71,10 +74,11 @@ def resume(
     steps: int | None,
     engine: Engine | None,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Go on with the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine)
+    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine, how=how)

@@ -44,7 +44,7 @@ class Plots:
     def record(self, kind: str = "time") -> Figure:
         """Draw the training record: along "time", as a "loop", or its "drive"'s spectrum."""
         problem = self.problem
-        every = draw_record(problem.record, problem.posterior.training, problem.findings)
+        every = draw_record(problem.record, problem.posterior.only.training, problem.findings)
         return _named(every, kind)
 
     def loop(self, *names: str) -> Figure:

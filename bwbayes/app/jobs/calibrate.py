@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from hashlib import sha256
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from bwbayes.app.report.calibration_report import render
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import ReplicateProgress
 from bwbayes.app.running.run import versions
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.results.calibration import Calibration, judge, summary
 from bwbayes.results.outputs import write_summary
@@ -99,6 +100,7 @@ def carry_on(
     *,
     workers: int | None = None,
     count: int | None = None,
+    how: str | Executor | None = None,
 ) -> Calibration:
     """Make the missing replicates, judge all, and write the calibration's files.
 
@@ -113,6 +115,8 @@ def carry_on(
         result does not depend on it.
     count
         A new number of replicates, if given; none is thrown away.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -130,7 +134,7 @@ def carry_on(
         # What is written last is the sign that all is there; now something is to come.
         _clear(folder)
         if missing:
-            _make(folder, common, problem.config.seed, missing, entries, workers, console)
+            _make(folder, common, problem.config.seed, missing, entries, workers, console, how)
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         calibration = judge(ordered, generator(problem.config.seed, "ranks"))
@@ -151,16 +155,18 @@ def _make(
     entries: dict[int, Entry],
     workers: int | None,
     console: Console,
+    how: str | Executor | None,
 ) -> None:
     """Add the missing replicates to the entries, and write each as soon as it is there."""
     count = min(workers or os.cpu_count() or 1, len(missing))
     unconverged = sum(not entry["converged"] for entry in entries.values())
     # Processes, also for the compiled engine: most of a replicate's time goes into Python.
     with (
-        executor(count) as pool,
+        executor(count, how=how) as pool,
         ReplicateProgress(console, len(entries), len(missing), unconverged) as progress,
     ):
-        for made in replicates(common, seed, missing, pool, count):
+        together = side_by_side(pool, workers, len(missing))
+        for made in replicates(common, seed, missing, pool, together):
             entry = entries[made.number] = made.entry()
             _append(folder, json.dumps(entry).encode() + b"\n")
             progress(made.converged)

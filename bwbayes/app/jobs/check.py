@@ -94,7 +94,7 @@ def write_page(
 ) -> Path:
     """Write the page and its pictures to a folder, and return the page's path."""
     record = problem.record
-    figures = draw_record(record, problem.posterior.training, findings)
+    figures = draw_record(record, problem.posterior.only.training, findings)
     pictures = save(figures, out / "figures")
     page = template("check.html.j2").render(
         name=problem.config.name or record.origin,

@@ -38,7 +38,7 @@ from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.table import Table
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
@@ -143,23 +143,22 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
     assert record.displacement is not None
-    posterior = Posterior(
+    dataset = Dataset(
         record.voltage,
         record.displacement,
         split.training,
         actuator,
         noise,
-        prior,
-        choose(config.sampling.engine),
         config.record.from_rest,
     )
+    posterior = Posterior((dataset,), prior, choose(config.sampling.engine))
     aside = config.record.outliers
     if config.model.outliers and aside is None:
-        samples = outliers(posterior, generator(config.seed, "outliers"))
+        samples = outliers(posterior, generator(config.seed, "outliers"))["record"]
         aside = record.time[samples].tolist()
         record = record.without(samples)
         assert record.displacement is not None
-        posterior = replace(posterior, displacement=record.displacement)
+        posterior = posterior.altered(displacement=record.displacement)
     if aside is not None:
         remarks.append(_set_aside(aside))
     windows = iter(split.held_out)
@@ -383,7 +382,7 @@ def _explicit(
                 outliers=outliers,
                 remarks=remarks or None,
             ),
-            "model": explicit_model(config.model, posterior.actuator),
+            "model": explicit_model(config.model, posterior.only.actuator),
             "parameters": {p.name: as_config(p) for p in prior.parameters},
             "sampling": config.sampling.model_copy(
                 update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}

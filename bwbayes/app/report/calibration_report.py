@@ -129,7 +129,7 @@ def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]
     record, model, plan = problem.record, problem.config.model, problem.plan
     held_out = [v.window for v in problem.validations.values() if v.window is not None]
     judged = sum(window.stop - window.start for window in held_out)
-    fitted = sum(window.stop - window.start for window in problem.posterior.training)
+    fitted = sum(window.stop - window.start for window in problem.posterior.only.training)
     return [
         ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
         ("fitted, held out", f"{fitted} samples, {judged} samples"),

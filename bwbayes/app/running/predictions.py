@@ -168,7 +168,7 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
     """Predict the training windows and everything held out."""
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(result.flat_draws, generator(seed, "draws"))
-    training = posterior.training
+    training = posterior.only.training
     windows = {
         "training" if len(training) == 1 else f"training-{i + 1}": window
         for i, window in enumerate(training)

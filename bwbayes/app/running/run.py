@@ -12,6 +12,7 @@ import platform
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -57,6 +58,7 @@ __all__ = [
     "go_on",
     "judged",
     "load_run",
+    "numbers_of",
     "predictions",
     "redraw",
     "start",
@@ -104,9 +106,12 @@ def carry_on(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: str | Executor | None = None,
 ) -> Result:
     """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
-    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+    return go_on(
+        folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+    ).result
 
 
 def go_on(
@@ -118,6 +123,7 @@ def go_on(
     steps: int | None = None,
     engine: Engine | None = None,
     files: bool = True,
+    how: str | Executor | None = None,
 ) -> Run:
     """Do what is left of a run.
 
@@ -136,6 +142,8 @@ def go_on(
         here on not the same bits.
     files
         Write what a run leaves besides its config, records and chain.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -149,7 +157,7 @@ def go_on(
         problem = load_run(folder)
         with (
             _chain(folder, problem, console, engine) as chain,
-            executor(workers, problem.posterior.engine) as pool,
+            executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
             # It is written last, as the sign that all is there; now something is to come.
@@ -275,7 +283,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *identifiability.remarks(posterior, chain.point, flat),
     ]
     columns = posterior.table.columns(posterior.prior.theta(flat))
-    remarks += posterior.actuator.hysteresis.remarks(columns, posterior.names)
+    remarks += posterior.only.actuator.hysteresis.remarks(columns, posterior.names)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
@@ -322,7 +330,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
     record, config = problem.record, problem.config
     windows = ", ".join(
-        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
+        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
+        for w in posterior.only.training
     )
     accepted = {
         phase: ", ".join(
@@ -356,15 +365,22 @@ def going_on(path: Path, problem: Problem) -> str:
     return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
-def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
-    numbers = summary(result) | {
+def numbers_of(
+    folder: RunFolder, problem: Problem, result: Result, seconds: float
+) -> dict[str, object]:
+    """Return a run's numbers as its summary holds them."""
+    return summary(result) | {
         "seed": problem.config.seed,
         "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
+
+
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.record)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures

@@ -1,0 +1,1 @@
+"""Tests of bwbayes.results: predictions and how they are judged."""
