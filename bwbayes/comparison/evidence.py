@@ -108,12 +108,12 @@ def evidence(
     random = np.random.RandomState(generator.integers(2**32))
     places = proposal.draw(random, PROPOSED)
     at_places = posterior.log_density(places) - _normalised(proposal, places)
-    found, effective = bridge(at_draws, at_places)
+    bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
     return Evidence(
-        found.log_integral + constant - mass,
-        float(np.hypot(found.error, mass_error)),
+        bridged.log_integral + constant - mass,
+        float(np.hypot(bridged.error, mass_error)),
         mass,
         effective,
     )

@@ -165,9 +165,9 @@ class PlaysStep(HysteresisStep):
 
     def after(self, memory: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return the plays, (models, plays)."""
-        there = voltage[:, np.newaxis]
+        target = voltage[:, np.newaxis]
         plays: FloatArray = np.maximum(
-            there - self.thresholds, np.minimum(there + self.thresholds, memory)
+            target - self.thresholds, np.minimum(target + self.thresholds, memory)
         )
         return plays
 

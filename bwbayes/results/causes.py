@@ -191,9 +191,9 @@ def _explained(residual: FloatArray, *features: FloatArray) -> float:
         if spread > 0:
             columns.append((feature - np.mean(feature)) / spread)
     matrix = np.stack(columns, axis=1)
-    found, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
+    weights, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
     total = _energy(residual)
-    return 1 - _energy(residual - matrix @ found) / total if total > 0 else 0.0
+    return 1 - _energy(residual - matrix @ weights) / total if total > 0 else 0.0
 
 
 def _beside(residual: FloatArray, where: BoolArray) -> float:

@@ -229,8 +229,8 @@ class Replicate:
 
     def entry(self) -> Entry:
         """Return what is stored of it."""
-        found = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
         return Entry(
             number=self.number,
             converged=self.converged,
@@ -238,7 +238,7 @@ class Replicate:
             steps=self.steps,
             spacing=self.spacing,
             truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
             covered=dict(self.covered),
         )
 
@@ -384,8 +384,8 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    wanted = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    apart = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
     left = chained[::-spacing].reshape(-1, free)
     return spacing, thinned(left, generator, RANKED)
 

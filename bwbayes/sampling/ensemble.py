@@ -185,8 +185,8 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
         power /= np.sum(away**2, axis=-1, keepdims=True)
         correlation = fft.irfft(np.mean(power, axis=0), padded)[:, :steps]
     times = 2 * np.cumsum(correlation, axis=1) - 1
-    found = np.array([time[auto_window(time, WINDOW)] for time in times])
-    return np.where(found > 0, found, np.nan)
+    windowed = np.array([time[auto_window(time, WINDOW)] for time in times])
+    return np.where(windowed > 0, windowed, np.nan)
 
 
 def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:

@@ -78,7 +78,7 @@ FIRST_PART = 0.5
 Watcher = Callable[[Phase, Check | None], None]
 
 
-def _unwatched(phase: Phase, found: Check | None) -> None:
+def _unwatched(phase: Phase, latest: Check | None) -> None:
     """Watch nothing."""
 
 
@@ -218,20 +218,22 @@ def _sampled(
         blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
     part = 1.0 if passed else FIRST_PART
-    fewest = np.min([found.ess_bulk, found.ess_tail])
+    fewest = np.min([latest.ess_bulk, latest.ess_tail])
     with np.errstate(divide="ignore"):
-        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = max(part * steps / plan.block, APART * passed)
-    if not wanted > blocks:  # nan too
-        wanted = LEAST_STRETCH * blocks
-    return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
+        steps = np.maximum(
+            latest.steps * plan.ess / fewest, LENGTH * np.max(latest.autocorrelation)
+        )
+    following = max(part * steps / plan.block, APART * passed)
+    if not following > blocks:  # nan too
+        following = LEAST_STRETCH * blocks
+    return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
 class _Judge:
@@ -262,11 +264,11 @@ class _Judge:
             self._prepare(number)
         self.prepared = blocks
         (every,) = self.draws = self._joined(self.draws)
-        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
+        latest = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
         if self.proposal is None:
-            return found
+            return latest
         (weights,) = self.log_weights = self._joined(self.log_weights)
-        return replace(found, pareto_k=pareto_k(weights.ravel()))
+        return replace(latest, pareto_k=pareto_k(weights.ravel()))
 
     @staticmethod
     def _joined(kept: list[FloatArray]) -> list[FloatArray]:

@@ -71,10 +71,10 @@ def calibrate(
     changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
     from bwbayes.app.config.config import load
 
-    wanted = load(config)
-    wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
+    chosen = load(config)
+    chosen = chosen.model_copy(update=changes | ({"name": chosen.name} if chosen.name else {}))
     where = out or Path("results") / f"{config.stem}-calibration"
-    folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
+    folder = start(chosen, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
     return _calibrate(folder, None, workers, how, quiet)
 
 

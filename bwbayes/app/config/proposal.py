@@ -248,7 +248,7 @@ def _start(record: Record) -> list[str]:
     moving = float(np.ptp(few)) > MOVES * extent
     how = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
     if away:
-        return [f"# from_rest = false  # it starts {how}: its history is unknown, and found"]
+        return [f"# from_rest = false  # it starts {how}: its history is unknown, and estimated"]
     return [
         f"# from_rest = true  # it starts {how}; say so if the actuator was demagnetised and "
         "nothing moved"

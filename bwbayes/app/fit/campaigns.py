@@ -186,10 +186,10 @@ def campaign(
     if config is not None:
         text, where = config_text(Path(config)), Path(config).parent
     elif keys:
-        wanted, in_memory = config_of("each", keys, "campaign")
+        each, in_memory = config_of("each", keys, "campaign")
         if in_memory:
             raise InputError("campaign: validation: give files, which each record's run can read")
-        text = dump(wanted)
+        text = dump(each)
     scratch = Scratch() if folder is None else None
     path = scratch.path / "campaign" if scratch is not None else Path(str(folder))
     source = path.with_name(f"{path.name}-records") if isinstance(records, Mapping) else records

@@ -183,7 +183,7 @@ def _append(folder: CalibrationFolder, line: bytes) -> None:
 def _read(
     folder: CalibrationFolder, common: Experiment, identity: str
 ) -> tuple[_Request, dict[int, Entry]]:
-    """Read how many replicates are wanted, and those that are there; cut off half a line."""
+    """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
@@ -206,7 +206,7 @@ def _read(
 
 
 def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
-    """Read the line that says how many replicates are wanted, and check that they are these."""
+    """Read the line that says how many replicates were requested, and check that they are these."""
     try:
         request = _Request.model_validate_json(line)
     except ValueError:

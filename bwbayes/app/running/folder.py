@@ -161,7 +161,7 @@ class CalibrationFolder(RunFolder):
 
     @property
     def replicates(self) -> Path:
-        """What they are replicates of, how many are wanted, and then a line for each."""
+        """What they are replicates of, how many were requested, and then a line for each."""
         return self.path / self.MARK
 
     @property

@@ -192,15 +192,15 @@ def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    found: Innovations,
+    series: Innovations,
     moved: Moved | None,
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name."""
-    start = innovations.odd_start(found)
+    start = innovations.odd_start(series)
     verdicts = {}
     for one in bands:
         # Of several training windows the first one holds the start.
-        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
+        at_start = one.training and one.time[0] <= series.time[0] <= one.time[-1]
         far = beyond_training(problem.posterior, one.voltage, one.interval)
         verdict = (
             assess(one, background, start=start, moved=moved, beyond=far)
