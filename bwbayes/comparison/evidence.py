@@ -139,7 +139,7 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
     Returns
     -------
     tuple[Bridge, float]
-        log r with its error, and the effective draws that the numerator's mean hangs on.
+        log r with its error, and the effective draws behind the numerator's mean.
 
     Notes
     -----
@@ -191,7 +191,7 @@ def _effective(values: FloatArray) -> float:
 
 
 def _normalised(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
-    """Log density of a proposal with its constant, shaped as the coordinates but for the last."""
+    """Log density of a proposal with its constant, shaped as the coordinates less the last axis."""
     first = proposal.components[0]
     free, freedom = first.centre.size, first.freedom
     constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)

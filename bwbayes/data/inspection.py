@@ -39,7 +39,7 @@ LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
-MOST_SPIKES = 0.02  # of the readings: more are no outliers
+MOST_SPIKES = 0.02  # of the readings: more are not outliers
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _readings(record: Record) -> FloatArray:
 
 
 def _extent(values: FloatArray) -> float:
-    """Return the range of values but for the outermost thousandth on either side."""
+    """Return the range of values without the outermost thousandth on either side."""
     low, high = np.quantile(values, (0.001, 0.999))
     return float(high - low)
 
@@ -149,7 +149,7 @@ def _sampling(record: Record) -> Iterator[Finding]:
 
 
 def _amplitude(record: Record) -> Iterator[Finding]:
-    """Find a drive whose swings are all alike, but for the unfinished ones at its ends."""
+    """Find a drive whose swings are all alike, except for the unfinished ones at its ends."""
     turns = turning_points(record.voltage, 0.02 * float(np.ptp(record.voltage)))
     swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
     if swings.size >= 3 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):

@@ -25,7 +25,7 @@ def choose(choice: EngineChoice = "auto") -> Engine:
     Raises
     ------
     InputError
-        ``choice`` is no engine, or is ``"numba"`` where numba is not installed.
+        ``choice`` is not an engine, or is ``"numba"`` where numba is not installed.
     """
     installed = find_spec("numba") is not None
     match choice:

@@ -36,7 +36,7 @@ ROUNDS = 6
 # Median of a standard normal's distance from zero.
 MEDIAN = float(norm.ppf(0.75))
 
-# A larger part of the readings than this are no isolated outliers.
+# If they are a larger part of the readings than this, they are not isolated outliers.
 MOST = 0.05
 
 

@@ -1,6 +1,6 @@
 """Parameters: what they are called, what is known of them, and where they may lie.
 
-Each parameter is either fixed or has a prior. The priors are independent but for the physical
+Each parameter is either fixed or has a prior. The priors are independent except for the physical
 constraints that the model's parts declare, which cut the joint prior: for Bouc-Wen 0 < α < d,
 |γ| ≤ β, an initial state inside the hysteresis ceiling. :class:`JointPrior` draws from the cut
 prior and gives its log density, up to the one constant that the cut leaves. It also maps parameters

@@ -26,7 +26,7 @@ STARTS = 8
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
 RESIDUALS = 1000
 
-# An optimum less probable than the best by this much, nats, is no place to start from: it holds
+# An optimum less probable than the best by this much, nats, is not a place to start from: it holds
 # nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
 HOPELESS = 30.0
 

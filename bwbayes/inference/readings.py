@@ -42,7 +42,7 @@ class Readings:
 
     @classmethod
     def of(cls, displacement: FloatArray, windows: Sequence[slice]) -> Readings:
-        """Take what windows (slices) of a displacement (samples,) have; nan is no reading.
+        """Take the readings in windows (slices) of a displacement (samples,); nan marks a gap.
 
         Raises
         ------

@@ -211,7 +211,7 @@ def _start(r: Residuals) -> float:
     if not early.any() or not late.any():
         return 0.0
     tail = _energy(r.residual[late]) / np.sum(late)
-    # An offset of the rest is no start.
+    # An offset of the remaining readings does not count as a start.
     total = _energy(r.residual)
     return max(0.0, (_energy(r.residual[early]) - tail * np.sum(early)) / total) if total else 0.0
 
@@ -280,7 +280,7 @@ def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
     fast = 1.4826 * float(np.median(np.abs(beside)))
     fast = max(fast, 1e-6 * float(np.ptp(residual)))
     jumps = ndimage.maximum_filter1d(np.abs(steps), 5)
-    # As long as they are few; many are no outliers.
+    # As long as they are few; many are not outliers.
     far = (np.abs(beside) > SPIKE * fast) & (np.abs(beside) > jumps)
     # The top of something broader is none.
     level = np.maximum(np.abs(padded[:-4]), np.abs(padded[4:]))

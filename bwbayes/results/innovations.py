@@ -146,7 +146,7 @@ def odd_start(series: Innovations) -> OddStart | None:
     if not size:
         return None
     first = 0
-    # Up to a third of the record: what is odd for longer is no start.
+    # Up to a third of the record: what is odd for longer is not a start.
     while first < series.white.size // 3 and _oddness(series.white[first:], ENDED):
         first = max(first + 1, round(1.2 * first))
     return OddStart(float(series.time[0]), float(series.time[first]), size)
@@ -199,7 +199,7 @@ def _correlated(series: Innovations) -> list[str]:
     after = series.time[lag + 1] - series.time[0]
     return [
         f"innovations {after:.3g} s apart correlate by {correlation[lag]:.2f}, and should not: "
-        "the discrepancy is no process that forgets exponentially, or the sensor filters"
+        "the discrepancy does not forget exponentially, or the sensor filters"
     ]
 
 

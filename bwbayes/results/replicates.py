@@ -88,7 +88,7 @@ class Experiment:
     Raises
     ------
     InputError
-        No training voltage goes forth and back, so that there is no loop to measure.
+        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     posterior: Posterior
@@ -101,7 +101,7 @@ class Experiment:
     def __post_init__(self) -> None:
         if not any(_crossings(path).both for path in self._paths.values()):
             raise InputError(
-                "record: its training voltage does not go forth and back, so there is no loop to "
+                "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
             )
 

@@ -173,7 +173,7 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
     """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
 
     As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
-    but for all walkers at once: the mean is taken of their spectra, and transformed back once. It
+    here for all walkers at once: the mean is taken of their spectra, and transformed back once. It
     is nan where it cannot be told, for instance where nothing moves.
     """
     steps = draws.shape[0]

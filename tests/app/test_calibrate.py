@@ -286,12 +286,12 @@ def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
         ({0: b'{"replicates":0,"of":"x"}'}, "does not say how many"),
         ({0: b'{"replicates":3}'}, "does not say how many"),
         ({0: b'{"replicates":1e999,"of":"x"}'}, "does not say how many"),
-        ({1: b"nonsense"}, ":2: is no replicate of these; delete this line"),
-        ({1: b'{"number": 0}'}, ":2: is no replicate of these; delete this line"),
-        ({2: b"[1]"}, ":3: is no replicate of these; delete this line"),
-        ({2: b"[" * 100_000}, ":3: is no replicate of these; delete this line"),
-        ({2: b"{}"}, ":3: is no replicate of these; delete this line"),
-        ({2: b"\xff"}, ":3: is no replicate of these; delete this line"),
+        ({1: b"nonsense"}, ":2: is not one of these replicates; delete this line"),
+        ({1: b'{"number": 0}'}, ":2: is not one of these replicates; delete this line"),
+        ({2: b"[1]"}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"[" * 100_000}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"{}"}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"\xff"}, ":3: is not one of these replicates; delete this line"),
     ],
 )
 def test_damaged_lines_are_refused(
@@ -318,7 +318,7 @@ def test_line_of_another_replicate_is_refused(
     def change(number: int, line: bytes) -> bytes:
         return re.sub(one, other, line) if number == 2 else line
 
-    assert_refused(whole, tmp_path, ":3: is no replicate of these; delete this line", change)
+    assert_refused(whole, tmp_path, ":3: is not one of these replicates; delete this line", change)
 
 
 def assert_refused(

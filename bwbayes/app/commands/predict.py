@@ -56,7 +56,9 @@ def predict(
     if (record is None) == (waveform is None):
         raise InputError("predict: give either --record or --signal")
     if not 0 < lead_in < math.inf:
-        raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
+        raise InputError(
+            f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
+        )
     begin = Start(from_rest, not same_offset, lead_in, lead_in_from)
     return write(
         folder, record, waveform, begin, out, Console(), window=window, overwrite=overwrite

@@ -312,5 +312,5 @@ def _windows(windows: list[tuple[float, float]]) -> str:
 
 
 def _quoted(text: str) -> str:
-    # A JSON string is a TOML string too, but for DEL, which no name of a column has.
+    # A JSON string is a TOML string too, except for DEL, which no column's name has.
     return json.dumps(text, ensure_ascii=False)

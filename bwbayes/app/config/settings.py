@@ -1,4 +1,4 @@
-"""What a config says but for the model: the home of every key's type, default and description.
+"""What a config says, except for the model: the home of every key's type, default and description.
 
 A key is a field here and nowhere else: its type is what is checked, its :func:`described` what
 ``bwbayes config`` prints. A new key is a new field, and a new table a model that

@@ -205,11 +205,11 @@ def campaign(
 
 
 def _write(records: Mapping[str, Record], folder: Path) -> None:
-    """Write records that are in memory, but for those that are there already."""
+    """Write records that are in memory, except for those that are written already."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, record in records.items():
         if not re.fullmatch(r"[\w][\w .+-]*", name):
-            raise InputError(f"campaign: {name!r} is no name of a file; choose another")
+            raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
         path = folder / f"{name}.h5"
         if not path.exists() or read_record(path).sha256 != record.sha256:
             write_record(record, path)

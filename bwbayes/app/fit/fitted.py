@@ -353,7 +353,7 @@ def carried_on(
     engine: Engine | None = None,
     how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
         console_of(progress),

@@ -199,7 +199,7 @@ def _read(
             entry = _entry(line, common, entries)
         except ValueError:
             raise InputError(
-                f"{folder.replicates}:{number}: is no replicate of these; delete this line"
+                f"{folder.replicates}:{number}: is not one of these replicates; delete this line"
             ) from None
         entries[entry["number"]] = entry
     return request, entries

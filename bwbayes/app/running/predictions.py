@@ -84,7 +84,7 @@ class Prediction(Bands):
         return pd.DataFrame(dict(self.columns()))
 
     def plot(self) -> Figure:
-        """Draw the bands along time: voltage, displacement, and what is left without the mean."""
+        """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         return draw_alone(self)
 
     def numbers(self) -> dict[str, object]:
@@ -213,6 +213,6 @@ def judged(
 
 
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    """Return the generator that scores bands: it depends on the readings, not on a name."""
     assert bands.measured is not None
     return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")

@@ -108,7 +108,7 @@ def carry_on(
     engine: Engine | None = None,
     how: str | Executor | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
+    """Finish a run and write its files, as :func:`go_on` does; return the result."""
     return go_on(
         folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
     ).result
@@ -125,7 +125,7 @@ def go_on(
     files: bool = True,
     how: str | Executor | None = None,
 ) -> Run:
-    """Do what is left of a run.
+    """Finish a run.
 
     Parameters
     ----------

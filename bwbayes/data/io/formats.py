@@ -115,7 +115,7 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
         _write_whole(path, lambda part: write_hdf5(record, part))
     else:
         truth_path = _truth_path(path)
-        truth_path.unlink(missing_ok=True)  # first, lest it ever stand beside another record
+        truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
         _write_whole(path, lambda part: write_csv(record, part))
         if record.truth is not None:
             truth = replace(record, displacement=record.truth)

@@ -38,7 +38,7 @@ def read_hdf5(path: Path, naming: Naming) -> Table:
     Raises
     ------
     InputError
-        If it is no HDF5 file, is damaged, or has datasets that are no vectors of real numbers.
+        If it is not an HDF5 file, is damaged, or has datasets other than real vectors.
     """
     if not h5py.is_hdf5(path):
         raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it anew")

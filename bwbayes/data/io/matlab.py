@@ -50,7 +50,7 @@ def read_mat(path: Path, naming: Naming) -> Table:
     Raises
     ------
     InputError
-        If it is no MATLAB file, is damaged, or has variables that are no vectors of real numbers.
+        If it is not a MATLAB file, is damaged, or has variables other than real vectors.
     """
     try:
         return _read_7_3(path, naming) if h5py.is_hdf5(path) else _read_5(path, naming)
