@@ -36,7 +36,7 @@ def choose(choice: EngineChoice = "auto") -> Engine:
         case "numba":
             if not installed:
                 raise InputError(
-                    "engine: numba is not installed; pip install numba, or take the numpy engine"
+                    "engine: numba is not installed; pip install numba, or choose the numpy engine"
                 )
             return "numba"
     raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")

@@ -173,7 +173,7 @@ class JointPrior:
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
         if not np.all(self._possible(fixed)):
-            raise InputError(f"priors: what is fixed must have {self._stated()}")
+            raise InputError(f"priors: fixed values must have {self._stated()}")
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
@@ -220,7 +220,7 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                raise InputError(f"priors: hardly a draw has {self._stated()}")
+                raise InputError(f"priors: hardly any draw has {self._stated()}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:

@@ -52,7 +52,7 @@ class Readings:
         rows = np.concatenate([np.arange(w.start, w.stop) for w in windows]).astype(np.int64)
         rows = rows[np.isfinite(displacement[rows])]
         if not rows.size:
-            raise InputError("record.train: no reading is in it; give another window")
+            raise InputError("record.train: it holds no reading; give another window")
         gaps = np.diff(rows)
         stride = int(gaps.min()) if gaps.size else 1
         skipped = np.concatenate([[0.0], (gaps - stride) / stride])

@@ -170,7 +170,7 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
     if swayed.part > WIDE:
         return f"the prior decides there: the posterior has {swayed.part:.0%} of its sd"
     if not swayed.told:
-        return "whether the prior decides there cannot be told from these draws"
+        return "these draws cannot tell whether the prior decides there"
     if swayed.decides:
         return (
             f"the prior decides there: one twice as wide moves {swayed.name} by {swayed.moved:.1f} "
@@ -195,7 +195,7 @@ def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> st
     columns = first.table.columns(alone.prior.theta(its))
     opening = first.actuator.hysteresis.opening(columns, half)
     if opening is not None and float(np.median(opening)) < SMALL:
-        return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
     if len(swings) < 2:
         return "drive the actuator up and down several times, with decreasing amplitude"
     if min(swings) > (1 - ALIKE) * max(swings):

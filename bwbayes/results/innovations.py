@@ -1,6 +1,6 @@
-"""Innovations: what a fit's residuals bring anew at each reading, and whether it is pure chance.
+"""Innovations: what each reading adds to those before it, and whether that is pure chance.
 
-Where model and noise model are right, a residual less what the readings before it foretell, over
+Where model and noise model are right, a residual less what the readings before it predict, over
 its standard deviation, is an independent standard normal number. Four things can be seen in these
 innovations that the residuals hide: whether they are white, whether they are normal, whether their
 size depends on the drive (its rate, its voltage, its direction), and whether the record starts as
@@ -126,7 +126,7 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
 
 
 def remarks(series: Innovations) -> tuple[str, ...]:
-    """Say, one line each, in what the innovations are not what the noise model takes them for."""
+    """Say, one line each, where the innovations depart from what the noise model assumes."""
     if series.white.size < FEWEST:
         return ()
     lines = [*_correlated(series), *_heavy(series)]

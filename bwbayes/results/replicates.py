@@ -133,7 +133,7 @@ class Experiment:
 
     @cached_property
     def looped(self) -> str:
-        """The record whose loop is measured: the first that goes forth and back."""
+        """The record whose loop is measured: the first that goes back and forth."""
         return next(name for name, path in self._paths.items() if _crossings(path).both)
 
     @property
@@ -147,7 +147,7 @@ class Experiment:
         The opening (um) is the model's displacement where the voltage falls through zero, or
         through the middle of a drive beside it, less that where it rises through it, interpolated
         between samples, each the mean over all passages; the range (um) is its largest less its
-        smallest displacement. Of several records, in the first that goes forth and back.
+        smallest displacement. Of several records, in the first that goes back and forth.
         """
         displacement = posterior.simulate(theta, record=self.looped)
         path = self._paths[self.looped]

@@ -114,7 +114,7 @@ def start(
 
     The optima of the point fit take turns; from there the point lies ten posterior sds off in a
     random direction (nearer where the density is zero), so that ensembles agree only after they
-    have found the same posterior.
+    have reached the same posterior.
 
     Raises
     ------

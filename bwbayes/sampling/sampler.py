@@ -54,7 +54,7 @@ __all__ = [
     "sample",
 ]
 
-# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# Nested R-hat of the pilot's second half below which its ensembles have met. After so
 # many steps it is enough if each stays where it is: in modes far apart differential evolution would
 # keep them for ever, and a proposal fitted to all of them will not.
 PILOT_RHAT = 1.1
@@ -311,7 +311,7 @@ def _thinned(chain: Chain) -> tuple[str, ...]:
     thin = thinning(chain.draws("sampling"))
     if thin == 1:
         return ()
-    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to limit the memory",)
 
 
 def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:

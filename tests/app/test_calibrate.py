@@ -377,14 +377,14 @@ def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
 def test_prior_that_leaves_nothing_leaves_no_folder(tmp_path: Path) -> None:
     """Said at once, not by the first replicate."""
     impossible = TEXT.replace("mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01")
-    with pytest.raises(InputError, match="hardly a draw has"):
+    with pytest.raises(InputError, match="hardly any draw has"):
         begun(tmp_path / "a", text=impossible)
     assert [] == list(tmp_path.iterdir())
 
 
 def test_voltage_without_a_loop_leaves_nothing(tmp_path: Path) -> None:
     ramp = TEXT.replace("train = [[0.0, 1.5]]", "train = [[0.0, 0.2]]")
-    with pytest.raises(InputError, match="does not go forth and back"):
+    with pytest.raises(InputError, match="does not go back and forth"):
         begun(tmp_path / "a", text=ramp)
     assert [] == list(tmp_path.iterdir())
 

@@ -344,7 +344,7 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
 
 @pytest.mark.usefixtures("_no_run")
 def test_what_is_no_record_is_one_line(record: Record) -> None:
-    with pytest.raises(bw.InputError, match=r"ndarray is not a record; make one with Record.from_arr"):
+    with pytest.raises(bw.InputError, match=r"ndarray is not a record; make one with Record"):
         bw.fit(record.voltage)  # type: ignore[arg-type]
     with pytest.raises(bw.InputError, match="fit: record: has no displacement"):
         bw.fit(replace(record, displacement=None, truth=None))

@@ -63,7 +63,7 @@ ROLE = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
 
 
 def config_reference(requested: str | None) -> str:
-    """Return what there is to know of a config's keys: of all, or of those of a name or path.
+    """Describe a config's keys: all of them, or those of a name or path.
 
     A path may have the user's own names in it, and may leave out its first tables:
     ``parameters.d.prior``, ``ess``.
@@ -135,7 +135,7 @@ def _wrapped(text: str, indent: str = "") -> str:
 
 
 def parts_reference(requested: str | None) -> str:
-    """Return what there is to know of a model's parts: a line of each, or all of one of them.
+    """Describe a model's parts: each in a line, or one of them in full.
 
     ``requested`` is a part's name or the import path of one from outside.
 

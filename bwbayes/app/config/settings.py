@@ -38,10 +38,10 @@ class SignalConfig(Table):
         described("Shape of a period, or steps.", example='"triangle"'),
     ] = "sine"
     amplitude: Annotated[
-        Positive | None, described("Amplitude, but of steps.", unit="V", example="100.0")
+        Positive | None, described("Amplitude; not for steps.", unit="V", example="100.0")
     ] = None
     frequency: Annotated[
-        Positive | None, described("Frequency, but of steps.", unit="Hz", example="1.0")
+        Positive | None, described("Frequency; not for steps.", unit="Hz", example="1.0")
     ] = None
     levels: Annotated[
         Annotated[list[float], Field(min_length=1)] | None,
@@ -168,7 +168,7 @@ class RecordConfig(_Source):
         ),
     ] = None
     decimate: Annotated[
-        int, Field(ge=1), described("Every how many-th reading is used.", example="5")
+        int, Field(ge=1), described("Of so many readings one is used.", example="5")
     ] = 1
     train: Annotated[
         Windows | None,

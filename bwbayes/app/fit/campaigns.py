@@ -205,7 +205,7 @@ def campaign(
 
 
 def _write(records: Mapping[str, Record], folder: Path) -> None:
-    """Write records that are in memory, except for those that are written already."""
+    """Write the records that are in memory, except those that are written already."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, record in records.items():
         if not re.fullmatch(r"[\w][\w .+-]*", name):

@@ -336,7 +336,7 @@ class Fit:
 
 
 class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
+    """A temporary folder that is removed when nobody needs it any more."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
@@ -365,7 +365,7 @@ def carried_on(
         how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
 

@@ -160,7 +160,7 @@ def go_on(
             executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
-            # It is written last, as the sign that all is there; now something is to come.
+            # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
@@ -379,7 +379,7 @@ def numbers_of(
 
 
 def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    """Write all files of a run; the summary last, as the sign that all is done."""
     numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.record)

@@ -99,8 +99,8 @@ def column_names(path: str | Path) -> list[str]:
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
     """Write a record so that reading it gives the same numbers.
 
-    A file that stands there is replaced at once or not at all. The truth goes beside a text file,
-    and one that stands there from an earlier record is removed.
+    An existing file is replaced at once or not at all. The truth goes beside a text file, and
+    that of an earlier record is removed.
 
     Raises
     ------

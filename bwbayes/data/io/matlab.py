@@ -59,7 +59,7 @@ def read_mat(path: Path, naming: Naming) -> Table:
     except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         problem = f"not a MATLAB file, damaged or cut off ({reason})"
-        raise InputError(f"{path}: {problem}; save it anew") from error
+        raise InputError(f"{path}: {problem}; save it again") from error
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
