@@ -87,7 +87,7 @@ def main() -> None:
     except BrokenExecutor as error:
         # Python's own says nothing of use.
         said = "" if isinstance(error, BrokenProcessPool) else str(error)
-        said = said or "a worker process was ended; mind the memory, and resume"
+        said = said or "a worker process was killed; free some memory, and resume"
         click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:

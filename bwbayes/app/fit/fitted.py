@@ -345,7 +345,7 @@ class Fit:
 
 
 class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
+    """A temporary folder that is removed when nobody needs it any more."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
@@ -362,7 +362,7 @@ def carried_on(
     engine: Engine | None = None,
     how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
         console_of(progress),
@@ -374,7 +374,7 @@ def carried_on(
         how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
 

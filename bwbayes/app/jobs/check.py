@@ -46,7 +46,7 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     config
         The config; its files are relative to `folder`.
     out
-        The page's folder, made if need be; a page that stands there is replaced.
+        The page's folder, made if need be; an existing page is replaced.
     console
         Shows the record, what is wrong with it, priors and point fit.
 

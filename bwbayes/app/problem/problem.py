@@ -185,7 +185,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
 
 
 def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
-    """Return what is wrong with a record, but for places that no window looks at."""
+    """Return what is wrong with a record in the places that some window uses."""
     # Borders that differ by less than half a sample are the same.
     times = [
         record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
