@@ -155,9 +155,17 @@ class Posterior:
 
     @property
     def only(self) -> Dataset:
-        """The record, of a posterior of one; see :meth:`alone` for one of several."""
-        (only,) = self.datasets
-        return only
+        """The record, of a posterior of one; see :meth:`alone` for one of several.
+
+        Raises
+        ------
+        InputError
+            There are several.
+        """
+        if len(self.datasets) > 1:
+            names = ", ".join(one.name for one in self.datasets)
+            raise InputError(f"record: several were fitted ({names}), and this is for a fit of one")
+        return self.datasets[0]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,7 +175,7 @@ class Posterior:
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (models,) at coordinates (models, free): likelihood and prior.
 
-        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
+        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is not evidence
         for a model: there the density is −∞ too.
         """
         free, result = self.prior.constrain(coordinates)

@@ -11,7 +11,7 @@ made; :mod:`bwbayes.results.calibration` judges many of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -31,7 +31,16 @@ from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
 
-__all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
+__all__ = [
+    "EXTRA",
+    "RANKED",
+    "Entry",
+    "Experiment",
+    "Replicate",
+    "as_done",
+    "replicate",
+    "replicates",
+]
 
 # Draws that a truth is ranked among.
 RANKED = 199
@@ -80,7 +89,7 @@ class Experiment:
     Raises
     ------
     InputError
-        No training voltage goes forth and back, so that there is no loop to measure.
+        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     posterior: Posterior
@@ -93,7 +102,7 @@ class Experiment:
     def __post_init__(self) -> None:
         if not any(crossings(path).both for path in self._paths.values()):
             raise InputError(
-                "record: its training voltage does not go forth and back, so there is no loop to "
+                "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
             )
 
@@ -125,7 +134,7 @@ class Experiment:
 
     @cached_property
     def looped(self) -> str:
-        """The record whose loop is measured: the first that goes forth and back."""
+        """The record whose loop is measured: the first that goes back and forth."""
         return next(name for name, path in self._paths.items() if crossings(path).both)
 
     @property
@@ -139,7 +148,7 @@ class Experiment:
         The opening (um) is the model's displacement where the voltage falls through zero, or
         through the middle of a drive beside it, less that where it rises through it, interpolated
         between samples, each the mean over all passages; the range (um) is its largest less its
-        smallest displacement. Of several records, in the first that goes forth and back.
+        smallest displacement. Of several records, in the first that goes back and forth.
         """
         displacement = posterior.simulate(theta, record=self.looped)
         path = self._paths[self.looped]
@@ -189,8 +198,8 @@ class Replicate:
 
     def entry(self) -> Entry:
         """Return what is stored of it."""
-        found = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
         return Entry(
             number=self.number,
             converged=self.converged,
@@ -198,7 +207,7 @@ class Replicate:
             steps=self.steps,
             spacing=self.spacing,
             truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
             covered=dict(self.covered),
         )
 
@@ -215,11 +224,26 @@ def replicates(
     Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
     be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
     """
-    waiting = iter(numbers)
-    running: set[Future[Replicate]] = set()
+    return as_done(
+        executor, together, replicate, ((experiment, seed, number) for number in numbers)
+    )
+
+
+def as_done[T](
+    executor: Executor,
+    together: int,
+    call: Callable[..., T],
+    arguments: Iterable[tuple[object, ...]],
+) -> Iterator[T]:
+    """Call a function with each of the arguments, and yield each result as soon as it is there.
+
+    Only so many ``together`` are under way, so that whoever stops waits for those alone.
+    """
+    waiting = iter(arguments)
+    running: set[Future[T]] = set()
     while True:
-        for number in islice(waiting, together - len(running)):
-            running.add(executor.submit(replicate, experiment, seed, number))
+        for each in islice(waiting, together - len(running)):
+            running.add(executor.submit(call, *each))
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -324,8 +348,8 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    wanted = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    apart = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
     left = chained[::-spacing].reshape(-1, free)
     return spacing, thinned(left, generator, RANKED)
 

@@ -79,9 +79,9 @@ LOOPS, SLOW = dataset("loops"), dataset("slow")
 
 def test_a_record_has_its_own_columns_named_after_it_and_one_alone_has_plain_names() -> None:
     both, alone = joint(LOOPS, SLOW), joint(LOOPS)
-    expected = ("d", "alpha", "beta", "gamma", "exponent", "initial[loops]", "initial[slow]", "lag")
-    expected += ("offset[loops]", "offset[slow]", "sensor_sd", "discrepancy_sd", "discrepancy_time")
-    assert expected == both.table.names
+    shape, noise = "d alpha beta gamma exponent", "sensor_sd discrepancy_sd discrepancy_time"
+    own = "initial[loops] initial[slow] lag offset[loops] offset[slow]"
+    assert f"{shape} {own} {noise}".split() == [*both.table.names]
     assert LOOPS.table.names == alone.table.names
     assert both.alone("slow").table.names == alone.table.names
 

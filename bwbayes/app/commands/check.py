@@ -24,8 +24,8 @@ def check(config: Path, record: Path | None, out: Path | None) -> int:
     """
     from bwbayes.app.jobs.check import check as look
 
-    wanted = config_or_proposal(config, Console(quiet=True), refuse=False)
+    chosen = config_or_proposal(config, Console(quiet=True), refuse=False)
     if record is not None:
-        wanted = wanted.with_record(record)
-    look(wanted, config.parent, out or Path("results") / f"{config.stem}-check", Console())
+        chosen = chosen.with_record(record)
+    look(chosen, config.parent, out or Path("results") / f"{config.stem}-check", Console())
     return 0

@@ -77,7 +77,7 @@ class Config(Table):
     seed: Annotated[
         int,
         Field(ge=0, le=LARGEST_SEED),
-        described("Where all random numbers come from.", example="7"),
+        described("Seed of all random numbers.", example="7"),
     ] = 1
     record: Annotated[
         Annotated[RecordConfig, Tag(ONE)] | Annotated[dict[Name, RecordConfig], Tag(SEVERAL)],
@@ -164,7 +164,8 @@ class Config(Table):
         if not isinstance(self.record, RecordConfig):
             names = ", ".join(self.record)
             raise InputError(
-                f"--record: the config has several records ({names}); change their files there"
+                f"record: the config has several ({names}), and another one cannot stand for all "
+                "of them; change their files there"
             )
         source = self.record.model_copy(update={"file": str(file.resolve()), "signal": None})
         return self.model_copy(update={"record": source})

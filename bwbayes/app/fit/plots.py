@@ -68,7 +68,7 @@ class Plots:
         return _drawn(draw_coverage, result.bands, result.scores)
 
     def innovations(self, name: str | None = None) -> Figure:
-        """Draw whether what each reading brings anew is white, normal and of one size.
+        """Draw whether innovations, what each reading adds, are white, normal, of one size.
 
         Of several records in the one of this name, by default the first.
         """

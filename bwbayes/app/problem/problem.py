@@ -1,6 +1,6 @@
 """From a config to a problem: records read, windows cut, every prior a number.
 
-:func:`resolve` does once what must not happen twice: it runs the virtual stand, draws up default
+:func:`resolve` does once what must not happen twice: it runs the virtual stand, sets default
 priors, and takes ``hold = "auto"`` from the record. What comes out is a config that says all this
 in explicit numbers and refers to the records as files beside it, so that a run's folder can be
 moved, continued and run again by itself.
@@ -48,7 +48,7 @@ from bwbayes.inference.table import JointTable
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.sampler import SamplingPlan, best_together
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -153,7 +153,9 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             for name, validation in config.validation.items()
             if validation.another
         }
-    remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    said = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    noted = [text for one in config.records.values() for text in one.remarks or ()]
+    said = list(dict.fromkeys([*noted, *said]))
     findings = {
         name: tuple(
             one
@@ -164,6 +166,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         )
         for name, record in fitted.items()
     }
+    remarks = [*said]
     remarks += [f"{name}: {finding}" for name, every in findings.items() for finding in every]
     remarks += [text for name, other in others.items() for text in unlike(config, name, other)]
     posterior, defaults = _posterior(config, fitted, windows)
@@ -189,7 +192,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     first = posterior.datasets[0]
     truth = (recoverable(stand, first.actuator) if stand else {}) | config.truth
     return Problem(
-        _explicit(config, posterior, truth, aside),
+        _explicit(config, posterior, truth, aside, said),
         fitted,
         posterior,
         _plan(config, posterior),
@@ -225,7 +228,7 @@ def _posterior(
     parameters = parameters_of(config, table, contexts)
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
     if not prior.dimensions:
-        raise InputError("parameters: all are fixed, so there is nothing to find; free some")
+        raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
     named = [
         (replace(column.declaration, name=column.name), contexts[column.record])
         for column in table.layout
@@ -266,6 +269,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
             f"use at least {least}"
         )
+    samples = sum(one.readings.samples for one in posterior.datasets)
     return SamplingPlan(
         ess=given.ess,
         ensembles=given.ensembles,
@@ -273,6 +277,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
+        together=best_together(given.ensembles, walkers, samples),
     )
 
 
@@ -291,6 +296,7 @@ def _explicit(
     posterior: Posterior,
     truth: Mapping[str, float],
     outliers: Mapping[str, list[float] | None],
+    remarks: list[str],
 ) -> Config:
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
@@ -300,6 +306,8 @@ def _explicit(
             train=one.train,
             from_rest=one.from_rest,
             outliers=outliers[name],
+            # Said while all were read: the first has them.
+            remarks=remarks or None if name == next(iter(config.records)) else None,
         )
         for name, one in config.records.items()
     }

@@ -33,7 +33,7 @@ FREE_TO_CHANGE = (
     "sampling.pilot_steps",
 )
 # Of each record: where it comes from.
-SOURCE = re.compile(r"record\.([^.]+\.)?(file|signal)(\..*)?")
+SOURCE = re.compile(r"record\.([^.]+\.)?(file|remarks|signal)(\..*)?")
 NAMES_FOR_PEOPLE = ("label", "description")
 
 # What chains were sampled with before a config could say it.

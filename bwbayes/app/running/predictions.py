@@ -84,7 +84,7 @@ class Prediction(Bands):
         return pd.DataFrame(dict(self.columns()))
 
     def plot(self) -> Figure:
-        """Draw the bands along time: voltage, displacement, and what is left without the mean."""
+        """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         return draw_alone(self)
 
     def numbers(self) -> dict[str, object]:
@@ -194,12 +194,12 @@ def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    found: Mapping[str, Innovations],
+    series: Mapping[str, Innovations],
     moved: Mapping[str, Moved | None],
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name.
 
-    ``found`` and ``moved`` are by the name of the training record.
+    ``series`` and ``moved`` are by the name of the training record.
     """
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
@@ -208,8 +208,8 @@ def judged(
         record = records.get(one.name) if one.training else None
         start, away = None, None
         # Of several training windows the first one holds the start.
-        if record and one.time[0] <= found[record].time[0] <= one.time[-1]:
-            start, away = innovations.odd_start(found[record]), moved[record]
+        if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
+            start, away = innovations.odd_start(series[record]), moved[record]
         verdict = assess(one, background, start=start, moved=away, beyond=far)
         if verdict is not None:
             verdicts[one.name] = verdict
@@ -217,6 +217,6 @@ def judged(
 
 
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    """Return the generator that scores bands: it depends on the readings, not on a name."""
     assert bands.measured is not None
     return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")

@@ -12,6 +12,7 @@ import platform
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -56,6 +57,7 @@ __all__ = [
     "go_on",
     "judged",
     "load_run",
+    "numbers_of",
     "predictions",
     "redraw",
     "start",
@@ -103,9 +105,12 @@ def carry_on(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: str | Executor | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
-    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+    """Finish a run and write its files, as :func:`go_on` does; return the result."""
+    return go_on(
+        folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+    ).result
 
 
 def go_on(
@@ -117,8 +122,9 @@ def go_on(
     steps: int | None = None,
     engine: Engine | None = None,
     files: bool = True,
+    how: str | Executor | None = None,
 ) -> Run:
-    """Do what is left of a run.
+    """Finish a run.
 
     Parameters
     ----------
@@ -135,6 +141,8 @@ def go_on(
         here on not the same bits.
     files
         Write what a run leaves besides its config, records and chain.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -143,15 +151,15 @@ def go_on(
     """
     begun = time.monotonic()
     with folder.locked(), one_thread():
-        if any(wanted is not None for wanted in (ess, steps, engine)):
+        if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
         with (
             _chain(folder, problem, console, engine) as chain,
-            executor(workers, problem.posterior.engine) as pool,
+            executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
-            # It is written last, as the sign that all is there; now something is to come.
+            # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
@@ -207,7 +215,7 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
 
 
 def _chain(
-    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
 ) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
@@ -215,7 +223,7 @@ def _chain(
         chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
-            if wanted is None:
+            if requested is None:
                 chain.close()
                 raise InputError(
                     f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
@@ -250,9 +258,9 @@ def _retarget(
     folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
 ) -> None:
     config = load(folder.config)
-    wanted = {"ess": ess, "steps": steps, "engine": engine}
+    changes = {"ess": ess, "steps": steps, "engine": engine}
     sampling = config.sampling.model_copy(
-        update={name: value for name, value in wanted.items() if value is not None}
+        update={name: value for name, value in changes.items() if value is not None}
     )
     text = dump(config.model_copy(update={"sampling": sampling}))
     parse(text, "resume")  # refuses what a config cannot say
@@ -292,7 +300,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
-    found = {
+    series = {
         name: innovations.innovations(alone, one[0], problem.records[name].start)
         for name, alone, one in posterior.each(best[np.newaxis])
     }
@@ -317,10 +325,10 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     several = len(problem.records) > 1
     odd = [
         f"{name}: {remark}" if several else remark
-        for name, one in found.items()
+        for name, one in series.items()
         for remark in innovations.remarks(one)
     ]
-    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
     return replace(
         result,
         bands=bands,
@@ -330,7 +338,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
             if one.name in verdicts
         },
         verdicts=verdicts,
-        innovations=found,
+        innovations=series,
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, stepped(problem)),
         agreement=compared,
@@ -350,15 +358,22 @@ def going_on(path: Path, problem: Problem) -> str:
     return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
-def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
-    numbers = summary(result) | {
+def numbers_of(
+    folder: RunFolder, problem: Problem, result: Result, seconds: float
+) -> dict[str, object]:
+    """Return a run's numbers as its summary holds them."""
+    return summary(result) | {
         "seed": problem.config.seed,
         "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.sha256,
     }
+
+
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write all files of a run; the summary last, as the sign that all is done."""
+    numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.records)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures

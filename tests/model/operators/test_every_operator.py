@@ -68,7 +68,7 @@ def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
 def test_states_that_are_reachable_are_inside_the_prior(name: str) -> None:
     of = posterior(name)
     column = of.table.columns(drawn(of, 200))
-    (initial,) = (p for p in of.prior.free if p.name == "initial")
+    (initial,) = (p for p in of.prior.parameters if p.name == "initial")
     low, high = initial.limits(column)
     least, most = of.only.actuator.hysteresis.reachable(
         column, float(of.only.voltage[0]), Span(-100.0, 100.0)
