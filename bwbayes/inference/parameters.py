@@ -17,8 +17,9 @@ from functools import cached_property
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
+from bwbayes.model.closed import Scored
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
 
@@ -142,6 +143,9 @@ class JointPrior:
         self._known = {
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
         }
+        self._free_rows = [self.names.index(name) for name in self.free_names]
+        self._fixed_rows = [self.names.index(name) for name in self._fixed]
+        self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -172,11 +176,10 @@ class JointPrior:
 
     def theta(self, free: FloatArray) -> FloatArray:
         """Put free parameters (models, free) and fixed ones together: (models, parameters)."""
-        columns = dict(zip(self.free_names, free.T, strict=True))
-        ones = np.ones(free.shape[0])
-        return np.stack(
-            [columns[n] if n in columns else self._fixed[n] * ones for n in self.names], axis=1
-        )
+        theta = np.empty((len(self.names), free.shape[0]))
+        theta[self._free_rows] = free.T
+        theta[self._fixed_rows] = self._fixed_values
+        return theta.T
 
     def log_density(self, free: FloatArray) -> FloatArray:
         """Log density (models,) of free parameters (models, free), up to a constant."""
@@ -230,22 +233,55 @@ class JointPrior:
 
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
+        # A parameter is a row here, so that what is done with one is done with neighbours.
+        given = np.ascontiguousarray(coordinates.T)
+        safe = np.clip(given, -FARTHEST, FARTHEST)
+        free, possible = np.empty_like(safe), np.equal(safe, given).all(axis=0)
+        self._plain.fill(free, safe)
         values = self._values(None, rows=coordinates.shape[0])
-        safe = np.clip(coordinates, -FARTHEST, FARTHEST)
+        values.update(zip(self.free_names, free, strict=True))
         room = np.ones(coordinates.shape[0])
-        for parameter, z in zip(self.free, safe.T, strict=True):
+        for row, parameter in self._cut:
             assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            x, between = parameter.prior.from_normal(z, *bounds)
-            # Rounding may put a positive parameter on its open bound, where there is no model.
-            room = room * np.where(parameter.above_floor(x), between, 0)
-            values[parameter.name] = x
+            free[row], between = parameter.prior.from_normal(safe[row], *bounds)
+            room *= between
+        # Rounding may put a positive parameter on its open bound, where there is no model.
+        possible &= self._above_floors(free)
         if self.constraint is not None:
-            room = np.where(self.constraint(values), room, 0)
+            possible &= self.constraint(values)
         with np.errstate(divide="ignore"):
-            log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
-        log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
-        return np.stack([values[name] for name in self.free_names], axis=1), log_prior
+            log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
+        return free.T, np.where(possible, log_prior, -np.inf)
+
+    @cached_property
+    def _plain(self) -> _Plain:
+        """The free parameters that a formula maps and nothing ever cuts."""
+        return _Plain.of(self.free)
+
+    @cached_property
+    def _cut(self) -> tuple[tuple[int, Parameter], ...]:
+        """The other ones, and which they are of the free ones."""
+        return tuple(
+            (row, parameter)
+            for row, parameter in enumerate(self.free)
+            if row not in self._plain.rows
+        )
+
+    @cached_property
+    def _floors(self) -> tuple[FloatArray, FloatArray]:
+        """What free parameters must be above, or reach at least: two columns."""
+        floors = np.array([parameter.floor for parameter in self.free])
+        reached = [p.declared is None or p.declared.reaches_floor for p in self.free]
+        nothing = np.full(len(self.free), -np.inf)
+        above, least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
+        return above[:, np.newaxis], least[:, np.newaxis]
+
+    def _above_floors(self, free: FloatArray) -> BoolArray:
+        """Tell which models (models,) of free parameters (free, models) are on or above floors."""
+        above, least = self._floors
+        inside: BoolArray = ((free > above) & (free >= least)).all(axis=0)
+        return inside
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
@@ -256,21 +292,64 @@ class JointPrior:
 
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
-        low, high = (np.asarray(end) for end in parameter.support)
-        if parameter.declared is None or parameter.declared.bounds is None:
-            return low, high
-        known = {name: values[name] for name in self._known[parameter.name]}
-        least, most = parameter.limits(known)
+        declared = parameter.declared
+        low, high = parameter.support
+        if declared is None or declared.bounds is None:
+            return np.asarray(low), np.asarray(high)
+        least, most = declared.bounds({name: values[name] for name in self._known[parameter.name]})
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
-        low = low if np.all(np.isneginf(least)) else np.maximum(low, least)
-        high = high if np.all(np.isposinf(most)) else np.minimum(high, most)
-        return low, high
+        cut = np.any(np.greater(least, low)), np.any(np.less(most, high))
+        return (
+            np.maximum(low, least) if cut[0] else np.asarray(low),
+            np.minimum(high, most) if cut[1] else np.asarray(high),
+        )
 
     def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
         low, high = self._limits(parameter, values)
         x = values[parameter.name]
         inside: BoolArray = (low <= x) & (x <= high) & parameter.above_floor(x)
         return inside
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """Parameters whose normal scores a formula maps to values, all at once.
+
+    ``rows`` are their places among the free ones; ``normal`` and ``lognormal`` those of each kind,
+    with their centres and scales as columns.
+    """
+
+    rows: frozenset[int]
+    normal: tuple[IntArray, FloatArray, FloatArray]
+    lognormal: tuple[IntArray, FloatArray, FloatArray]
+
+    @classmethod
+    def of(cls, free: Iterable[Parameter]) -> _Plain:
+        """Find them among the free parameters."""
+        kinds: dict[bool, list[tuple[int, float, float]]] = {False: [], True: []}
+        for row, parameter in enumerate(free):
+            assert parameter.prior is not None
+            form, declared = parameter.prior.form, parameter.declared
+            bounded = declared is not None and declared.bounds is not None
+            whole = parameter.support == parameter.prior.support
+            if isinstance(form, Scored) and whole and not bounded:
+                kinds[form.logarithmic].append((row, form.centre, form.scale))
+        rows = frozenset(row for kind in kinds.values() for row, _, _ in kind)
+        return cls(rows, _columns(kinds[False]), _columns(kinds[True]))
+
+    def fill(self, free: FloatArray, scores: FloatArray) -> None:
+        """Write the values of their scores, both (free, models)."""
+        rows, centre, scale = self.normal
+        if rows.size:
+            free[rows] = centre + scale * scores[rows]
+        rows, centre, scale = self.lognormal
+        if rows.size:
+            free[rows] = centre * np.exp(scale * scores[rows])
+
+
+def _columns(kind: list[tuple[int, float, float]]) -> tuple[IntArray, FloatArray, FloatArray]:
+    rows, centres, scales = np.array(kind).reshape(-1, 3).T
+    return rows.astype(np.int64), centres[:, np.newaxis], scales[:, np.newaxis]
 
 
 def _draw_single(parameter: Parameter, generator: np.random.Generator, size: int) -> FloatArray:
