@@ -24,6 +24,9 @@ LAYERS = (
     ("bwbayes.inference",),
     ("bwbayes.sampling",),
     ("bwbayes.results",),
+    ("bwbayes.comparison",),
+    ("bwbayes.population",),
+    ("bwbayes.control",),
     ("bwbayes.app",),
 )
 
@@ -33,7 +36,12 @@ KEEPERS = {
     "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves", "bwbayes.sampling.walking"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_stats": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_stats": (
+        "bwbayes.sampling.diagnostics",
+        "bwbayes.results.*",
+        "bwbayes.population.population",
+        "bwbayes.app.*",
+    ),
     "matplotlib": (
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",
@@ -42,7 +50,7 @@ KEEPERS = {
     "corner": ("bwbayes.app.figures*",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
-    "jinja2": ("bwbayes.app.*",),
+    "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),
     "pydantic": ("bwbayes.app.*",),
     "tomlkit": ("bwbayes.app.*",),
 }

@@ -85,7 +85,7 @@ def start(
 
     The optima of the point fit take turns; from there the point lies ten posterior sds off in a
     random direction (nearer where the density is zero), so that ensembles agree only after they
-    have found the same posterior.
+    have reached the same posterior.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
     """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
 
     As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
-    but for all walkers at once: the mean is taken of their spectra, and transformed back once. It
+    here for all walkers at once: the mean is taken of their spectra, and transformed back once. It
     is nan where it cannot be told, for instance where nothing moves.
     """
     steps = draws.shape[0]
@@ -194,8 +194,8 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
         power /= np.sum(away**2, axis=-1, keepdims=True)
         correlation = fft.irfft(np.mean(power, axis=0), padded)[:, :steps]
     times = 2 * np.cumsum(correlation, axis=1) - 1
-    found = np.array([time[auto_window(time, WINDOW)] for time in times])
-    return np.where(found > 0, found, np.nan)
+    windowed = np.array([time[auto_window(time, WINDOW)] for time in times])
+    return np.where(windowed > 0, windowed, np.nan)
 
 
 def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:

@@ -55,7 +55,7 @@ __all__ = [
     "sample",
 ]
 
-# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# Nested R-hat of the pilot's second half below which its ensembles have met. After so
 # many steps it is enough if each stays where it is: in modes far apart differential evolution would
 # keep them for ever, and a proposal fitted to all of them will not.
 PILOT_RHAT = 1.1
@@ -82,7 +82,7 @@ LIGHT = 1 << 16
 Watcher = Callable[[Phase, Check | None], None]
 
 
-def _unwatched(phase: Phase, found: Check | None) -> None:
+def _unwatched(phase: Phase, latest: Check | None) -> None:
     """Watch nothing."""
 
 
@@ -235,20 +235,22 @@ def _sampled(
         blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
     part = 1.0 if passed else FIRST_PART
-    fewest = np.min([found.ess_bulk, found.ess_tail])
+    fewest = np.min([latest.ess_bulk, latest.ess_tail])
     with np.errstate(divide="ignore"):
-        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = max(part * steps / plan.block, APART * passed)
-    if not wanted > blocks:  # nan too
-        wanted = LEAST_STRETCH * blocks
-    return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
+        steps = np.maximum(
+            latest.steps * plan.ess / fewest, LENGTH * np.max(latest.autocorrelation)
+        )
+    following = max(part * steps / plan.block, APART * passed)
+    if not following > blocks:  # nan too
+        following = LEAST_STRETCH * blocks
+    return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
 class _Judge:
@@ -279,11 +281,11 @@ class _Judge:
             self._prepare(number)
         self.prepared = blocks
         (every,) = self.draws = self._joined(self.draws)
-        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
+        latest = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
         if self.proposal is None:
-            return found
+            return latest
         (weights,) = self.log_weights = self._joined(self.log_weights)
-        return replace(found, pareto_k=pareto_k(weights.ravel()))
+        return replace(latest, pareto_k=pareto_k(weights.ravel()))
 
     @staticmethod
     def _joined(kept: list[FloatArray]) -> list[FloatArray]:
@@ -326,7 +328,7 @@ def _thinned(chain: Chain) -> tuple[str, ...]:
     thin = thinning(chain.draws("sampling"))
     if thin == 1:
         return ()
-    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to limit the memory",)
 
 
 def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:

@@ -24,9 +24,11 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.run import (
@@ -43,6 +45,7 @@ from bwbayes.app.screen import (
     score_texts,
     show_result,
 )
+from bwbayes.control.exported import Exported
 from bwbayes.data import Record
 from bwbayes.errors import InputWarning, NotConvergedError
 from bwbayes.inference.engine import Engine
@@ -56,7 +59,7 @@ from bwbayes.sampling.storage import ChainFile
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Fit", "Scratch", "carried_on", "to_know", "warn"]
+__all__ = ["Fit", "Scratch", "carried_on", "console_of", "to_know", "warn"]
 
 # Whether bands hold, in a word.
 HELD = {True: "yes", False: "NO", None: "unknown"}
@@ -248,6 +251,24 @@ class Fit:
             warn([made.verdict.line], 3)
         return made
 
+    def compare(self, *others: Fit, **options: Any) -> Compared:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        ``options`` (future, workers) and errors are as of
+        :func:`bwbayes.app.fit.compared.compared`.
+        """
+        return compared((self, *others), **options)
+
+    def export(self, folder: str | Path, **options: Any) -> Exported:
+        """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
+
+        ``options`` (limits, rate, hold, overwrite) and errors are as of
+        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
+        discrete ``scipy.signal`` system.
+        """
+        draws = self._converged().flat_draws
+        return export_draws(self.problem, draws, Path(folder), **options)[0]
+
     def resume(
         self,
         *,
@@ -255,13 +276,16 @@ class Fit:
         steps: int | None = None,
         engine: Engine | None = None,
         workers: int | None = None,
+        executor: Any = None,
         progress: bool = True,
     ) -> Fit:
         """Go on sampling, with a new target or budget, and return what comes of it.
 
         Parameters and errors are as in :func:`bwbayes.resume_run`.
         """
-        made = carried_on(self.folder, self._scratch, progress, workers, ess, steps, engine)
+        made = carried_on(
+            self.folder, self._scratch, progress, workers, ess, steps, engine, executor
+        )
         warn(to_know(made), 3)
         return made
 
@@ -321,7 +345,7 @@ class Fit:
 
 
 class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
+    """A temporary folder that is removed when nobody needs it any more."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
@@ -336,24 +360,26 @@ def carried_on(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
-        _console(progress),
+        console_of(progress),
         workers=workers,
         ess=ess,
         steps=steps,
         engine=engine,
         files=scratch is None,
+        how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
 
 
-def _console(progress: bool) -> Console:
+def console_of(progress: bool) -> Console:
     """Return where progress goes: the terminal's own lines, and in a notebook plain ones."""
     if Console(quiet=True).is_jupyter:
         return Console(file=sys.stdout, force_jupyter=False, quiet=not progress)

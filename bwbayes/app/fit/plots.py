@@ -44,7 +44,7 @@ class Plots:
     def record(self, kind: str = "time") -> Figure:
         """Draw the training record: along "time", as a "loop", or its "drive"'s spectrum."""
         problem = self.problem
-        every = draw_record(problem.record, problem.posterior.training, problem.findings)
+        every = draw_record(problem.record, problem.posterior.only.training, problem.findings)
         return _named(every, kind)
 
     def loop(self, *names: str) -> Figure:
@@ -64,7 +64,7 @@ class Plots:
         return _drawn(draw_coverage, result.bands, result.scores)
 
     def innovations(self) -> Figure:
-        """Draw whether what each reading brings anew is white, normal and of one size."""
+        """Draw whether innovations, what each reading adds, are white, normal, of one size."""
         return _drawn(draw_innovations, self.converged().innovations)
 
     def corner(self) -> Figure:

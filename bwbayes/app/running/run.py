@@ -12,6 +12,7 @@ import platform
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -57,6 +58,7 @@ __all__ = [
     "go_on",
     "judged",
     "load_run",
+    "numbers_of",
     "predictions",
     "redraw",
     "start",
@@ -104,9 +106,12 @@ def carry_on(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: str | Executor | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
-    return go_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine).result
+    """Finish a run and write its files, as :func:`go_on` does; return the result."""
+    return go_on(
+        folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+    ).result
 
 
 def go_on(
@@ -118,8 +123,9 @@ def go_on(
     steps: int | None = None,
     engine: Engine | None = None,
     files: bool = True,
+    how: str | Executor | None = None,
 ) -> Run:
-    """Do what is left of a run.
+    """Finish a run.
 
     Parameters
     ----------
@@ -136,6 +142,8 @@ def go_on(
         here on not the same bits.
     files
         Write what a run leaves besides its config, records and chain.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -144,15 +152,15 @@ def go_on(
     """
     begun = time.monotonic()
     with folder.locked(), one_thread():
-        if any(wanted is not None for wanted in (ess, steps, engine)):
+        if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
         with (
             _chain(folder, problem, console, engine) as chain,
-            executor(workers, problem.posterior.engine) as pool,
+            executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
-            # It is written last, as the sign that all is there; now something is to come.
+            # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
@@ -208,7 +216,7 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
 
 
 def _chain(
-    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
 ) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
@@ -216,7 +224,7 @@ def _chain(
         chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
-            if wanted is None:
+            if requested is None:
                 chain.close()
                 raise InputError(
                     f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
@@ -251,9 +259,9 @@ def _retarget(
     folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
 ) -> None:
     config = load(folder.config)
-    wanted = {"ess": ess, "steps": steps, "engine": engine}
+    changes = {"ess": ess, "steps": steps, "engine": engine}
     sampling = config.sampling.model_copy(
-        update={name: value for name, value in wanted.items() if value is not None}
+        update={name: value for name, value in changes.items() if value is not None}
     )
     text = dump(config.model_copy(update={"sampling": sampling}))
     parse(text, "resume")  # refuses what a config cannot say
@@ -275,7 +283,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *identifiability.remarks(posterior, chain.point, flat),
     ]
     columns = posterior.table.columns(posterior.prior.theta(flat))
-    remarks += posterior.actuator.hysteresis.remarks(columns, posterior.names)
+    remarks += posterior.only.actuator.hysteresis.remarks(columns, posterior.names)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
@@ -292,7 +300,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
-    found = innovations.innovations(posterior, best, problem.record.start)
+    series = innovations.innovations(posterior, best, problem.record.start)
     # By a second point fit, without the record's start.
     source = generator(problem.config.seed, "without start")
     moved = without_start(
@@ -302,7 +310,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         problem.record.start,
         seen=any(one.kind == "switch-on transient" for one in problem.findings),
     )
-    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
     return replace(
         result,
         bands=bands,
@@ -312,17 +320,18 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
             if one.name in verdicts
         },
         verdicts=verdicts,
-        innovations=found,
+        innovations=series,
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, problem.others),
-        remarks=(*result.remarks, *innovations.remarks(found)),
+        remarks=(*result.remarks, *innovations.remarks(series)),
     )
 
 
 def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
     record, config = problem.record, problem.config
     windows = ", ".join(
-        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s" for w in posterior.training
+        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
+        for w in posterior.only.training
     )
     accepted = {
         phase: ", ".join(
@@ -356,15 +365,22 @@ def going_on(path: Path, problem: Problem) -> str:
     return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
 
 
-def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
-    numbers = summary(result) | {
+def numbers_of(
+    folder: RunFolder, problem: Problem, result: Result, seconds: float
+) -> dict[str, object]:
+    """Return a run's numbers as its summary holds them."""
+    return summary(result) | {
         "seed": problem.config.seed,
         "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
         "data_sha256": problem.record.sha256,
     }
+
+
+def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+    """Write all files of a run; the summary last, as the sign that all is done."""
+    numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.record)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures

@@ -71,8 +71,8 @@ def moments(
         if able.all():
             sums = kernels.sums(*record, models, stage.kind, own, stage.plan, *parts, *unknowns)
         else:
-            mine = models[able], stage.kind, own[able], stage.plan
-            sums[:, able] = kernels.sums(*record, *mine, *parts, *unknowns)
+            mine = stage.kind, own[able], stage.plan
+            sums[:, able] = kernels.sums(*record, models[able], *mine, *parts, *unknowns)
     others = np.flatnonzero(~able)
     size = max(LARGEST // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
