@@ -26,6 +26,7 @@ from rich.console import Console
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.report import template
 from bwbayes.app.running.folder import RunFolder
@@ -45,6 +46,7 @@ from bwbayes.app.screen import (
     show_result,
 )
 from bwbayes.control.exported import Exported
+from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
 from bwbayes.errors import InputWarning, NotConvergedError
 from bwbayes.inference.engine import Engine
@@ -253,12 +255,18 @@ class Fit:
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-        ``options`` (limits, rate, hold, overwrite) and errors are as of
-        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
-        discrete ``scipy.signal`` system.
+        Options and errors are those of :func:`bwbayes.app.jobs.export.export_draws`. What is
+        returned has the ``linear`` part as a discrete ``scipy.signal`` system.
         """
         draws = self._converged().flat_draws
         return export_draws(self.problem, draws, Path(folder), **options)[0]
+
+    def track(self, **options: Any) -> Tracking:
+        """Say how well a closed loop would follow, with and without the model.
+
+        Options are the fields of :class:`bwbayes.app.jobs.track.Setup`.
+        """
+        return track_draws(self.problem, self._converged().flat_draws, Setup(**options))
 
     def resume(
         self,
