@@ -36,16 +36,17 @@ def slowly(
     shape = controllers, signals, len(theta)
     rms, largest = np.empty(shape), np.empty(shape)
     for c, s, m in np.ndindex(shape):
-        held, readings, answers, errors = [], [], [0.0] * stand.delay, [0.0, 0.0]
-        missed = []
+        held: list[float] = []
+        missed: list[float] = []
+        answers, errors = [0.0] * stand.delay, [0.0, 0.0]
         answer = 0.0
         for t in range(samples - 1):
             # Held voltages act a sample later, so the present one may be anything.
             voltage = np.array([0.0, *held, 0.0])
             x = actuator.displacement(theta[m : m + 1], voltage, from_rest=True)[0, -1]
             missed.append(x - plan.reference[s, t])
-            readings.append(stand.sensor.step * np.round(x / stand.sensor.step))
-            errors.append(plan.targets[c, s, t] - readings[-1])
+            reading = stand.sensor.step * np.round(x / stand.sensor.step)
+            errors.append(plan.targets[c, s, t] - reading)
             if plan.looks[c]:
                 answer += sum(q * e for q, e in zip(gains.steps, errors[:-4:-1], strict=True))
                 later = plan.ahead[c, s, t + stand.delay] if t + stand.delay < samples else 0.0
