@@ -14,6 +14,8 @@ from bwbayes.app.commands import cli, run
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import Proposal, propose
 from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import load_run
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.data.teststand import VirtualTestStand
@@ -278,6 +280,30 @@ def test_run_without_a_config_runs_the_proposed_one(
     assert [4.5, 6.0] == config.validation["held_out"].window
     said = command("run", path, "--out", tmp_path / "again").output
     assert "fitting 0 to 4.5 s; the rest is held out; `bwbayes init" in said
+
+
+@pytest.mark.parametrize("command_line", ["init", "run", "run my.toml"])
+def test_what_the_reader_remarks_is_shown_and_kept(
+    write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command_line: str
+) -> None:
+    """Of a record that is run at once, of a config's, and in the run's folder ever after."""
+    path = write()
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
+    remark = "mine.csv:1: ignored columns: temperature_C"
+    monkeypatch.setattr(run, "finish", lambda *_: 0)
+    name, _, config = command_line.partition(" ")
+    if config:
+        path = path.with_suffix(".toml")
+        path.write_text('[record]\nfile = "mine.csv"\n[model]\ndynamics = "lag"\n')
+    out: list[str | Path] = [] if name == "init" else ["--out", tmp_path / "out"]
+    done = command(name, path, *out)
+    assert 0 == done.return_value
+    assert 1 == done.output.count(remark), done.output
+    if name == "run":
+        kept = load_run(RunFolder(tmp_path / "out"))
+        assert [remark] == [one.removeprefix(f"{tmp_path}/") for one in kept.remarks]
+        assert resolve(kept.config, tmp_path / "out").config == kept.config
 
 
 def test_check_takes_a_record_and_shows_what_a_run_refuses(write: Write, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ __all__ = ["resume", "run"]
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
-@click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing run.")
 @workers_option
 @executor_option
 @quiet_option
@@ -40,19 +40,23 @@ def run(
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     from bwbayes.app.running.run import load_run, start
-    from bwbayes.app.screen import show_priors
+    from bwbayes.app.screen import show_priors, show_remarks
+    from bwbayes.data.io.formats import SUFFIXES
 
-    wanted = config_or_proposal(config, Console(quiet=quiet))
+    chosen = config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
-        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        wanted = wanted.model_copy(update={"record": source})
+        source = chosen.record.model_copy(update={"file": str(record.resolve()), "signal": None})
+        chosen = chosen.model_copy(update={"record": source})
     if seed is not None:
-        wanted = wanted.model_copy(update={"seed": seed})
-    if wanted.name is None:
-        wanted = wanted.model_copy(update={"name": config.stem})
-    folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+        chosen = chosen.model_copy(update={"seed": seed})
+    if chosen.name is None:
+        chosen = chosen.model_copy(update={"name": config.stem})
+    folder = start(chosen, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
     if not quiet:
-        show_priors(load_run(folder).posterior.prior, Console())
+        problem = load_run(folder)
+        if config.suffix.lower() not in SUFFIXES:  # of a record alone they are shown already
+            show_remarks(problem.remarks, Console())
+        show_priors(problem.posterior.prior, Console())
     return finish(folder.path, workers, quiet, how=how)
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.fit.fitted import Fit, carried_on, to_know
+from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
@@ -38,7 +39,7 @@ def fit(
     record
         The training record, or its file.
     folder
-        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is there after
+        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
     overwrite
         Replace a run that is in the folder already.
@@ -121,7 +122,7 @@ def resume_run(
     Raises
     ------
     InputError
-        No such run, or its files do not fit together.
+        No such run, or its files do not belong together.
 
     Warns
     -----

@@ -9,11 +9,6 @@ does. What the command line prints as a remark is a warning here
 from __future__ import annotations
 
 import shutil
-import sys
-import tempfile
-import warnings
-import weakref
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import StringIO
@@ -24,11 +19,13 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.run import (
@@ -48,7 +45,7 @@ from bwbayes.app.screen import (
 from bwbayes.control.exported import Exported
 from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
-from bwbayes.errors import InputWarning, NotConvergedError
+from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -60,7 +57,7 @@ from bwbayes.sampling.storage import ChainFile
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Fit", "Scratch", "carried_on", "console_of", "to_know", "warn"]
+__all__ = ["Fit", "carried_on", "to_know"]
 
 # Whether bands hold, in a word.
 HELD = {True: "yes", False: "NO", None: "unknown"}
@@ -252,6 +249,14 @@ class Fit:
             warn([made.verdict.line], 3)
         return made
 
+    def compare(self, *others: Fit, **options: Any) -> Compared:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        ``options`` (future, workers) and errors are as of
+        :func:`bwbayes.app.fit.compared.compared`.
+        """
+        return compared((self, *others), **options)
+
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
@@ -343,14 +348,6 @@ class Fit:
         )
 
 
-class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
-        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
-
-
 def carried_on(
     folder: RunFolder,
     scratch: Scratch | None,
@@ -361,7 +358,7 @@ def carried_on(
     engine: Engine | None = None,
     how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
         console_of(progress),
@@ -373,16 +370,9 @@ def carried_on(
         how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
-
-
-def console_of(progress: bool) -> Console:
-    """Return where progress goes: the terminal's own lines, and in a notebook plain ones."""
-    if Console(quiet=True).is_jupyter:
-        return Console(file=sys.stdout, force_jupyter=False, quiet=not progress)
-    return Console(stderr=True, quiet=not progress)
 
 
 def to_know(made: Fit) -> list[str]:
@@ -391,9 +381,3 @@ def to_know(made: Fit) -> list[str]:
     if not made.converged:
         lines.append(f"not converged: {made.outcome.stop_reason}; no interval is given")
     return lines
-
-
-def warn(lines: Iterable[str], level: int) -> None:
-    """Warn of each line; the caller of the function that calls this is level 3."""
-    for line in lines:
-        warnings.warn(line, InputWarning, stacklevel=level)

@@ -1,6 +1,6 @@
 """From a config to a problem: records read, windows cut, every prior a number.
 
-:func:`resolve` does once what must not happen twice: it runs the virtual stand, draws up default
+:func:`resolve` does once what must not happen twice: it runs the virtual stand, sets default
 priors, and takes ``hold = "auto"`` from the record. What comes out is a config that says all this
 in explicit numbers and refers to the records as files beside it, so that a run's folder can be
 moved, continued and run again by itself.
@@ -15,12 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.app.config.config import (
-    Config,
-    RecordConfig,
-    SignalConfig,
-    ValidationConfig,
-)
+from bwbayes.app.config.config import Config, RecordConfig, SignalConfig, ValidationConfig
 from bwbayes.app.problem.model import actuator_of, explicit_model
 from bwbayes.app.problem.parameters import as_config, context_of, parameters_of
 from bwbayes.app.problem.stand import planned, recoverable, stand_of
@@ -28,15 +23,7 @@ from bwbayes.data import Record, Split, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Carrier,
-    Decay,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    signal,
-)
+from bwbayes.data.waveforms import Carrier, Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -48,7 +35,7 @@ from bwbayes.inference.table import Table
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.sampler import SamplingPlan, best_together
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -80,8 +67,8 @@ class Problem:
     validations: Mapping[str, Validation]
     remarks: tuple[str, ...] = ()
     defaults: Mapping[str, Distribution] = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()
     """What the default priors of this record would be, by name."""
+    findings: tuple[Finding, ...] = ()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -100,22 +87,18 @@ def generator(seed: int, purpose: str) -> np.random.Generator:
     return np.random.default_rng([seed, *purpose.encode()])
 
 
-def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
-    """Return the waveform of that name, or the one a config draws up."""
-    if isinstance(wanted, str):
-        return signal(wanted)
+def sampled_waveform(source: str | SignalConfig) -> Waveform:
+    """Return the waveform of that name, or the one that a config describes."""
+    if isinstance(source, str):
+        return signal(source)
     carrier: Carrier
-    if wanted.shape == "steps":
-        carrier = Staircase(tuple(wanted.levels or ()), wanted.dwell or 0.0)
+    if source.shape == "steps":
+        carrier = Staircase(tuple(source.levels or ()), source.dwell or 0.0)
     else:
-        shape = Sine if wanted.shape == "sine" else Triangle
-        carrier = shape(wanted.amplitude or 0.0, wanted.frequency or 0.0)
-    return Waveform(
-        carrier,
-        wanted.duration,
-        wanted.start,
-        Decay(wanted.decay_from, wanted.decay),
-    )
+        shape = Sine if source.shape == "sine" else Triangle
+        carrier = shape(source.amplitude or 0.0, source.frequency or 0.0)
+    decay = Decay(source.decay_from, source.decay)
+    return Waveform(carrier, source.duration, source.start, decay)
 
 
 def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
@@ -139,9 +122,10 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             for name, validation in config.validation.items()
             if validation.another
         }
-    remarks = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    said = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    said = list(dict.fromkeys([*(config.record.remarks or ()), *said]))
     findings = _findings(record, (*split.training, *split.held_out))
-    remarks += [f"record: {finding}" for finding in findings]
+    remarks = [*said, *(f"record: {finding}" for finding in findings)]
     remarks += [text for name, other in others.items() for text in _unlike(config, name, other)]
     actuator = actuator_of(config.model, record)
     noise = noise_model(config.model.noise, record.interval)
@@ -149,7 +133,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     parameters = parameters_of(config, table.declarations, context)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     if not prior.dimensions:
-        raise InputError("parameters: all are fixed, so there is nothing to find; free some")
+        raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
     assert record.displacement is not None
     dataset = Dataset(
         record.voltage,
@@ -186,7 +170,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         leaving = beyond_training(posterior, voltage, other.interval)
         remarks += [f"{name}: {remark}" for remark in leaving]
     truth = (recoverable(stand, actuator) if stand else {}) | config.truth
-    explicit = _explicit(config, posterior, truth, aside)
+    explicit = _explicit(config, posterior, truth, aside, said)
     plan = _plan(config, posterior)
     return Problem(
         explicit,
@@ -201,7 +185,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
 
 
 def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
-    """Return what is wrong with a record, but for places that no window looks at."""
+    """Return what is wrong with a record in the places that some window uses."""
     # Borders that differ by less than half a sample are the same.
     times = [
         record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
@@ -300,8 +284,8 @@ def _start(config: Config, name: str) -> Start:
     )
 
 
-def _named(record: Record, wanted: str | SignalConfig) -> Record:
-    name = wanted if isinstance(wanted, str) else wanted.shape
+def _named(record: Record, source: str | SignalConfig) -> Record:
+    name = source if isinstance(source, str) else source.shape
     return replace(record, origin=f"{record.origin}, {name} signal")
 
 
@@ -348,6 +332,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
+        together=best_together(given.ensembles, walkers, posterior.readings.samples),
     )
 
 
@@ -366,6 +351,7 @@ def _explicit(
     posterior: Posterior,
     truth: Mapping[str, float],
     outliers: list[float] | None,
+    remarks: list[str],
 ) -> Config:
     """Return the config with every choice made, its records as files beside it."""
     prior = posterior.prior
@@ -387,6 +373,7 @@ def _explicit(
                 train=config.record.train,
                 from_rest=config.record.from_rest,
                 outliers=outliers,
+                remarks=remarks or None,
             ),
             "model": explicit_model(config.model, posterior.only.actuator),
             "parameters": {p.name: as_config(p) for p in prior.parameters},

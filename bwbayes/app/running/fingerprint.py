@@ -27,6 +27,7 @@ FREE_TO_CHANGE = (
     "truth",
     "validation",
     "record.file",
+    "record.remarks",
     "record.signal",
     "sampling.engine",
     "sampling.ess",
