@@ -27,6 +27,7 @@ from bwbayes.app.commands.report import report
 from bwbayes.app.commands.run import resume, run
 from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
 from bwbayes.app.commands.simulate import simulate
+from bwbayes.app.commands.track import track
 from bwbayes.errors import InputError
 
 __all__ = ["main"]
@@ -53,6 +54,7 @@ for command in (
     calibrate,
     campaign,
     export,
+    track,
     compare,
     config,
     models,

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.fit.fitted import Fit, carried_on, to_know
+from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
