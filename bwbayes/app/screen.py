@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -14,6 +15,10 @@ from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
+from bwbayes.comparison.choice import Comparison
+from bwbayes.comparison.table import COLUMNS as COMPARED
+from bwbayes.comparison.table import DIFFERENCE_COLUMNS, differences
+from bwbayes.comparison.table import rows as compared
 from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
@@ -30,6 +35,7 @@ __all__ = [
     "score_texts",
     "show_calibration",
     "show_campaign",
+    "show_comparison",
     "show_loops",
     "show_priors",
     "show_remarks",
@@ -41,6 +47,9 @@ __all__ = [
 
 # Probability by which constraints must move a quantile to be shown: more than draws do.
 CHANGED = 0.03
+
+# Columns of a comparison that a terminal has room for: the page has all.
+ON_SCREEN = (0, 1, 2, 4, 5, 6, 8)
 
 PARAMETER_COLUMNS = ("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
 SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
@@ -200,6 +209,28 @@ def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Con
         highlight=False,
         soft_wrap=True,
     )
+
+
+def show_comparison(comparison: Comparison, folder: Path | None, console: Console) -> None:
+    """Show what is recommended, what speaks against it, and the models' numbers."""
+    first, *others = comparison.lines
+    console.print(f"[bold]{escape(first)}[/]", highlight=False, soft_wrap=True)
+    for line in others:
+        console.print(escape(line), highlight=False, soft_wrap=True)
+    for line in comparison.against:
+        console.print(f"against it: {escape(line)}", highlight=False, soft_wrap=True)
+    table = Table(*(COMPARED[i] for i in ON_SCREEN))
+    for row in compared(comparison):
+        table.add_row(*(escape(row[i]) for i in ON_SCREEN))
+    console.print(table)
+    table = Table(*DIFFERENCE_COLUMNS)
+    for row in differences(comparison):
+        table.add_row(*map(escape, row))
+    if table.row_count:
+        console.print(f"less {escape(comparison.best or '')}:", highlight=False)
+        console.print(table)
+    if folder is not None:
+        console.print(f"report: {folder / 'comparison.html'}", highlight=False, soft_wrap=True)
 
 
 def show_priors(

@@ -23,6 +23,7 @@ from bwbayes.control.sampled import (
     NEWTON_ROUNDS,
     SampledModel,
     require_inverse,
+    resolution,
 )
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -139,6 +140,7 @@ class Exported:
             growth=self._growth,
             inverse=self.without_inverse is None,
             without_inverse=_plain(self.without_inverse or ""),
+            close=resolution(self.limits),
             newton=NEWTON_ROUNDS,
             bisection=BISECTION_ROUNDS,
         )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.control.steps import HysteresisStep, step_of
+from bwbayes.control.steps import Gone, HysteresisStep, step_of
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
@@ -29,6 +29,7 @@ __all__ = [
     "Sections",
     "SteppedState",
     "require_inverse",
+    "resolution",
     "sections_of",
     "zeros",
 ]
@@ -113,8 +114,7 @@ class SampledModel:
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        memory = self.step.after(self.step.demagnetised(), voltage)
-        rest = self._drive(memory, voltage)[0]
+        rest, _, memory = self.drive(self.step.demagnetised(), voltage)
         filters = np.zeros((*self.sections.gains.shape, 2))
         return SteppedState(memory, voltage, rest, rest * self._growth(voltage), filters)
 
@@ -123,36 +123,46 @@ class SampledModel:
         before = np.where(self.sections.crept, state.crept_rest[:, None], state.rest[:, None])
         return (self.sections.gains * before).sum(axis=1)
 
+    def displacement(self, state: SteppedState) -> FloatArray:
+        """Return the displacement (models,), um, that a held voltage has led to."""
+        return self.level(state) + (self.sections.gains * state.filters[..., 0]).sum(axis=1)
+
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
         """Return the displacement (models,), um, at a sample with this voltage, and the state.
 
         If the voltage is held, the displacement is that just before it changes.
         """
         numerator, denominator, gains, crept = self.sections
-        w = self._drive(state.memory, voltage)[0]
+        w, _, memory = self.drive(state.memory, voltage)
+        creeping = w if self._even else w * self._growth(voltage)
         drives = np.where(
-            crept,
-            (w * self._growth(voltage) - state.crept_rest)[:, np.newaxis],
-            (w - state.rest)[:, np.newaxis],
+            crept, (creeping - state.crept_rest)[:, np.newaxis], (w - state.rest)[:, np.newaxis]
         )
         moved = numerator[..., 0] * drives + state.filters[..., 0]
         ahead = numerator[..., 1:] * drives[..., np.newaxis]
         ahead -= denominator[..., 1:] * moved[..., np.newaxis]
         ahead[..., 0] += state.filters[..., 1]
         displacement = self.level(state) + (gains * moved).sum(axis=1)
-        after = self.step.after(state.memory, voltage)
-        return displacement, SteppedState(after, voltage, state.rest, state.crept_rest, ahead)
+        return displacement, state._replace(memory=memory, voltage=voltage, filters=ahead)
 
     def inverse(
-        self, state: SteppedState, displacement: FloatArray, limits: Span
+        self,
+        state: SteppedState,
+        displacement: FloatArray,
+        limits: Span,
+        guess: FloatArray | None = None,
+        close: float | None = None,
     ) -> tuple[FloatArray, SteppedState]:
         """Return the voltage (models,), V, that gives a displacement (models,), um, and the state.
 
         If the voltage is held, it is the displacement of the next sample. What would need a voltage
-        outside of the limits gets the limit.
+        outside of the limits gets the limit. The search starts at a ``guess``, or else the last
+        voltage, and ends when it is ``close``, V, by default to the last bits.
         """
         drive, crept, missing = self._instant(state, displacement)
-        voltage = self._solve(state, drive, crept, missing, limits)
+        first = np.clip(state.voltage if guess is None else guess, *limits)
+        close = resolution(limits) if close is None else close
+        voltage = self._solve(state.memory, first, (drive, crept, missing), limits, close)
         return voltage, self.forward(state, voltage)[1]
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
@@ -183,17 +193,17 @@ class SampledModel:
 
     def _solve(
         self,
-        state: SteppedState,
-        drive: FloatArray,
-        crept: FloatArray,
-        missing: FloatArray,
+        memory: FloatArray,
+        voltage: FloatArray,
+        demand: tuple[FloatArray, FloatArray, FloatArray],
         limits: Span,
+        close: float,
     ) -> FloatArray:
-        """Solve (b + b_c (1 + κ |u| / U)) w(u) = ``missing``, rising in u, between limits."""
+        """Solve (b + b_c (1 + κ |u| / U)) w(u) = missing, rising in u, between limits."""
+        drive, crept, missing = demand
         low, high = np.full_like(missing, limits.low), np.full_like(missing, limits.high)
-        voltage = np.clip(state.voltage, low, high)
         for done in range(NEWTON_ROUNDS + BISECTION_ROUNDS):
-            w, slope = self._drive(state.memory, voltage)
+            w, slope, _ = self.drive(memory, voltage)
             factor = drive + crept * self._growth(voltage)
             excess = factor * w - missing
             steepness = factor * slope + crept * w * self._growth_slope(voltage)
@@ -204,22 +214,22 @@ class SampledModel:
                 with np.errstate(divide="ignore", invalid="ignore"):
                     newton = np.clip(voltage - excess / steepness, limits.low, limits.high)
                 better = np.where((newton >= low) & (newton <= high), newton, better)
-            if np.all(better == voltage):
+            moved, voltage = np.abs(better - voltage), better
+            if np.all(moved <= close):
                 break
-            voltage = better
         return voltage
 
-    def _drive(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return hysteresis and gain at a voltage (models,), and their slope."""
-        w, slope = self.step.at(memory, voltage)
+    def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return hysteresis and gain once the voltage has gone there."""
+        w, slope, after = self.step.go(memory, voltage)
         gain = self.actuator.gain
         if gain is None:
-            return w, slope
+            return Gone(w, slope, after)
         x = gain.scaled(voltage)
         for name, power in (("quadratic", 2), ("cubic", 3)):
             if name in gain.terms:
                 w = w + self.column[name] * x**power
-        return w, slope + self._gain_slope(voltage[:, np.newaxis])[:, 0]
+        return Gone(w, slope + self._gain_slope(voltage[:, np.newaxis])[:, 0], after)
 
     def _gain_slope(self, voltage: FloatArray) -> FloatArray:
         """Return the gain's slope (models, any), um/V, at voltages (models or 1, any)."""
@@ -232,10 +242,15 @@ class SampledModel:
                 slope = slope + self.column[name][:, np.newaxis] * power * x ** (power - 1) / half
         return slope
 
+    @property
+    def _even(self) -> bool:
+        """Whether the creep does not grow with the voltage."""
+        return self.actuator.creep is None or not self.actuator.creep.growing
+
     def _growth(self, voltage: FloatArray) -> FloatArray:
         """Return 1 + κ |u| / U (models,)."""
         creep = self.actuator.creep
-        if creep is None or not creep.growing:
+        if creep is None or self._even:
             return np.ones_like(voltage)
         grown: FloatArray = 1 + self.column["creep_growth"] * creep.size(voltage)
         return grown
@@ -243,7 +258,7 @@ class SampledModel:
     def _growth_slope(self, voltage: FloatArray) -> FloatArray:
         """Return the slope of 1 + κ |u| / U, 1/V."""
         creep = self.actuator.creep
-        if creep is None or not creep.growing:
+        if creep is None or self._even:
             return np.zeros_like(voltage)
         slope: FloatArray = (
             np.sign(voltage) * self.column["creep_growth"] * creep.size(np.array(1.0))
@@ -292,6 +307,11 @@ def require_inverse(model: SampledModel, limits: Span) -> None:
                     f"dynamics have a zero at {zero.real:.4g}); sample more slowly, or hold the "
                     "voltage"
                 )
+
+
+def resolution(limits: Span) -> float:
+    """Return the change of a voltage at which its search ends, V: some units in its last place."""
+    return float(4 * np.finfo(np.float64).eps * max(abs(limits.low), abs(limits.high)))
 
 
 def zeros(sections: Sections, row: int) -> ComplexArray:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,13 +25,21 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, threshold_volts
 
-__all__ = ["STEPPED", "HysteresisStep", "LinearStep", "PlaysStep", "step_of"]
+__all__ = ["STEPPED", "Gone", "HysteresisStep", "LinearStep", "PlaysStep", "step_of"]
 
 # Names, as a config has them, of the operators that have a step.
 STEPPED = ("bouc-wen with n = 1", "backlash-like", "plays", "maxwell-slip")
 
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
+
+
+class Gone(NamedTuple):
+    """What is once a voltage has gone there: w (models,), um, dw/du (models,), and the memory."""
+
+    w: FloatArray
+    slope: FloatArray
+    memory: FloatArray
 
 
 class HysteresisStep(ABC):
@@ -46,12 +54,8 @@ class HysteresisStep(ABC):
         """Return the memory of a demagnetised actuator at zero volts."""
 
     @abstractmethod
-    def at(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return w and its slope dw/du once the voltage has gone there; the memory stays."""
-
-    @abstractmethod
-    def after(self, memory: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return the memory once the voltage has gone there."""
+    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return what is once the voltage has gone there; the memory that is given stays."""
 
     @abstractmethod
     def slopes(self) -> tuple[FloatArray, FloatArray]:
@@ -87,17 +91,8 @@ class LinearStep(HysteresisStep):
         """Return zero volts and h = 0, (models, 2)."""
         return np.zeros((self.d.size, 2))
 
-    def at(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return d u − h, and its slope d − α + c g."""
-        h, rise = self._moved(memory, voltage)
-        return self.d * voltage - h, self.d - rise
-
-    def after(self, memory: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return the voltage and h, (models, 2)."""
-        return np.stack([voltage, self._moved(memory, voltage)[0]], axis=1)
-
-    def _moved(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return h, um, and dh/du, um/V."""
+    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return d u − h, its slope d − α + c g, and the voltage with h."""
         direction = np.where(voltage < memory[:, 0], -1.0, 1.0)
         travel = np.abs(voltage - memory[:, 0])
         g = direction * memory[:, 1]
@@ -111,7 +106,9 @@ class LinearStep(HysteresisStep):
         late = travel - early
         rate = np.where(travel < crossing, against, ahead)
         g = g - (g - self.alpha / ahead) * -np.expm1(-ahead * late)
-        return direction * g, self.alpha - rate * g
+        h = direction * g
+        slope = self.d - self.alpha + rate * g
+        return Gone(self.d * voltage - h, slope, np.stack([voltage, h], axis=1))
 
     @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:
@@ -156,20 +153,13 @@ class PlaysStep(HysteresisStep):
         """Return all plays at zero, (models, plays)."""
         return np.zeros_like(self.weights)
 
-    def at(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return w, and the slope d + Σ w_j of those plays that are moved."""
-        plays = self.after(memory, voltage)
+    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return w, the slope d + Σ w_j of those plays that are moved, and all plays."""
+        target = voltage[:, np.newaxis]
+        plays = np.maximum(target - self.thresholds, np.minimum(target + self.thresholds, memory))
         carried = np.where(plays != memory, self.weights, 0.0)
         w = self.slope * voltage + np.einsum("mj,mj->m", self.weights, plays)
-        return w, self.slope + carried.sum(axis=1)
-
-    def after(self, memory: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return the plays, (models, plays)."""
-        target = voltage[:, np.newaxis]
-        plays: FloatArray = np.maximum(
-            target - self.thresholds, np.minimum(target + self.thresholds, memory)
-        )
-        return plays
+        return Gone(w, self.slope + carried.sum(axis=1), plays)
 
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Return d, and d + Σ w_j."""

@@ -209,6 +209,7 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
         upper={(k, level): joined[f"{k} {level} upper"] for k in KINDS for level in LEVELS},
         pit=joined.get("pit"),
         crps=joined.get("crps"),
+        log_score=joined.get("log_score"),
         interval=record.interval,
     )
 
@@ -243,9 +244,12 @@ def _summarised(
     if record.displacement is not None:
         reading = record.displacement[first : first + simulated.shape[1]]
         seen = np.isfinite(reading)
-        judged = np.full((2, reading.size), np.nan)
+        judged = np.full((3, reading.size), np.nan)
         if seen.any():
-            judged[:, seen] = mixture.judged(simulated[:, seen], mixed.sds("sensor"), reading[seen])
+            of = simulated[:, seen], mixed.sds("sensor"), reading[seen]
+            judged[:2, seen] = mixture.judged(*of)
+            judged[2, seen] = mixture.log_density(*of)
         summarised["pit"] = judged[0]
         summarised["crps"] = judged[1] - spread["sensor"]
+        summarised["log_score"] = judged[2]
     return summarised

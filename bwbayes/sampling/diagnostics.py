@@ -25,7 +25,15 @@ from scipy.special import ndtri
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.ensemble import autocorrelation_time
 
-__all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat", "pareto_k"]
+__all__ = [
+    "Check",
+    "as_chains",
+    "check",
+    "effective_draws",
+    "nested_rhat",
+    "pareto_k",
+    "smoothed_weights",
+]
 
 LARGEST_RHAT = 1.01
 
@@ -203,6 +211,24 @@ def pareto_k(log_weights: FloatArray) -> float:
     except (ValueError, IndexError):  # nothing
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
+
+
+def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
+    """Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
+
+    The largest weights are replaced by the order statistics of the generalised Pareto distribution
+    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted.
+
+    Notes
+    -----
+    A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling,
+    Journal of Machine Learning Research 25 (2024).
+    """
+    if log_weights.size and np.ptp(log_weights) < EQUAL:
+        return np.full(log_weights.size, 1 / log_weights.size), 0.0
+    smoothed, shape = array_stats.psislw(-log_weights)
+    weights = np.exp(smoothed - np.max(smoothed))
+    return weights / np.sum(weights), float(shape) if np.isfinite(shape) else np.inf
 
 
 def as_chains(draws: FloatArray) -> FloatArray:

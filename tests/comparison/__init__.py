@@ -1,1 +1,1 @@
-"""Tests of bwbayes.results: predictions and how they are judged."""
+"""Tests of bwbayes.comparison: which model, and what can be told apart."""

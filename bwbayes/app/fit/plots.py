@@ -64,7 +64,7 @@ class Plots:
         return _drawn(draw_coverage, result.bands, result.scores)
 
     def innovations(self) -> Figure:
-        """Draw whether the innovations, what each reading adds, are white, normal and of one size."""
+        """Draw whether the innovations are white, normal and of one size."""
         return _drawn(draw_innovations, self.converged().innovations)
 
     def corner(self) -> Figure:
