@@ -163,9 +163,11 @@ def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
             if begun.blocks("pilot"):
                 main.kill()
 
-        with executor(how=f"dask://{address}") as pool:
-            with pytest.raises(BrokenExecutor, match="the scheduler is gone"):
-                sample(one, PLAN, begun, pool, watcher)
+        with (
+            executor(how=f"dask://{address}") as pool,
+            pytest.raises(BrokenExecutor, match="the scheduler is gone"),
+        ):
+            sample(one, PLAN, begun, pool, watcher)
     assert 0 < begun.blocks("pilot")
     assert not begun.blocks("sampling")
     with executor(1) as pool:
@@ -222,7 +224,8 @@ class Foreign(Executor):
         self.pool = ThreadPoolExecutor(2)
         self.sent = 0
 
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Any, /, *args: Any, **_: Any) -> Future[Any]:
+        """Send a call."""
         self.sent += 1
         return self.pool.submit(pickle.loads(pickle.dumps(fn)), *pickle.loads(pickle.dumps(args)))
 
