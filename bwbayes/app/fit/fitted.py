@@ -25,6 +25,7 @@ from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.report import template
@@ -250,12 +251,20 @@ class Fit:
             warn([made.verdict.line], 3)
         return made
 
+    def compensate(self, reference: Any, **options: Any) -> Compensated:
+        """Return the voltage for a displacement that is asked for, and what is promised of it.
+
+        All is as of :func:`bwbayes.app.jobs.compensate.compensate_draws`.
+        """
+        made = compensate_draws(self.problem, self._converged().flat_draws, reference, **options)
+        warn(made.remarks, 3)
+        return made
+
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-        ``options`` (limits, rate, hold, overwrite) and errors are as of
-        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
-        discrete ``scipy.signal`` system.
+        ``options`` and errors are as of :func:`bwbayes.app.jobs.export.export_draws`. What is
+        returned has the ``linear`` part as a discrete ``scipy.signal`` system.
         """
         draws = self._converged().flat_draws
         return export_draws(self.problem, draws, Path(folder), **options)[0]
