@@ -22,6 +22,7 @@ from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
@@ -260,6 +261,15 @@ class Fit:
         :func:`bwbayes.app.fit.compared.compared`.
         """
         return compared((self, *others), **options)
+
+    def compensate(self, reference: Any, **options: Any) -> Compensated:
+        """Return the voltage for a displacement that is asked for, and what is promised of it.
+
+        All is as of :func:`bwbayes.app.jobs.compensate.compensate_draws`.
+        """
+        made = compensate_draws(self.problem, self._converged().flat_draws, reference, **options)
+        warn(made.remarks, 3)
+        return made
 
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.

@@ -205,7 +205,7 @@ def test_the_mirrored_displacement_needs_the_mirrored_voltage(
     """Along any turns, from the demagnetised state; and simulated, the displacement is returned."""
     of = posterior(name)
     actuator = replace(of.likelihood.actuator, dynamics="none")
-    table = dict(of.table.columns(drawn(of, 4)))
+    table = dict(of.only.table.columns(drawn(of, 4)))
     theta = np.array([[table[n][row] for n in actuator.parameters]])
     column = {n: theta[:, i] for i, n in enumerate(actuator.parameters)}
     column["offset"][:] = 0.0
