@@ -28,6 +28,7 @@ __all__ = [
     "Background",
     "Bands",
     "Calibration",
+    "Campaign",
     "Chain",
     "Config",
     "Distribution",
@@ -42,6 +43,7 @@ __all__ = [
     "Outcome",
     "Parameter",
     "PointFit",
+    "Population",
     "Posterior",
     "Prediction",
     "Problem",
@@ -56,6 +58,7 @@ __all__ = [
     "VirtualTestStand",
     "Waveform",
     "assess",
+    "campaign",
     "draws",
     "first_chain",
     "fit",
@@ -88,6 +91,7 @@ if TYPE_CHECKING:
     from bwbayes.app.config.config import load as load_config
     from bwbayes.app.config.config import parse as parse_config
     from bwbayes.app.fit.calls import fit, open_run, resume_run
+    from bwbayes.app.fit.campaigns import Campaign, campaign
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem, resolve
     from bwbayes.app.running.predictions import Prediction
@@ -105,6 +109,7 @@ if TYPE_CHECKING:
     from bwbayes.model.actuator import Actuator
     from bwbayes.model.boucwen import hysteresis
     from bwbayes.model.distributions import Distribution
+    from bwbayes.population.population import Population
     from bwbayes.results.bands import Bands
     from bwbayes.results.calibration import Calibration, judge
     from bwbayes.results.loops import Loops, measure_loops
@@ -123,6 +128,7 @@ else:
         "Background": "results.verdict",
         "Bands": "results.bands",
         "Calibration": "results.calibration",
+        "Campaign": "app.fit.campaigns",
         "Chain": "sampling.chain",
         "Config": "app.config.config",
         "Distribution": "model.distributions",
@@ -137,6 +143,7 @@ else:
         "Outcome": "sampling.sampler",
         "Parameter": "inference.parameters",
         "PointFit": "inference.pointfit",
+        "Population": "population.population",
         "Posterior": "inference.posterior",
         "Prediction": "app.running.predictions",
         "Problem": "app.problem.problem",
@@ -151,6 +158,7 @@ else:
         "VirtualTestStand": "data.teststand",
         "Waveform": "data.waveforms",
         "assess": "results.verdict",
+        "campaign": "app.fit.campaigns",
         "draws": "sampling.sampler",
         "first_chain": "sampling.sampler",
         "forecast": "results.prediction",

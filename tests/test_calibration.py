@@ -123,10 +123,10 @@ def test_white_noise_model_fails_the_bands() -> None:
     """It takes the discrepancy of the same records for sensor noise."""
     common = experiment(problem(fixed=("lag", "beta")))
     right = common.posterior
-    names = (*right.actuator.parameters, "sensor_sd")
+    names = (*right.only.actuator.parameters, "sensor_sd")
     white = replace(
         right,
-        noise=WhiteNoise(),
+        datasets=(replace(right.only, noise=WhiteNoise()),),
         prior=JointPrior(p for p in right.prior.parameters if p.name in names),
     )
     found = made(replace(common, posterior=white, source=right), FEW)
@@ -153,9 +153,14 @@ class Swapped(Posterior):
         """Log likelihood of the model with the wrong sign."""
         return super().log_likelihood(self._swapped(theta))
 
-    def simulate(self, theta: FloatArray, rows: IntArray | slice = EVERY_SAMPLE) -> FloatArray:
+    def simulate(
+        self,
+        theta: FloatArray,
+        rows: IntArray | slice = EVERY_SAMPLE,
+        record: str | None = None,
+    ) -> FloatArray:
         """Displacement of the model with the wrong sign."""
-        return super().simulate(self._swapped(theta), rows)
+        return super().simulate(self._swapped(theta), rows, record)
 
     def _swapped(self, theta: FloatArray) -> FloatArray:
         signs = np.ones(theta.shape[1])
@@ -167,7 +172,7 @@ class Swapped(Posterior):
 def wrong_correlation() -> Experiment:
     common = experiment(problem(fixed=("alpha", "beta", "gamma", "lag")))
     right = common.posterior
-    wrong = replace(right, noise=WrongCorrelation(right.actuator.interval))
+    wrong = right.altered(noise=WrongCorrelation(right.only.actuator.interval))
     return replace(common, posterior=wrong, source=right)
 
 

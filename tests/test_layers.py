@@ -24,16 +24,24 @@ LAYERS = (
     ("bwbayes.inference",),
     ("bwbayes.sampling",),
     ("bwbayes.results",),
+    ("bwbayes.comparison",),
+    ("bwbayes.population",),
+    ("bwbayes.control",),
     ("bwbayes.app",),
 )
 
 # Libraries that few modules may know, and these modules (patterns).
 KEEPERS = {
     "h5py": ("bwbayes.sampling.storage", "bwbayes.data.io.hdf5", "bwbayes.data.io.matlab"),
-    "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves"),
+    "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves", "bwbayes.sampling.walking"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
-    "arviz_stats": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
+    "arviz_stats": (
+        "bwbayes.sampling.diagnostics",
+        "bwbayes.results.*",
+        "bwbayes.population.population",
+        "bwbayes.app.*",
+    ),
     "matplotlib": (
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",
@@ -43,7 +51,7 @@ KEEPERS = {
     "bokeh": ("bwbayes.app.figures.interactive",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
-    "jinja2": ("bwbayes.app.*",),
+    "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),
     "pydantic": ("bwbayes.app.*",),
     "tomlkit": ("bwbayes.app.*",),
 }

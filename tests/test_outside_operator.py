@@ -201,7 +201,7 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)
-    assert np.max(np.abs(one - other) / (posterior.voltage.size + np.abs(one))) < 1e-10
+    assert np.max(np.abs(one - other) / (posterior.only.voltage.size + np.abs(one))) < 1e-10
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
         (f"{HERE}:NoSuchClass", "has no attribute 'NoSuchClass'"),
         (":Loop", "write module:Class"),
         ("broken_module:Loop", "(ZeroDivisionError: division by zero); write module:Class"),
-        (f"{HERE}:NUMBER", "is no class; write module:Class"),
+        (f"{HERE}:NUMBER", "is not a class; write module:Class"),
         (f"{HERE}:Stranger", "makes a Stranger, which is not a bwbayes.model.operator.Operator"),
         ("bwbayes.model.filters:Lag", "makes a Lag, which is not a bwbayes.model.operator"),
         (f"{HERE}:Incomplete", "cannot be made: Can't instantiate abstract class Incomplete"),

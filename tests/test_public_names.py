@@ -16,6 +16,7 @@ import bwbayes
 PUBLIC = {
     "bwbayes.app.config.config": {"Config", "load as load_config", "parse as parse_config"},
     "bwbayes.app.fit.calls": {"fit", "open_run", "resume_run"},
+    "bwbayes.app.fit.campaigns": {"Campaign", "campaign"},
     "bwbayes.app.fit.fitted": {"Fit"},
     "bwbayes.app.running.predictions": {"Prediction"},
     "bwbayes.app.problem.problem": {"Problem", "resolve"},
@@ -34,6 +35,7 @@ PUBLIC = {
     "bwbayes.sampling.sampler": {"Outcome", "SamplingPlan", "draws", "first_chain", "sample"},
     "bwbayes.model.actuator": {"Actuator"},
     "bwbayes.model.boucwen": {"hysteresis"},
+    "bwbayes.population.population": {"Population"},
     "bwbayes.results.bands": {"Bands"},
     "bwbayes.results.calibration": {"Calibration", "judge"},
     "bwbayes.results.replicates": {"Experiment", "Replicate", "replicates"},

@@ -62,10 +62,12 @@ def reference(
     config, case, folder = load(path), load_case(path), FOLDER
     if request.param == "measured":
         folder = tmp_path_factory.mktemp("thinned")
-        assert config.record.start is not None
-        thinned = Record(case.voltage, case.displacement, case.interval, config.record.start)
+        assert config.records["record"].start is not None
+        thinned = Record(
+            case.voltage, case.displacement, case.interval, config.records["record"].start
+        )
         write_record(thinned, folder / "thinned.h5")
-        source = RecordConfig(file="thinned.h5", train=config.record.train)
+        source = RecordConfig(file="thinned.h5", train=config.records["record"].train)
         config = config.model_copy(update={"record": source})
     return Reference(resolve(config, folder), case, found)
 
@@ -115,11 +117,11 @@ def drawn(case: Case, size: int) -> list[dict[str, float]]:
 def test_both_read_the_same_case(reference: Reference) -> None:
     posterior, case = reference.problem.posterior, reference.case
     assert case.names == posterior.prior.names
-    assert case.training == posterior.training
-    assert case.hold == posterior.actuator.hold
-    np.testing.assert_allclose(case.interval, posterior.actuator.interval, rtol=1e-9)
-    np.testing.assert_array_equal(case.voltage, posterior.voltage)
-    np.testing.assert_array_equal(case.displacement, posterior.displacement)
+    assert case.training == posterior.only.training
+    assert case.hold == posterior.only.actuator.hold
+    np.testing.assert_allclose(case.interval, posterior.only.actuator.interval, rtol=1e-9)
+    np.testing.assert_array_equal(case.voltage, posterior.only.voltage)
+    np.testing.assert_array_equal(case.displacement, posterior.only.displacement)
 
 
 def test_the_reference_is_of_this_case(reference: Reference) -> None:
@@ -183,7 +185,7 @@ def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> N
     wrong = Slower(reference.case.interval)
     planted = replace(
         problem,
-        posterior=replace(problem.posterior, noise=wrong),
+        posterior=problem.posterior.altered(noise=wrong),
         plan=replace(problem.plan, ess=1000.0, walkers=24),
     )
     outcome, got = run(planted)

@@ -16,8 +16,8 @@ from scipy import stats
 
 from bwbayes.data import Record, write_record
 from bwbayes.results.bands import Bands
-from tests.found import keep
 from tests.inference.test_likelihood import dense
+from tests.measured import keep
 from tests.results.runs import Judged, Stand, judge, problem_of, run
 
 RATE = 100.0
@@ -52,7 +52,7 @@ def test_missing_readings_leave_the_posterior_of_the_dense_gaussian(
     write_record(record.without(lost), tmp_path / "record.csv")
     problem, result = run('[record]\nfile = "record.csv"\n', tmp_path)
     posterior, log_density = problem.posterior, result.log_density.ravel()
-    assert posterior.readings.rows.size == record.samples - np.sum(lost)
+    assert posterior.only.readings.rows.size == record.samples - np.sum(lost)
     chosen = np.random.default_rng(3).choice(log_density.size, 25, replace=False)
     theta = posterior.prior.theta(result.flat_draws[chosen])
     z = posterior.prior.unconstrain(result.flat_draws[chosen])
@@ -98,7 +98,7 @@ def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: i
         told(record, tmp_path, ASIDE),
         told(record, tmp_path),
     )
-    assert rows == np.flatnonzero(np.isnan(aside.problem.posterior.displacement)).tolist()
+    assert rows == np.flatnonzero(np.isnan(aside.problem.posterior.only.displacement)).tolist()
     (remark,) = (line for line in aside.problem.remarks if "set aside" in line)
     assert remark.startswith("10 readings set aside as isolated outliers, at ")
     assert width(aside.bands["rest"]) == pytest.approx(width(clean.bands["rest"]), rel=0.1)
@@ -124,7 +124,7 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
     for seed in range(100, 100 + RECORDS):
         record, rows = spiky(measured(seed), seed)
         clean, aside = told(measured(seed), tmp_path), told(record, tmp_path, ASIDE)
-        gone = set(np.flatnonzero(np.isnan(aside.problem.posterior.displacement)).tolist())
+        gone = set(np.flatnonzero(np.isnan(aside.problem.posterior.only.displacement)).tolist())
         found, false = found + len(gone & set(rows)), false + len(gone - set(rows))
         ratios.append(width(aside.bands["rest"]) / width(clean.bands["rest"]))
         for name, value in TRUTH.items():

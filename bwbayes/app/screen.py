@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
+from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
+from bwbayes.comparison.choice import Comparison
+from bwbayes.comparison.table import COLUMNS as COMPARED
+from bwbayes.comparison.table import DIFFERENCE_COLUMNS, differences
+from bwbayes.comparison.table import rows as compared
 from bwbayes.inference import conflict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.bands import KINDS, LEVELS
@@ -26,8 +34,11 @@ __all__ = [
     "parameter_rows",
     "score_texts",
     "show_calibration",
+    "show_campaign",
+    "show_comparison",
     "show_loops",
     "show_priors",
+    "show_remarks",
     "show_result",
     "show_scores",
     "show_verdicts",
@@ -36,6 +47,9 @@ __all__ = [
 
 # Probability by which constraints must move a quantile to be shown: more than draws do.
 CHANGED = 0.03
+
+# Columns of a comparison that a terminal has room for: the page has all.
+ON_SCREEN = (0, 1, 2, 4, 5, 6, 8)
 
 PARAMETER_COLUMNS = ("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
 SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
@@ -57,10 +71,15 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
         if result.loops is not None:
             show_loops(result.loops, console)
     console.print(_sampling(result), highlight=False, soft_wrap=True)
-    for remark in result.remarks:
-        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
+    show_remarks(result.remarks, console)
     if folder is not None:
         console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def show_remarks(remarks: Iterable[str], console: Console) -> None:
+    """Show what a user should know, a line for each."""
+    for remark in remarks:
+        console.print(f"note: {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
@@ -148,8 +167,8 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     if calibration.bands:
         table = Table("band", "of", *(f"{level} %" for level in LEVELS))
         for other, kind in product(calibration.predicted, KINDS):
-            found = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
-            covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in found)
+            coverages = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
+            covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in coverages)
             table.add_row(kind, escape(other) or "held-out samples", *covered)
         console.print(table)
     for text, power in calibration.power.items():
@@ -164,6 +183,54 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
         highlight=False,
         soft_wrap=True,
     )
+
+
+def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Console) -> None:
+    """Show the population and how many records ended in which way."""
+    if campaign.population is not None:
+        table = Table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")
+        for one in campaign.population.parameters.values():
+            low, high = np.quantile(one.new, [0.025, 0.975])
+            spread = float(np.median(one.spread))
+            table.add_row(
+                one.name,
+                one.unit,
+                f"{np.median(one.mean):.4g}",
+                f"{spread:.1%}" if one.logarithmic else f"{spread:.3g}",
+                f"{low:.4g} to {high:.4g}",
+                escape(", ".join(one.outliers)),
+            )
+        console.print(table)
+    else:
+        console.print(f"note: {escape(campaign.untold)}", highlight=False, soft_wrap=True)
+    ended = ", ".join(f"{count} {status}" for status, count in campaign.counts.items() if count)
+    console.print(
+        f"{len(campaign.rows)} records: {ended}\nreport: {folder.page}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def show_comparison(comparison: Comparison, folder: Path | None, console: Console) -> None:
+    """Show what is recommended, what speaks against it, and the models' numbers."""
+    first, *others = comparison.lines
+    console.print(f"[bold]{escape(first)}[/]", highlight=False, soft_wrap=True)
+    for line in others:
+        console.print(escape(line), highlight=False, soft_wrap=True)
+    for line in comparison.against:
+        console.print(f"against it: {escape(line)}", highlight=False, soft_wrap=True)
+    table = Table(*(COMPARED[i] for i in ON_SCREEN))
+    for row in compared(comparison):
+        table.add_row(*(escape(row[i]) for i in ON_SCREEN))
+    console.print(table)
+    table = Table(*DIFFERENCE_COLUMNS)
+    for row in differences(comparison):
+        table.add_row(*map(escape, row))
+    if table.row_count:
+        console.print(f"less {escape(comparison.best or '')}:", highlight=False)
+        console.print(table)
+    if folder is not None:
+        console.print(f"report: {folder / 'comparison.html'}", highlight=False, soft_wrap=True)
 
 
 def show_priors(

@@ -1,7 +1,7 @@
 """Shapes in a series of numbers: turning points, runs, spikes, trends and decays.
 
 They know nothing of records: :mod:`bwbayes.data.inspection` looks for them in voltages,
-displacements and what is left of a displacement without the voltage's part, and a fit's residual
+displacements and the part of a displacement that the voltage does not explain; a fit's residual
 can be looked at in the same way.
 """
 
@@ -78,7 +78,24 @@ def spikes(values: FloatArray, drive: FloatArray | None = None, least: float = 0
     if drive is not None:
         allowed = 2 * maximum_filter1d(np.abs(_off_median(drive)), 2 * NEIGHBOURS + 1)
     usual = scatter(off[off != 0]) if np.any(off) else 0.0
-    return np.flatnonzero(np.abs(off) > max(8 * usual, least) + allowed)
+    limit = max(8 * usual, least) + allowed
+    suspects = np.flatnonzero(np.abs(off) > limit)
+    # A spike moves its neighbours' medians too. The largest comes first, and a straight line takes
+    # its place before the next is judged.
+    half = NEIGHBOURS // 2
+    rest = np.pad(values, half, mode="edge")
+    isolated = np.zeros(rest.size, dtype=np.bool_)
+    for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
+        middle = np.sort(rest[at - half : at + half + 1])[half]
+        if abs(rest[at] - middle) > limit[at - half]:
+            isolated[at] = True
+            before = after = at
+            while isolated[before]:
+                before -= 1
+            while isolated[after]:
+                after += 1
+            rest[before : after + 1] = np.linspace(rest[before], rest[after], after - before + 1)
+    return np.flatnonzero(isolated[half:])
 
 
 def _off_median(values: FloatArray) -> FloatArray:

@@ -146,14 +146,14 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[s
         if np.isfinite(high) and _near(high - values[name]):
             yield _given_bound(parameter, "upper", high)
     for parameter in prior.parameters:
-        yield from _pressed_by_others(parameter, values)
+        seen = prior.seen(values, parameter.record)
+        yield from _pressed_by_others(parameter, values[parameter.name], seen)
 
 
-def _pressed_by_others(parameter: Parameter, values: Values) -> Iterator[str]:
-    """Yield remarks on bounds that other parameters set, relative to their size."""
+def _pressed_by_others(parameter: Parameter, x: FloatArray, values: Values) -> Iterator[str]:
+    """Yield remarks on bounds of draws x (draws,) that other parameters set."""
     if parameter.declared is None:
         return
-    x = values[parameter.name]
     for side, bound in zip(("lower", "upper"), parameter.limits(values), strict=True):
         advice = parameter.declared.pressed.get(side)
         if advice is None or not np.isfinite(bound).all():
@@ -197,4 +197,5 @@ def _widened(distribution: Distribution) -> Distribution:
 def _line(name: str, distribution: Distribution) -> str:
     """Write a prior as a config's line under ``[parameters]``."""
     arguments = "".join(f", {key} = {value:.6g}" for key, value in distribution.arguments.items())
-    return f'{name} = {{ prior = {{ distribution = "{distribution.name}"{arguments} }} }}'
+    key = name if name.isidentifier() else f'"{name}"'
+    return f'{key} = {{ prior = {{ distribution = "{distribution.name}"{arguments} }} }}'

@@ -1,10 +1,10 @@
-"""Isolated outliers: readings that say nothing of the displacement, found and set aside.
+"""Isolated outliers: readings that say nothing about the displacement are set aside.
 
 A loose contact or a lost bit spoils a reading now and then. A Gaussian noise model takes a few such
 readings for its sensor, and every band grows. The model here is: each reading is spoiled with a
 small probability, independently of all others, and a spoiled one may be anything. Its likelihood is
 a sum over all sets of spoiled readings. Where spikes are far outside the noise one set has nearly
-all of the weight, so it is found once, at the point fit, and kept: the likelihood of the others
+all of the weight, so it is chosen once, at the point fit, and kept: the likelihood of the others
 costs no more than before. A reading belongs to the set if the readings before and after it, without
 itself, predict it worse than by :data:`LIMIT` standard deviations: a good reading does so once in
 five hundred million.
@@ -13,7 +13,7 @@ five hundred million.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.stats import norm
@@ -35,57 +35,76 @@ ROUNDS = 6
 # Median of a standard normal's distance from zero.
 MEDIAN = float(norm.ppf(0.75))
 
-# A larger part of the readings than this are no isolated outliers.
+# If they are a larger part of the readings than this, they are not isolated outliers.
 MOST = 0.05
 
 
-def outliers(posterior: Posterior, generator: np.random.Generator) -> IntArray:
-    """Return the samples (outliers,) whose readings are to be set aside.
+def outliers(posterior: Posterior, generator: np.random.Generator) -> dict[str, IntArray]:
+    """Return the samples (outliers,) of each record, by name, whose readings are to be set aside.
 
     Raises
     ------
     InputError
-        More than one in twenty of the readings would be.
+        More than one in twenty of a record's readings would be.
     """
-    readings, everything = posterior, posterior.readings.rows.size
-    aside = doubtful = np.empty(0, dtype=np.int64)
+    everything, none = posterior, np.empty(0, dtype=np.int64)
+    aside = {one.name: none for one in posterior.datasets}
+    doubtful = dict(aside)
     for _ in range(ROUNDS):
         point = pointfit.fit(posterior, generator.spawn(1)[0])
-        rows = posterior.readings.rows
-        away = np.abs(surprise(posterior, point.mode))
-        # Many spikes make the fit's noise larger than that of most readings: theirs counts.
-        far = away > LIMIT * min(1.0, float(np.median(away)) / MEDIAN)
-        if not far.any():
+        places = _places(posterior, point.mode)
+        quiet = True
+        for name, place in places.items():
+            alone = posterior.alone(name)
+            rows, away = alone.only.readings.rows, np.abs(surprise(alone, place))
+            # Many spikes make the fit's noise larger than that of most readings: theirs counts.
+            far = away > LIMIT * min(1.0, float(np.median(away)) / MEDIAN)
+            quiet = quiet and not far.any()
+            aside[name] = np.union1d(aside[name], rows[far])
+            doubtful[name] = np.union1d(doubtful[name], rows[far & (away <= LIMIT)])
+            _require_few(aside[name].size, everything.alone(name).only.readings.rows.size)
+        if quiet:
             break
-        aside = np.union1d(aside, rows[far])
-        doubtful = np.union1d(doubtful, rows[far & (away <= LIMIT)])
-        if aside.size > MOST * everything:
-            raise InputError(
-                f"model.outliers: {aside.size} of {everything} readings would be set aside, too "
-                "many for isolated outliers; leave outliers out, and look at the residuals"
-            )
-        posterior = _without(readings, aside)
+        posterior = _without(everything, aside)
     # The last fit tells which of those that most readings' noise made suspect are outliers.
-    good = [row for row in doubtful.tolist() if _is_good(readings, aside, row, point.mode)]
-    return np.setdiff1d(aside, good)
+    for name, place in places.items():
+        one = everything.alone(name)
+        good = [row for row in doubtful[name].tolist() if _is_good(one, aside[name], row, place)]
+        aside[name] = np.setdiff1d(aside[name], good)
+    return aside
 
 
-def _without(posterior: Posterior, rows: IntArray) -> Posterior:
-    """Return the posterior without some readings."""
-    displacement = posterior.displacement.copy()
-    displacement[rows] = np.nan
-    return replace(posterior, displacement=displacement)
+def _places(posterior: Posterior, place: FloatArray) -> dict[str, FloatArray]:
+    """Return the coordinates (its free,) of each record alone at joint ones (free,)."""
+    free = posterior.prior.constrain(place[np.newaxis])[0]
+    return {name: one.prior.unconstrain(draws)[0] for name, one, draws in posterior.each(free)}
+
+
+def _require_few(outliers: int, everything: int) -> None:
+    if outliers > MOST * everything:
+        raise InputError(
+            f"model.outliers: {outliers} of {everything} readings would be set aside, too "
+            "many for isolated outliers; leave outliers out, and look at the residuals"
+        )
+
+
+def _without(posterior: Posterior, rows: Mapping[str, IntArray]) -> Posterior:
+    """Return the posterior without some readings of its records."""
+    displacements = {one.name: one.displacement.copy() for one in posterior.datasets}
+    for name, displacement in displacements.items():
+        displacement[rows[name]] = np.nan
+    return posterior.with_readings(displacements)
 
 
 def _is_good(posterior: Posterior, aside: IntArray, row: int, place: FloatArray) -> bool:
     """Tell whether the reading of a sample goes with all others that are not set aside."""
-    with_it = _without(posterior, aside[aside != row])
-    at = int(np.searchsorted(with_it.readings.rows, row))
+    with_it = _without(posterior, {posterior.only.name: aside[aside != row]})
+    at = int(np.searchsorted(with_it.only.readings.rows, row))
     return bool(np.abs(surprise(with_it, place)[at]) <= LIMIT)
 
 
 def surprise(posterior: Posterior, place: FloatArray) -> FloatArray:
-    """Return how far each reading is from what all others predict, in sds, (readings,).
+    """Return how far each reading of a record is from what all others predict, in sds, (readings,).
 
     At the coordinates ``place`` (free,). With the discrepancy's mean and variance (m, P) from the
     readings before, and from those after, both joined over its own variance σ²:
@@ -93,10 +112,10 @@ def surprise(posterior: Posterior, place: FloatArray) -> FloatArray:
         1/Q = 1/P₁ + 1/P₂ − 1/σ²,   x̂ = Q (m₁/P₁ + m₂/P₂),   (r − x̂) / √(Q + s²).
     """
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
-    readings, likelihood = posterior.readings, posterior.likelihood
+    readings, likelihood = posterior.only.readings, posterior.likelihood
     simulated = posterior.simulate(theta, readings.rows)[0]
     residual = readings.values - simulated
-    steady = likelihood.spaced.steady_state(posterior.table.noise(theta))
+    steady = likelihood.spaced.steady_state(posterior.only.table.noise(theta))
     own = float(steady.predicted[0] + steady.surplus[0])
     sensor = float(steady.variance[0] - steady.predicted[0])
     if own <= 0:

@@ -1,6 +1,6 @@
 """Parameters: what they are called, what is known of them, and where they may lie.
 
-Each parameter is either fixed or has a prior. The priors are independent but for the physical
+Each parameter is either fixed or has a prior. The priors are independent except for the physical
 constraints that the model's parts declare, which cut the joint prior: for Bouc-Wen 0 < α < d,
 |γ| ≤ β, an initial state inside the hysteresis ceiling. :class:`JointPrior` draws from the cut
 prior and gives its log density, up to the one constant that the cut leaves. It also maps parameters
@@ -19,6 +19,8 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.plainmap import PlainMap
+from bwbayes.model.closed import Scored
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
 
@@ -39,7 +41,8 @@ class Parameter:
     """One parameter: names for people, and a prior or a fixed value.
 
     ``lower`` and ``upper`` cut the prior; the bounds that its part ``declared`` hold besides.
-    ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures.
+    ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures. ``record``
+    is the one of several records that the parameter belongs to, empty if to all.
 
     Raises
     ------
@@ -56,6 +59,7 @@ class Parameter:
     lower: float = -np.inf
     upper: float = np.inf
     declared: Declaration | None = field(default=None, compare=False, repr=False)
+    record: str = ""
 
     @classmethod
     def of(cls, declared: Declaration, known: Distribution | float) -> Parameter:
@@ -81,6 +85,11 @@ class Parameter:
             raise InputError(f"{self.name}: fixed at {value:g}; must be {least} {self.floor:g}")
 
     @property
+    def plain(self) -> str:
+        """Its name without that of its record."""
+        return self.name if self.declared is None else self.declared.name
+
+    @property
     def floor(self) -> float:
         """What the parameter cannot be lower than."""
         return -np.inf if self.declared is None else self.declared.floor
@@ -96,7 +105,10 @@ class Parameter:
         return np.asarray(x >= self.floor if reaches else x > self.floor)
 
     def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Bounds (models,) given the values of other parameters; infinite without a constraint."""
+        """Bounds (models,) given the values of other parameters; infinite without a constraint.
+
+        By the names that the parts declare; see :meth:`JointPrior.seen`.
+        """
         if self.declared is None or self.declared.bounds is None:
             return np.asarray(-np.inf), np.asarray(np.inf)
         low, high = self.declared.bounds(values)
@@ -108,6 +120,14 @@ class Parameter:
         assert self.prior is not None
         low, high = self.prior.support
         return max(low, self.lower, self.floor), min(high, self.upper)
+
+    @property
+    def formula(self) -> Scored | None:
+        """The formula that maps normal scores to values, if there is one and nothing cuts it."""
+        assert self.prior is not None
+        bounded = self.declared is not None and self.declared.bounds is not None
+        form, whole = self.prior.form, self.support == self.prior.support
+        return form if isinstance(form, Scored) and whole and not bounded else None
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
@@ -126,7 +146,7 @@ class JointPrior:
         All parameters of the model and the noise, in the order of θ's columns. Bounds depend on
         those that come before and on fixed ones.
     constraint
-        What must hold besides.
+        What must hold besides, in each of several records.
     """
 
     def __init__(
@@ -138,10 +158,18 @@ class JointPrior:
         self.free = tuple(p for p in self.parameters if p.fixed is None)
         self.free_names = tuple(p.name for p in self.free)
         self._fixed = {p.name: p.fixed for p in self.parameters if p.fixed is not None}
+        self.records = tuple(dict.fromkeys(p.record for p in self.parameters if p.record))
+        self._own = {
+            record: [(p.plain, p.name) for p in self.parameters if p.record == record]
+            for record in self.records
+        }
         # What the bounds of each parameter may know.
         self._known = {
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
         }
+        self._free_rows = [self.names.index(name) for name in self.free_names]
+        self._fixed_rows = [self.names.index(name) for name in self._fixed]
+        self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -151,14 +179,14 @@ class JointPrior:
             if parameter.fixed is None or parameter.declared is None:
                 continue
             others = {name: value for name, value in fixed.items() if name != parameter.name}
-            low, high = parameter.limits(others)
+            low, high = self._between(parameter, others)
             stated = parameter.declared.stated_bounds
             if stated and not (low <= parameter.fixed) & (parameter.fixed <= high):
                 raise InputError(
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
-        if self.constraint is not None and not np.all(self.constraint(fixed)):
-            raise InputError(f"priors: what is fixed must have {self._stated()}")
+        if not np.all(self._possible(fixed)):
+            raise InputError(f"priors: fixed values must have {self._stated()}")
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
@@ -172,11 +200,10 @@ class JointPrior:
 
     def theta(self, free: FloatArray) -> FloatArray:
         """Put free parameters (models, free) and fixed ones together: (models, parameters)."""
-        columns = dict(zip(self.free_names, free.T, strict=True))
-        ones = np.ones(free.shape[0])
-        return np.stack(
-            [columns[n] if n in columns else self._fixed[n] * ones for n in self.names], axis=1
-        )
+        theta = np.empty((len(self.names), free.shape[0]))
+        theta[self._free_rows] = free.T
+        theta[self._fixed_rows] = self._fixed_values
+        return theta.T
 
     def log_density(self, free: FloatArray) -> FloatArray:
         """Log density (models,) of free parameters (models, free), up to a constant."""
@@ -187,8 +214,7 @@ class JointPrior:
             assert parameter.prior is not None
             result += parameter.prior.frozen.logpdf(values[parameter.name])
             inside &= self._inside(parameter, values)
-        if self.constraint is not None:
-            inside &= self.constraint(values)
+        inside &= self._possible(values)
         return np.where(inside, result, -np.inf)
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
@@ -206,7 +232,7 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                raise InputError(f"priors: hardly a draw has {self._stated()}")
+                raise InputError(f"priors: hardly any draw has {self._stated()}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
@@ -230,22 +256,53 @@ class JointPrior:
 
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
+        # A parameter is a row here, so that what is done with one is done with neighbours.
+        given = np.ascontiguousarray(coordinates.T)
+        safe = np.clip(given, -FARTHEST, FARTHEST)
+        free, possible = np.empty_like(safe), np.equal(safe, given).all(axis=0)
+        self._plain.fill(free, safe)
         values = self._values(None, rows=coordinates.shape[0])
-        safe = np.clip(coordinates, -FARTHEST, FARTHEST)
+        values.update(zip(self.free_names, free, strict=True))
         room = np.ones(coordinates.shape[0])
-        for parameter, z in zip(self.free, safe.T, strict=True):
+        for row, parameter in self._cut:
             assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            x, between = parameter.prior.from_normal(z, *bounds)
-            # Rounding may put a positive parameter on its open bound, where there is no model.
-            room = room * np.where(parameter.above_floor(x), between, 0)
-            values[parameter.name] = x
-        if self.constraint is not None:
-            room = np.where(self.constraint(values), room, 0)
+            free[row], between = parameter.prior.from_normal(safe[row], *bounds)
+            room *= between
+        # Rounding may put a positive parameter on its open bound, where there is no model.
+        possible &= self._above_floors(free) & self._possible(values)
         with np.errstate(divide="ignore"):
-            log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
-        log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
-        return np.stack([values[name] for name in self.free_names], axis=1), log_prior
+            log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
+        return free.T, np.where(possible, log_prior, -np.inf)
+
+    @cached_property
+    def _plain(self) -> PlainMap:
+        """The free parameters that a formula maps and nothing ever cuts."""
+        return PlainMap.of({row: p.formula for row, p in enumerate(self.free)})
+
+    @cached_property
+    def _cut(self) -> tuple[tuple[int, Parameter], ...]:
+        """The other ones, and which they are of the free ones."""
+        return tuple(
+            (row, parameter)
+            for row, parameter in enumerate(self.free)
+            if row not in self._plain.rows
+        )
+
+    @cached_property
+    def _floors(self) -> tuple[FloatArray, FloatArray]:
+        """What free parameters must be above, or reach at least: two columns."""
+        floors = np.array([parameter.floor for parameter in self.free])
+        reached = [p.declared is None or p.declared.reaches_floor for p in self.free]
+        nothing = np.full(len(self.free), -np.inf)
+        above, least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
+        return above[:, np.newaxis], least[:, np.newaxis]
+
+    def _above_floors(self, free: FloatArray) -> BoolArray:
+        """Tell which models (models,) of free parameters (free, models) are on or above floors."""
+        above, least = self._floors
+        inside: BoolArray = ((free > above) & (free >= least)).all(axis=0)
+        return inside
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
@@ -256,15 +313,52 @@ class JointPrior:
 
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
-        low, high = (np.asarray(end) for end in parameter.support)
+        low, high = parameter.support
         if parameter.declared is None or parameter.declared.bounds is None:
-            return low, high
+            return np.asarray(low), np.asarray(high)
         known = {name: values[name] for name in self._known[parameter.name]}
-        least, most = parameter.limits(known)
+        least, most = self._between(parameter, known)
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
-        low = low if np.all(np.isneginf(least)) else np.maximum(low, least)
-        high = high if np.all(np.isposinf(most)) else np.minimum(high, most)
+        cut = np.any(np.greater(least, low)), np.any(np.less(most, high))
+        return (
+            np.maximum(low, least) if cut[0] else np.asarray(low),
+            np.minimum(high, most) if cut[1] else np.asarray(high),
+        )
+
+    def seen(self, values: Values, record: str) -> Values:
+        """Return values by the names that the parts declare, as one record has them.
+
+        ``values`` are by the parameters' names, and some may be missing; ``record`` is empty if
+        there is one alone.
+        """
+        if not record:
+            return values
+        mine = {plain: values[name] for plain, name in self._own[record] if name in values}
+        return {**values, **mine}
+
+    def _views(self, parameter: Parameter) -> tuple[str, ...]:
+        """Return the records whose values a parameter's bounds depend on; empty for any."""
+        if parameter.record or not self.records:
+            return (parameter.record,)
+        return self.records
+
+    def _between(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds (models,) that other values set; of several records, the tightest."""
+        if parameter.declared is None or parameter.declared.bounds is None:
+            return np.asarray(-np.inf), np.asarray(np.inf)
+        every = [parameter.limits(self.seen(values, one)) for one in self._views(parameter)]
+        low, high = every[0]
+        for least, most in every[1:]:
+            low, high = np.maximum(low, least), np.minimum(high, most)
         return low, high
+
+    def _possible(self, values: Values) -> BoolArray:
+        """Tell which models (models,) meet the constraint."""
+        possible = np.asarray(True)
+        if self.constraint is not None:
+            for record in self.records or ("",):
+                possible = possible & self.constraint(self.seen(values, record))
+        return possible
 
     def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
         low, high = self._limits(parameter, values)

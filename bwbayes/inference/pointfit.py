@@ -26,7 +26,7 @@ STARTS = 8
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
 RESIDUALS = 1000
 
-# An optimum less probable than the best by this much, nats, is no place to start from: it holds
+# An optimum less probable than the best by this much, nats, is not a place to start from: it holds
 # nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
 HOPELESS = 30.0
 
@@ -39,7 +39,7 @@ class PointFit:
     """The posterior's mode and its Gaussian approximation, in unconstrained coordinates.
 
     ``mode`` (free,), ``covariance`` (free, free), ``log_density`` at the mode; ``optima``
-    (found, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
+    (modes, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
     is that of the prior's draws.
     """
 
@@ -112,19 +112,29 @@ class _LeastSquares:
 
     def __init__(self, posterior: Posterior, centre: FloatArray, spread: FloatArray) -> None:
         self.posterior, self.centre, self.spread = posterior, centre, spread
-        self.physical = np.array([n in posterior.actuator.parameters for n in posterior.names])
-        rows = posterior.readings.rows
-        self.rows = rows[:: max(rows.size // RESIDUALS, 1)]
-        self.target = posterior.displacement[self.rows]
-        # A hundredth of the range is about what a Bouc-Wen model misses.
-        self.scale = 0.01 * float(np.ptp(self.target)) * np.sqrt(self.rows.size)
+        self.physical = np.array([n in posterior.table.physical for n in posterior.names])
+        most = RESIDUALS // len(posterior.datasets)
+        every = [one.readings.rows for one in posterior.datasets]
+        self.rows = [rows[:: max(rows.size // most, 1)] for rows in every]
+        total = sum(rows.size for rows in self.rows)
+        self.targets, self.scales = [], []
+        for one, rows in zip(posterior.datasets, self.rows, strict=True):
+            self.targets.append(one.displacement[rows])
+            # A hundredth of the range is about what a Bouc-Wen model misses.
+            self.scales.append(0.01 * float(np.ptp(self.targets[-1])) * np.sqrt(total))
 
     def residuals(self, coordinates: FloatArray) -> FloatArray:
         """Residuals (models, rows + physical) at coordinates (models, free)."""
         free, _ = self.posterior.prior.constrain(coordinates)
-        simulated = self.posterior.simulate(self.posterior.prior.theta(free), self.rows)
+        theta = self.posterior.prior.theta(free)
         pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
-        return np.concatenate([(simulated - self.target) / self.scale, 1e-2 * pull], axis=1)
+        missed = [
+            (self.posterior.simulate(theta, rows, one.name) - target) / scale
+            for one, rows, target, scale in zip(
+                self.posterior.datasets, self.rows, self.targets, self.scales, strict=True
+            )
+        ]
+        return np.concatenate([*missed, 1e-2 * pull], axis=1)
 
     def costs(self, coordinates: FloatArray) -> FloatArray:
         """Sum of squares (models,)."""
@@ -151,14 +161,14 @@ class _LeastSquares:
             row: FloatArray = self.residuals(place(values))[0]
             return row
 
-        found = optimize.least_squares(
+        solution = optimize.least_squares(
             residuals,
             start[self.physical],
             jac=jacobian,
             x_scale=self.spread[self.physical],
             max_nfev=60,
         )
-        optimum: FloatArray = place(found.x)[0]
+        optimum: FloatArray = place(solution.x)[0]
         return optimum
 
 
@@ -175,7 +185,7 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     place, curvature = start, None
     for _ in range(4):
         # Each round measures in the units of the last curvature: finite differences need them.
-        found = optimize.minimize(
+        solution = optimize.minimize(
             surface.value,
             surface.inwards(place),
             jac=surface.gradient,
@@ -183,9 +193,9 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
             method="trust-exact",
             options={"gtol": 1e-2, "maxiter": 60},
         )
-        place = surface.outwards(found.x)
-        curvature = surface.hessian(found.x)
-        settled = found.success and np.allclose(np.diag(curvature), 1, atol=0.2)
+        place = surface.outwards(solution.x)
+        curvature = surface.hessian(solution.x)
+        settled = solution.success and np.allclose(np.diag(curvature), 1, atol=0.2)
         surface = surface.rescaled(place, curvature)
         if settled:
             break

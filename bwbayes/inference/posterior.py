@@ -1,15 +1,18 @@
-"""The posterior: forward model, noise and prior put together around one record.
+"""The posterior: forward model, noise and prior put together around one record, or several.
 
 A :class:`Posterior` gives the log density of a batch of models in the unconstrained coordinates
-in which everything downstream works: the point fit, the sampler, the diagnostics. The model is
-simulated from the record's first sample; only readings in the training windows enter the
-likelihood (:mod:`bwbayes.inference.likelihood`).
+in which everything downstream works: the point fit, the sampler, the diagnostics. Its likelihood is
+the sum over its records (:class:`Dataset`), each with its own voltage, windows and start. Each is
+simulated from its first sample; only readings in the training windows enter
+(:mod:`bwbayes.inference.likelihood`). One record is a joint fit of one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,15 +23,16 @@ from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import JointTable, Table
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.operator import Span
 
-__all__ = ["Posterior"]
+__all__ = ["Alone", "Dataset", "Posterior"]
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """The posterior of an actuator's parameters, given a record.
+class Dataset:
+    """One record as the likelihood sees it.
 
     Parameters
     ----------
@@ -39,18 +43,18 @@ class Posterior:
     training
         Slices of the samples that enter the likelihood, in order of time and apart. One discrepancy
         goes through all of them.
-    actuator, noise, prior
-        The model; the prior's parameters are those of the actuator followed by those of the noise.
-    engine
-        What computes the likelihood; see :mod:`bwbayes.inference.engine`.
+    actuator, noise
+        The model, at the record's own sampling interval and hold.
     from_rest
         The record starts with a demagnetised actuator at rest, and ``initial`` is h at zero volts
         before. Otherwise the state of the dynamics at the first sample is unknown.
+    name
+        What the record is called.
 
     Raises
     ------
     InputError
-        The prior is another model's, the windows are out of order, or no reading is in them.
+        The windows are out of order.
     """
 
     voltage: FloatArray
@@ -58,22 +62,110 @@ class Posterior:
     training: tuple[slice, ...]
     actuator: Actuator
     noise: Noise
-    prior: JointPrior
-    engine: Engine = "numpy"
     from_rest: bool = False
+    name: str = "record"
 
     def __post_init__(self) -> None:
-        expected = self.table.names
-        if self.prior.names != expected:
-            raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
         edges = [edge for window in self.training for edge in (window.start, window.stop)]
         if edges != sorted(edges):
             raise InputError("training: windows must be in order of time and must not overlap")
 
     @cached_property
     def table(self) -> Table:
-        """The parameters in the order of θ's columns."""
+        """The parameters of this record alone."""
         return Table(self.actuator, self.noise)
+
+    @cached_property
+    def readings(self) -> Readings:
+        """The readings that enter the likelihood."""
+        return Readings.of(self.displacement, self.training)
+
+    @property
+    def span(self) -> Span:
+        """The voltages that the actuator may have seen, V."""
+        span = self.actuator.within(self.voltage).span
+        assert span is not None
+        return span
+
+    @property
+    def extent(self) -> float:
+        """Range of the readings that enter the likelihood, um."""
+        return float(np.ptp(self.readings.values))
+
+    def likelihood(self, engine: Engine) -> Likelihood:
+        """Return the likelihood of the record."""
+        return Likelihood(
+            self.voltage,
+            self.readings,
+            self.actuator.within(self.voltage),
+            self.noise,
+            engine,
+            self.from_rest,
+            self.span.half,
+        )
+
+
+class Alone(NamedTuple):
+    """One of a posterior's records: its own posterior, and its parameters of some draws.
+
+    ``draws`` are (draws, free of that posterior), parameters in their own units.
+    """
+
+    name: str
+    posterior: Posterior
+    draws: FloatArray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The posterior of an actuator's parameters, given records of it.
+
+    Parameters
+    ----------
+    datasets
+        The records; at least one.
+    prior
+        Its parameters are those of :attr:`table`, in that order.
+    engine
+        What computes the likelihood; see :mod:`bwbayes.inference.engine`.
+    joint
+        The parameters of several records; may be left out of one.
+
+    Raises
+    ------
+    InputError
+        The prior is another model's.
+    """
+
+    datasets: tuple[Dataset, ...]
+    prior: JointPrior
+    engine: Engine = "numpy"
+    joint: JointTable | None = None
+
+    def __post_init__(self) -> None:
+        expected = self.table.names
+        if self.prior.names != expected:
+            raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
+
+    @cached_property
+    def table(self) -> JointTable:
+        """The parameters in the order of θ's columns."""
+        names = tuple(one.name for one in self.datasets)
+        return self.joint or JointTable(self.datasets[0].table, names)
+
+    @property
+    def only(self) -> Dataset:
+        """The record, of a posterior of one; see :meth:`alone` for one of several.
+
+        Raises
+        ------
+        InputError
+            There are several.
+        """
+        if len(self.datasets) > 1:
+            names = ", ".join(one.name for one in self.datasets)
+            raise InputError(f"record: several were fitted ({names}), and this is for a fit of one")
+        return self.datasets[0]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,7 +175,7 @@ class Posterior:
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (models,) at coordinates (models, free): likelihood and prior.
 
-        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
+        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is not evidence
         for a model: there the density is −∞ too.
         """
         free, result = self.prior.constrain(coordinates)
@@ -93,43 +185,85 @@ class Posterior:
         return np.where(np.isfinite(result), result, -np.inf)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood (models,) at θ (models, parameters), fixed parameters included."""
-        return self.likelihood.log_density(theta)
+        """Log likelihood (models,) at θ (models, parameters): the sum over the records."""
+        total = np.zeros(len(theta))
+        for one, likelihood in zip(self.datasets, self.likelihoods, strict=True):
+            total += likelihood.log_density(self.table.of(theta, one.name))
+        return total
 
     @cached_property
-    def readings(self) -> Readings:
-        """The readings that enter the likelihood."""
-        return Readings.of(self.displacement, self.training)
+    def likelihoods(self) -> tuple[Likelihood, ...]:
+        """The likelihood of each record."""
+        return tuple(one.likelihood(self.engine) for one in self.datasets)
 
-    @cached_property
+    @property
     def likelihood(self) -> Likelihood:
-        """The likelihood of the record."""
-        return Likelihood(
-            self.voltage,
-            self.readings,
-            self.actuator.within(self.voltage),
-            self.noise,
-            self.engine,
-            self.from_rest,
-            float(np.ptp(self.voltage)) / 2,
-        )
+        """The likelihood, of a posterior of one record."""
+        (only,) = self.likelihoods
+        return only
 
-    def simulate(self, theta: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Displacement (models, rows), um, at samples up to the last training sample.
+    def simulate(
+        self, theta: FloatArray, rows: IntArray | slice = slice(None), record: str | None = None
+    ) -> FloatArray:
+        """Displacement (models, rows), um, at samples up to the last training sample of a record.
 
-        Where the start of the dynamics is unknown, it is the most probable one.
+        Of the record of that name; it may be left out if there is one alone. Where the start of the
+        dynamics is unknown, it is the most probable one.
         """
-        likelihood, model = self.likelihood, self.table.actuator(theta)
+        number = 0 if record is None else self.table.records.index(record)
+        one = self.only if record is None else self.datasets[number]
+        likelihood, theta = self.likelihoods[number], self.table.of(theta, one.name)
+        model = one.table.actuator(theta)
         unrest = likelihood.start(theta).mean if likelihood.unknown else None
-        voltage = self.voltage[: self.training[-1].stop]
+        voltage = one.voltage[: one.training[-1].stop]
         return np.concatenate(
             [
                 likelihood.actuator.advance(
                     model[part],
                     voltage,
                     unrest=None if unrest is None else unrest[part],
-                    from_rest=self.from_rest,
+                    from_rest=one.from_rest,
                 )[0][:, rows]
                 for part in batches(len(theta), voltage.size)
             ]
         )
+
+    def altered(self, **fields: Any) -> Posterior:
+        """Return a posterior of one record with other fields of its dataset."""
+        return replace(self, datasets=(replace(self.only, **fields),))
+
+    def with_readings(self, displacements: Mapping[str, FloatArray]) -> Posterior:
+        """Return the posterior of other readings (samples,) of the same records, by name."""
+        datasets = (replace(one, displacement=displacements[one.name]) for one in self.datasets)
+        return replace(self, datasets=tuple(datasets))
+
+    @cached_property
+    def _alone(self) -> dict[str, Posterior]:
+        """The posterior of each record alone."""
+        if len(self.datasets) == 1:
+            return {self.only.name: self}
+        every = {}
+        for one in self.datasets:
+            places = self.table.places(one.name)
+            parameters = (self.prior.parameters[place] for place in places.tolist())
+            prior = JointPrior(
+                (replace(p, name=p.plain, record="") for p in parameters), self.prior.constraint
+            )
+            every[one.name] = Posterior((one,), prior, self.engine)
+        return every
+
+    def alone(self, record: str) -> Posterior:
+        """Return the posterior of one record alone, its parameters by their plain names."""
+        return self._alone[record]
+
+    def its(self, draws: FloatArray, record: str) -> FloatArray:
+        """Return the columns of draws (draws, free) that are free parameters of a record alone."""
+        names = (self.table.name_of(name, record) for name in self.alone(record).names)
+        columns = [self.names.index(name) for name in names]
+        part: FloatArray = draws[..., columns]
+        return part
+
+    def each(self, draws: FloatArray) -> Iterator[Alone]:
+        """Yield the records one by one, with their parameters of draws (draws, free)."""
+        for one in self.datasets:
+            yield Alone(one.name, self.alone(one.name), self.its(draws, one.name))

@@ -22,6 +22,7 @@ from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 
@@ -39,6 +40,7 @@ HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "krasnoselskii-pokrovskii": KrasnoselskiiPokrovskii,
     "jiles-atherton": JilesAtherton,
     "domain-wall": DomainWall,
+    "linear": NoHysteresis,
 }
 
 DYNAMICS: Mapping[str, Callable[..., Filter]] = {
@@ -72,7 +74,7 @@ def choose[Part](
             f"`python -c 'import {module}'` works where you run this"
         ) from None
     if not callable(maker):
-        raise InputError(f"{place}: {name!r} is no class; write module:Class")
+        raise InputError(f"{place}: {name!r} is not a class; write module:Class")
     return maker
 
 

@@ -45,10 +45,10 @@ class Bands:
     ``truth`` (the noise-free displacement) are None where there is none. ``lower`` and ``upper``
     hold a band's edges by kind and level. ``pit`` is the probability integral transform of each
     reading under the sensor's distribution, ``crps`` its continuous ranked probability score in
-    um; both None without a measurement. Samples before ``scored_from`` served to estimate the
-    record's offset and are not judged. ``interval`` is the sampling interval
-    in s; ``training`` says that the samples were fitted to. ``lead_in`` says how well the lead-in
-    fits, if there was one.
+    um, ``log_score`` the log of its density there, nats; all None without a measurement. Samples
+    before ``scored_from`` served to estimate the record's offset and are not judged. ``interval``
+    is the sampling interval in s; ``training`` says that the samples were fitted to. ``lead_in``
+    says how well the lead-in fits, if there was one.
     """
 
     name: str
@@ -65,6 +65,7 @@ class Bands:
     scored_from: int = 0
     training: bool = False
     lead_in: LeadIn | None = None
+    log_score: FloatArray | None = None
 
     def columns(self) -> Iterator[tuple[str, FloatArray]]:
         """Yield the names and values of the columns of ``bands.csv``."""

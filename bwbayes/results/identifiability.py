@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 from bwbayes.sampling.diagnostics import pareto_k
 
@@ -49,6 +49,9 @@ ALIKE = 0.2
 
 # A part of its bounds' distance that is a parameter's sd where little but the bounds holds it.
 ANYWHERE = 0.225
+
+# Step of a slope, in prior sds.
+STEP = 1e-5
 
 # A loop closes where its opening is about one; below this it hardly opens.
 SMALL = 0.3
@@ -102,7 +105,7 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
-    found = []
+    lines = []
     for i in np.flatnonzero(parts > LEFT_OPEN):
         combination = _combination(directions[:, i], names)
         text = f"the record does not determine {combination}: {parts[i]:.0%} of the prior's sd left"
@@ -111,8 +114,8 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
             text += f", next {following} with {parts[i + 1]:.0%}"
         members = [name for name in names if name in combination.split()]
         decider = _decider(posterior.prior, draws, members)
-        found.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
-    return found
+        lines.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
+    return lines
 
 
 def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
@@ -155,7 +158,7 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
     """Say whether the prior decides about some parameters."""
     columns = dict(zip(prior.names, prior.theta(draws).T, strict=True))
     for parameter in prior.free:
-        low, high = parameter.limits(columns)
+        low, high = parameter.limits(prior.seen(columns, parameter.record))
         if parameter.name not in names or not (np.isfinite(low) & np.isfinite(high)).all():
             continue
         place = (columns[parameter.name] - low) / (high - low)
@@ -163,33 +166,36 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
         if np.std(place) > ANYWHERE:
             assert parameter.declared is not None
             return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
-    found = sway(prior, draws, names)
-    if found.part > WIDE:
-        return f"the prior decides there: the posterior has {found.part:.0%} of its sd"
-    if not found.told:
-        return "whether the prior decides there cannot be told from these draws"
-    if found.decides:
+    swayed = sway(prior, draws, names)
+    if swayed.part > WIDE:
+        return f"the prior decides there: the posterior has {swayed.part:.0%} of its sd"
+    if not swayed.told:
+        return "these draws cannot tell whether the prior decides there"
+    if swayed.decides:
         return (
-            f"the prior decides there: one twice as wide moves {found.name} by {found.moved:.1f} "
-            f"of its sd and makes an interval {found.widened:.1f} times as wide"
+            f"the prior decides there: one twice as wide moves {swayed.name} by {swayed.moved:.1f} "
+            f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
         f"the prior does not decide there (one twice as wide moves nothing by more than "
-        f"{found.moved:.1f} of its sd) but the noise model, which may be too sure"
+        f"{swayed.moved:.1f} of its sd) but the noise model, which may be too sure"
     )
 
 
 def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> str:
     """Say what to measure instead."""
     swings, half = [], 0.0
-    for window in posterior.training:
-        voltage = posterior.voltage[window]
-        half = max(half, float(np.ptp(voltage)) / 2)
-        swings += np.abs(np.diff(voltage[turning_points(voltage)])).tolist()
-    columns = posterior.table.columns(posterior.prior.theta(draws))
-    opening = posterior.actuator.hysteresis.opening(columns, half)
+    for one in posterior.datasets:
+        for window in one.training:
+            voltage = one.voltage[window]
+            half = max(half, float(np.ptp(voltage)) / 2)
+            swings += np.abs(np.diff(voltage[turning_points(voltage)])).tolist()
+    first = posterior.datasets[0]
+    _, alone, its = next(posterior.each(draws))
+    columns = first.table.columns(alone.prior.theta(its))
+    opening = first.actuator.hysteresis.opening(columns, half)
     if opening is not None and float(np.median(opening)) < SMALL:
-        return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
     if len(swings) < 2:
         return "drive the actuator up and down several times, with decreasing amplitude"
     if min(swings) > (1 - ALIKE) * max(swings):
@@ -203,7 +209,8 @@ def _bounded(posterior: Posterior, name: str) -> bool:
     """Tell whether other parameters bound this one on both sides."""
     theta = posterior.prior.theta(posterior.prior.constrain(np.zeros((1, len(posterior.names))))[0])
     parameter = posterior.prior.free[posterior.names.index(name)]
-    low, high = parameter.limits(posterior.table.columns(theta))
+    columns = posterior.prior.seen(posterior.table.columns(theta), parameter.record)
+    low, high = parameter.limits(columns)
     return bool(np.isfinite(low).all() and np.isfinite(high).all())
 
 
@@ -213,9 +220,10 @@ def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatAr
     The parts (loop parameters,), the largest first, and the directions as columns, in units of
     each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
     """
-    columns = _columns(posterior, posterior.actuator.parameters)
-    slopes = _slopes(posterior, point.mode, columns)
-    left = linalg.inv(np.eye(len(columns)) + _information(posterior, point, slopes))
+    columns = _columns(posterior, posterior.table.physical)
+    steps = _steps(posterior, point.mode, columns)
+    told = sum(_information(posterior, point, one, steps) for one in posterior.datasets)
+    left = linalg.inv(np.eye(len(columns)) + told)
     loop = [
         i for i, column in enumerate(columns) if posterior.names[column] in posterior.table.loop
     ]
@@ -227,27 +235,25 @@ def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
     return [i for i, name in enumerate(posterior.names) if name in names]
 
 
-def _slopes(posterior: Posterior, mode: FloatArray, columns: list[int]) -> FloatArray:
-    """Change of the displacement per prior sd of each parameter, (physical, samples), um."""
+def _steps(
+    posterior: Posterior, mode: FloatArray, columns: list[int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return θ (physical, parameters) with each parameter a step above and below the mode."""
     free, _ = posterior.prior.constrain(mode[np.newaxis])
     theta = posterior.prior.theta(free)[0]
     values = dict(zip(posterior.prior.names, theta, strict=True))
-    scale = [_prior_sd(posterior.prior.free[column], values) for column in columns]
-    step = 1e-5
+    parameters = [posterior.prior.free[column] for column in columns]
+    scale = [_prior_sd(posterior.prior, parameter, values) for parameter in parameters]
     steps = np.zeros((len(columns), free.shape[1]))
-    steps[np.arange(len(columns)), columns] = step * np.array(scale)
-    plus, minus = np.split(
-        posterior.simulate(posterior.prior.theta(np.concatenate([free + steps, free - steps]))), 2
-    )
-    slopes: FloatArray = (plus - minus) / (2 * step)
-    return slopes
+    steps[np.arange(len(columns)), columns] = STEP * np.array(scale)
+    return posterior.prior.theta(free + steps), posterior.prior.theta(free - steps)
 
 
-def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
+def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float]) -> float:
     """Return a parameter's prior sd around its value in ``values``."""
     assert parameter.prior is not None
     others = {name: np.array([value]) for name, value in values.items()}
-    least, most = parameter.limits(others)
+    least, most = parameter.limits(prior.seen(others, parameter.record))
     if np.isfinite(least).all() and np.isfinite(most).all():
         # What the bounds leave to a parameter of which nothing else is known.
         return float(np.max(most) - np.min(least)) / float(np.sqrt(12))
@@ -258,19 +264,22 @@ def _prior_sd(parameter: Parameter, values: dict[str, float]) -> float:
     return (high - low) / 2
 
 
-def _information(posterior: Posterior, point: PointFit, slopes: FloatArray) -> FloatArray:
-    """Fisher information (physical, physical), each distinct stretch counted once."""
-    windows = posterior.training
-    rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
+def _information(
+    posterior: Posterior, point: PointFit, one: Dataset, steps: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Fisher information (physical, physical) of a record, each distinct stretch counted once."""
+    rows = np.concatenate([np.arange(w.start, w.stop) for w in one.training])
+    # Change of the displacement per prior sd of each parameter, (physical, samples), um.
+    plus, minus = np.split(posterior.simulate(np.concatenate(steps), record=one.name), 2)
+    slopes = (plus - minus) / (2 * STEP)
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
-    sds = posterior.noise.marginal_sd(posterior.table.noise(theta))
-    floor = DISCREPANCY * float(np.ptp(posterior.readings.values))
-    weights, duration = _stretches(posterior.voltage, rows)
+    sds = one.noise.marginal_sd(one.table.noise(posterior.table.of(theta, one.name)))
+    weights, duration = _stretches(one.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
-    values = np.array([[sds[1][0], floor, duration / 2]])
+    values = np.array([[sds[1][0], DISCREPANCY * one.extent, duration / 2]])
     total = np.zeros((slopes.shape[0], slopes.shape[0]))
-    for window in windows:
+    for window in one.training:
         (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])
         total += (white * weights[window]) @ white.T
     return total

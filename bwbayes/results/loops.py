@@ -157,7 +157,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     Parameters
     ----------
     posterior
-        The posterior that was sampled; its record's voltage gives the range.
+        The posterior that was sampled; its records' voltages give the range.
     draws
         (draws, free), parameters in their own units.
     points
@@ -168,9 +168,12 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     InputError
         A voltage that does not change, or an even number of points.
     """
-    actuator = posterior.actuator.within(posterior.voltage)
-    column = posterior.table.columns(posterior.prior.theta(draws))
-    span = Span(float(np.min(posterior.voltage)), float(np.max(posterior.voltage)))
+    _, alone, its = next(posterior.each(draws))
+    one = alone.only
+    actuator = one.actuator.within(one.voltage)
+    column = one.table.columns(alone.prior.theta(its))
+    every = [record.voltage for record in posterior.datasets]
+    span = Span(min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every))
     middle, half = span.middle, span.half
     voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
     return Loops(
@@ -258,7 +261,7 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
     ``widest_percent``
         The largest x↓ − x↑ at one voltage as a part of the range: what data sheets call hysteresis.
     ``remanence_um``
-        x↓(0) − x_m: what is left at zero volts after the highest voltage, against the middle; half
+        x↓(0) − x_m: what remains at zero volts after the highest voltage, against the middle; half
         of the opening in a loop that is symmetric about zero. None as for the opening.
     ``coercive_V``
         (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
@@ -330,7 +333,9 @@ def _loop(traced: Traced) -> Loop:
 def _voltages(low: float, high: float, points: int) -> FloatArray:
     """Return voltages (points,) from the lowest to the highest."""
     if not low < high:
-        raise InputError(f"loops: {low:g} to {high:g} V is no range; give a voltage that changes")
+        raise InputError(
+            f"loops: {low:g} to {high:g} V is not a range; give a voltage that changes"
+        )
     if points < 3 or points % 2 == 0:
         raise InputError(f"loops: {points} points along a branch; give an odd number from 3 on")
     return np.linspace(low, high, points)

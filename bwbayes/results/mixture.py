@@ -20,7 +20,7 @@ from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 
-__all__ = ["judged", "pieces", "quantiles_and_spread"]
+__all__ = ["judged", "log_density", "pieces", "quantiles_and_spread"]
 
 ComplexArray = NDArray[np.complex128]
 
@@ -306,6 +306,28 @@ def _evaluate(means: FloatArray, sds: FloatArray, x: FloatArray) -> tuple[FloatA
     weights = 1 / (np.sqrt(2 * np.pi) * sds.size * sds)
     density: FloatArray = weights @ np.exp(z, out=z)
     return probability, density
+
+
+def log_density(means: FloatArray, sds: FloatArray, values: FloatArray) -> FloatArray:
+    """Log density of the mixture at ``values`` (samples,), y in um; per um, in nats.
+
+    log (1/S) Σ φ((y − mean) / sd) / sd over the S draws, however far off y is. ``means`` and
+    ``sds``, all above zero, as in :func:`judged`; without any sd a density is infinite or zero.
+    """
+    result = np.empty(values.size)
+    with np.errstate(divide="ignore"):
+        sizes = np.log(sds)[:, np.newaxis] + 0.5 * np.log(2 * np.pi)
+    for piece in pieces(means):
+        z = _standardised(values[piece], means[:, piece], sds)
+        np.multiply(z, z, out=z)
+        z *= -0.5
+        z -= sizes
+        top = z.max(axis=0)
+        # Far from all draws no density is a float; its log is.
+        with np.errstate(invalid="ignore"):
+            z -= np.where(np.isfinite(top), top, 0)
+        result[piece] = top + np.log(np.exp(z, out=z).mean(axis=0))
+    return result
 
 
 def _standardised(x: FloatArray, means: FloatArray, sds: FloatArray) -> FloatArray:

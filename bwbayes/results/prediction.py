@@ -93,7 +93,9 @@ def predict_windows(
     mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     bands = []
     for name, window in windows.items():
-        training = any(w.start < window.stop and window.start < w.stop for w in posterior.training)
+        training = any(
+            w.start < window.stop and window.start < w.stop for w in posterior.only.training
+        )
         bands.append(replace(_bands(name, mixed, record, window), training=training))
     return bands
 
@@ -180,7 +182,7 @@ def predict_record(
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    return _Draws(start, *posterior.noise.marginal_sd(posterior.table.noise(theta)))
+    return _Draws(start, *posterior.only.noise.marginal_sd(posterior.only.table.noise(theta)))
 
 
 def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
@@ -207,6 +209,7 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
         upper={(k, level): joined[f"{k} {level} upper"] for k in KINDS for level in LEVELS},
         pit=joined.get("pit"),
         crps=joined.get("crps"),
+        log_score=joined.get("log_score"),
         interval=record.interval,
     )
 
@@ -241,9 +244,12 @@ def _summarised(
     if record.displacement is not None:
         reading = record.displacement[first : first + simulated.shape[1]]
         seen = np.isfinite(reading)
-        judged = np.full((2, reading.size), np.nan)
+        judged = np.full((3, reading.size), np.nan)
         if seen.any():
-            judged[:, seen] = mixture.judged(simulated[:, seen], mixed.sds("sensor"), reading[seen])
+            of = simulated[:, seen], mixed.sds("sensor"), reading[seen]
+            judged[:2, seen] = mixture.judged(*of)
+            judged[2, seen] = mixture.log_density(*of)
         summarised["pit"] = judged[0]
         summarised["crps"] = judged[1] - spread["sensor"]
+        summarised["log_score"] = judged[2]
     return summarised

@@ -1,4 +1,4 @@
-"""Whether a fit hangs on the start of its record: a second point fit without it tells.
+"""Whether a fit depends on the start of its record: a second point fit without it tells.
 
 A switch-on transient, or a first part that belongs to something else, can drag the parameters far
 away while the noise model covers what is then missed everywhere, so that neither bands nor
@@ -64,9 +64,10 @@ def without_start(
     generator: np.random.Generator,
     begin: float = 0.0,
     *,
+    record: str | None = None,
     seen: bool = False,
 ) -> Moved | None:
-    """Fit again without the first readings; return the parameter that moves most, if one does.
+    """Fit again without a record's first readings; return the parameter that moves most, if any.
 
     Parameters
     ----------
@@ -78,15 +79,22 @@ def without_start(
         Starts the point fit and draws from its approximation.
     begin
         Time of the record's first sample, s.
+    record
+        Its name; may be left out if there is one alone.
     seen
         The readings show a switch-on transient.
     """
-    rows = posterior.readings.rows
+    name = posterior.only.name if record is None else record
+    one = posterior.alone(name).only
+    rows = one.readings.rows
     if rows.size < FEWEST:
         return None
     first = int(rows[round(PART * rows.size)])
-    later = [slice(max(w.start, first), w.stop) for w in posterior.training if w.stop > first]
-    rest = replace(posterior, training=tuple(later))
+    later = [slice(max(w.start, first), w.stop) for w in one.training if w.stop > first]
+    cut = replace(one, training=tuple(later))
+    rest = replace(
+        posterior, datasets=tuple(cut if o.name == name else o for o in posterior.datasets)
+    )
     try:
         point = pointfit.fit(rest, generator)
     except InputError:
@@ -101,8 +109,7 @@ def without_start(
     physical = [
         i
         for i, p in enumerate(posterior.prior.free)
-        if p.name in posterior.actuator.parameters
-        and p.name not in posterior.table.of_scope("record")
+        if p.plain in one.actuator.parameters and p.plain not in one.table.of_scope("record")
     ]
     if not physical or len(free) < DRAWS // 4:
         return None
@@ -112,7 +119,7 @@ def without_start(
     if moved[worst] <= (SEEN_MOVED if seen else MOVED):
         return None
     parameter = posterior.prior.free[physical[worst]]
-    until = begin + posterior.actuator.interval * first
+    until = begin + one.actuator.interval * first
     whole = float(mean[worst]), float(sd[worst])
     return Moved(
         parameter.name, parameter.unit, until, whole, (float(other[worst]), float(its_sd[worst]))

@@ -11,9 +11,9 @@ made; :mod:`bwbayes.results.calibration` judges many of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from typing import TypedDict
@@ -26,11 +26,21 @@ from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.passages import crossings, passed
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
 
-__all__ = ["EXTRA", "RANKED", "Entry", "Experiment", "Replicate", "replicate", "replicates"]
+__all__ = [
+    "EXTRA",
+    "RANKED",
+    "Entry",
+    "Experiment",
+    "Replicate",
+    "as_done",
+    "replicate",
+    "replicates",
+]
 
 # Draws that a truth is ranked among.
 RANKED = 199
@@ -64,8 +74,10 @@ class Experiment:
     plan
         How to sample.
     held_out
-        Windows (slices of the voltage) for which bands are predicted and held against the
-        simulated record.
+        Windows (slices of a record's voltage) for which bands are predicted and held against the
+        simulated record, by name.
+    belongs
+        The record that a held-out window is of, by the window's name; by default the first.
     others
         Other records, by name: made with the same truth, but with a start and an offset of their
         own, and predicted with the parameters from the posterior.
@@ -77,7 +89,7 @@ class Experiment:
     Raises
     ------
     InputError
-        The training voltage does not go forth and back, so that there is no loop to measure.
+        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     posterior: Posterior
@@ -85,12 +97,12 @@ class Experiment:
     held_out: Mapping[str, slice] = field(default_factory=dict)
     others: Mapping[str, OtherRecord] = field(default_factory=dict)
     source: Posterior | None = None
+    belongs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        rising, falling = self._crossings
-        if not (rising.size and falling.size):
+        if not any(crossings(path).both for path in self._paths.values()):
             raise InputError(
-                "record: its training voltage does not go forth and back, so there is no loop to "
+                "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
             )
 
@@ -116,42 +128,34 @@ class Experiment:
         return (*own, *(f"{other} {name}" for other in self.others for name in names))
 
     @cached_property
+    def _paths(self) -> dict[str, FloatArray]:
+        """The voltage of each record up to its last training sample."""
+        return {one.name: one.voltage[: one.training[-1].stop] for one in self.posterior.datasets}
+
+    @cached_property
+    def looped(self) -> str:
+        """The record whose loop is measured: the first that goes back and forth."""
+        return next(name for name, path in self._paths.items() if crossings(path).both)
+
+    @property
     def level(self) -> float:
-        """Voltage at which loops are measured, V: zero, or the middle of a drive beside it."""
-        path = self._path
-        low, high = float(np.min(path)), float(np.max(path))
-        return 0.0 if low < 0 < high else (low + high) / 2
-
-    @cached_property
-    def _path(self) -> FloatArray:
-        end = max(window.stop for window in self.posterior.training)
-        path: FloatArray = self.posterior.voltage[:end]
-        return path
-
-    @cached_property
-    def _crossings(self) -> tuple[IntArray, IntArray]:
-        """Samples after which the voltage goes up and down through the level."""
-        above = self._path > self.level
-        return np.flatnonzero(~above[:-1] & above[1:]), np.flatnonzero(above[:-1] & ~above[1:])
+        """Voltage at which loops are measured, V."""
+        return crossings(self._paths[self.looped]).level
 
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
         """Log likelihood and the two loop measures of models θ, (models, 3).
 
-        The opening (um) is the model's displacement where the voltage falls through
-        :attr:`level` less that where it rises through it, interpolated between samples, each the
-        mean over all passages; the range (um) is its largest less its smallest displacement.
+        The opening (um) is the model's displacement where the voltage falls through zero, or
+        through the middle of a drive beside it, less that where it rises through it, interpolated
+        between samples, each the mean over all passages; the range (um) is its largest less its
+        smallest displacement. Of several records, in the first that goes back and forth.
         """
-        displacement = posterior.simulate(theta)
-        falling, rising = (self._passed(displacement, at) for at in reversed(self._crossings))
+        displacement = posterior.simulate(theta, record=self.looped)
+        path = self._paths[self.looped]
+        level, up, down = crossings(path)
+        falling, rising = (passed(displacement, path, at, level) for at in (down, up))
         extent = np.ptp(displacement, axis=1)
         return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
-
-    def _passed(self, displacement: FloatArray, at: IntArray) -> FloatArray:
-        before, after = self._path[at], self._path[at + 1]
-        part = (self.level - before) / (after - before)
-        passed = displacement[:, at] * (1 - part) + displacement[:, at + 1] * part
-        mean: FloatArray = np.mean(passed, axis=1)
-        return mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +198,8 @@ class Replicate:
 
     def entry(self) -> Entry:
         """Return what is stored of it."""
-        found = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
         return Entry(
             number=self.number,
             converged=self.converged,
@@ -203,7 +207,7 @@ class Replicate:
             steps=self.steps,
             spacing=self.spacing,
             truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
             covered=dict(self.covered),
         )
 
@@ -220,11 +224,26 @@ def replicates(
     Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
     be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
     """
-    waiting = iter(numbers)
-    running: set[Future[Replicate]] = set()
+    return as_done(
+        executor, together, replicate, ((experiment, seed, number) for number in numbers)
+    )
+
+
+def as_done[T](
+    executor: Executor,
+    together: int,
+    call: Callable[..., T],
+    arguments: Iterable[tuple[object, ...]],
+) -> Iterator[T]:
+    """Call a function with each of the arguments, and yield each result as soon as it is there.
+
+    Only so many ``together`` are under way, so that whoever stops waits for those alone.
+    """
+    waiting = iter(arguments)
+    running: set[Future[T]] = set()
     while True:
-        for number in islice(waiting, together - len(running)):
-            running.add(executor.submit(replicate, experiment, seed, number))
+        for each in islice(waiting, together - len(running)):
+            running.add(executor.submit(call, *each))
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -243,9 +262,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     generator = np.random.default_rng([seed, number])
     simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
     theta, made = _simulated(experiment, simulating)
-    record = made.record
-    assert record.displacement is not None
-    posterior = replace(experiment.posterior, displacement=record.displacement)
+    posterior = _with_readings(experiment.posterior, made)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     truth = _statistics(experiment, posterior, true)[0]
     names = experiment.statistics
@@ -263,31 +280,41 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
     inside = _held_out(experiment, posterior, flat, made, predicting)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
-    inside |= _others(experiment, posterior, flat, theta, record, others)
+    inside |= _others(experiment, posterior, flat, theta, made, others)
     return Replicate(number, *ended, names, truth, drawn, inside)
 
 
 def _simulated(
     experiment: Experiment, generator: np.random.Generator
-) -> tuple[dict[str, FloatArray], Simulated]:
-    """Draw a truth; return it by parameter, (1,) each, and its record."""
+) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
+    """Draw a truth; return it by parameter, (1,) each, and its records by name."""
     source = experiment.truth
     theta = source.prior.theta(source.prior.draw(generator, 1))
-    column = dict(zip(source.prior.names, theta.T, strict=True))
-    sd = source.likelihood.start_sd(theta)
-    model = source.likelihood.actuator.advance(
-        source.table.actuator(theta),
-        source.voltage,
-        unrest=sd * generator.standard_normal(sd.shape),
-        from_rest=source.from_rest,
-    )[0][0]
-    discrepancy, sensor = source.noise.draw(source.table.noise(theta), model.size, generator)
-    truth = model + discrepancy
-    reading = truth + sensor
-    reading[np.isnan(experiment.posterior.displacement)] = np.nan
-    return column, Simulated(
-        Record(source.voltage, reading, source.actuator.interval, truth=truth), model
-    )
+    column = source.table.columns(theta)
+    made = {}
+    for fitted, one, likelihood in zip(
+        experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
+    ):
+        mine = source.table.of(theta, one.name)
+        sd = likelihood.start_sd(mine)
+        model = likelihood.actuator.advance(
+            one.table.actuator(mine),
+            one.voltage,
+            unrest=sd * generator.standard_normal(sd.shape),
+            from_rest=one.from_rest,
+        )[0][0]
+        discrepancy, sensor = one.noise.draw(one.table.noise(mine), model.size, generator)
+        truth = model + discrepancy
+        reading = truth + sensor
+        reading[np.isnan(fitted.displacement)] = np.nan
+        record = Record(one.voltage, reading, one.actuator.interval, truth=truth)
+        made[one.name] = Simulated(record, model)
+    return column, made
+
+
+def _with_readings(posterior: Posterior, made: Mapping[str, Simulated]) -> Posterior:
+    """Return a posterior with the readings of simulated records."""
+    return posterior.with_readings({name: one.reading for name, one in made.items()})
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
@@ -321,8 +348,8 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    wanted = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    apart = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
     left = chained[::-spacing].reshape(-1, free)
     return spacing, thinned(left, generator, RANKED)
 
@@ -331,16 +358,24 @@ def _held_out(
     experiment: Experiment,
     posterior: Posterior,
     draws: FloatArray,
-    made: Simulated,
+    made: Mapping[str, Simulated],
     generator: np.random.Generator,
 ) -> dict[str, float]:
     """Part of the held-out samples, of all windows together, inside each band."""
-    windows = experiment.held_out
-    if not windows:
-        return {}
-    bands = predict_windows(posterior, draws, made.record, windows, generator)
-    parts = covered(list(zip(bands, windows.values(), strict=True)), made)
-    return {f"{kind} {level}": part for kind, level, part in parts}
+    parts = []
+    for name, alone, its in posterior.each(draws):
+        first = posterior.table.records[0]
+        windows = {
+            window: part
+            for window, part in experiment.held_out.items()
+            if experiment.belongs.get(window, first) == name
+        }
+        if windows:
+            bands = predict_windows(alone, its, made[name].record, windows, generator)
+            parts += [
+                (one, made[name], part) for one, part in zip(bands, windows.values(), strict=True)
+            ]
+    return {f"{kind} {level}": part for kind, level, part in covered(parts)} if parts else {}
 
 
 def _others(
@@ -348,17 +383,18 @@ def _others(
     posterior: Posterior,
     draws: FloatArray,
     theta: Mapping[str, FloatArray],
-    record: Record,
+    records: Mapping[str, Simulated],
     generator: np.random.Generator,
 ) -> dict[str, float]:
     """Make the other records with the same truth; part of their samples inside each band."""
-    assert record.displacement is not None
-    source = replace(experiment.truth, displacement=record.displacement)
+    source = _with_readings(experiment.truth, records)
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     inside = {}
     for name, other in experiment.others.items():
-        made = other.simulated(source, true, generator)
-        predicted = other.predicted(posterior, draws, made.record, generator)
-        for kind, level, part in covered([predicted], made):
-            inside[f"{name} {kind} {level}"] = part
+        like = other.like or posterior.table.records[0]
+        made = other.simulated(source.alone(like), source.table.of(true, like), generator)
+        alone, its = posterior.alone(like), posterior.its(draws, like)
+        bands, part = other.predicted(alone, its, made.record, generator)
+        for kind, level, covering in covered([(bands, made, part)]):
+            inside[f"{name} {kind} {level}"] = covering
     return inside

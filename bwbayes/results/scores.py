@@ -44,6 +44,9 @@ class Scores:
         nan if the measured does not vary.
     max_error_um
         Largest absolute measured - mean.
+    log_score
+        Mean log density of a reading under the sensor's distribution, nats, per um; None if it is
+        not known.
     crps_um
         Mean continuous ranked probability score of the sensor's distribution.
     width_um
@@ -71,6 +74,7 @@ class Scores:
     coverage: dict[str, dict[int, float] | None]
     coverage_error: dict[str, dict[int, float] | None]
     worst_second: dict[int, float]
+    log_score: float | None = None
 
 
 def score(bands: Bands, generator: np.random.Generator) -> Scores:
@@ -125,6 +129,7 @@ def score(bands: Bands, generator: np.random.Generator) -> Scores:
         coverage=coverage,
         coverage_error=error,
         worst_second=seconds,
+        log_score=None if bands.log_score is None else float(bands.log_score[judged].mean()),
     )
 
 
@@ -140,6 +145,11 @@ def as_summary(scores: Scores) -> dict[str, object]:
     return {
         "nrmse": scores.nrmse if np.isfinite(scores.nrmse) else None,
         "max_error_um": scores.max_error_um,
+        "log_score": (
+            scores.log_score
+            if scores.log_score is not None and np.isfinite(scores.log_score)
+            else None
+        ),
         "crps_um": scores.crps_um,
         **{f"width_{level}_um": width for level, width in scores.width_um.items()},
         **{f"interval_score_{level}_um": s for level, s in scores.interval_score_um.items()},
@@ -150,7 +160,10 @@ def as_summary(scores: Scores) -> dict[str, object]:
 
 
 def block_bootstrap_error(
-    hits: BoolArray, block: int, generator: np.random.Generator, replicates: int = REPLICATES
+    hits: BoolArray | FloatArray,
+    block: int,
+    generator: np.random.Generator,
+    replicates: int = REPLICATES,
 ) -> float:
     """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
 
@@ -162,7 +175,7 @@ def block_bootstrap_error(
     Parameters
     ----------
     hits
-        (samples,) whether the band holds the value.
+        (samples,) whether the band holds the value; or any other series.
     block
         Samples in a block, see `block_length`; kept between 1/500 and a quarter of all samples.
     generator
@@ -181,7 +194,7 @@ def block_bootstrap_error(
     in Exploring the Limits of Bootstrap, Wiley 1992, 263-270.
     """
     samples = hits.size
-    if hits.all() or not hits.any():
+    if (hits == hits[0]).all():
         return 0.0
     block = max(1, samples // MOST_BLOCKS, min(block, samples // FEWEST_BLOCKS))
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([hits, hits[: block - 1]]))])

@@ -7,7 +7,7 @@ dynamics as far from rest as their prior says, and with an offset of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -29,6 +29,12 @@ class Simulated(NamedTuple):
     record: Record
     model: FloatArray
 
+    @property
+    def reading(self) -> FloatArray:
+        """What its sensor says, (samples,), um."""
+        assert self.record.displacement is not None
+        return self.record.displacement
+
 
 @dataclass(frozen=True)
 class OtherRecord:
@@ -43,11 +49,15 @@ class OtherRecord:
         What is known of its start.
     window
         Part of it (start, stop) that is predicted, s; by default all.
+    like
+        The record that was fitted whose own parameters it takes where nothing tells its own; by
+        default the first.
     """
 
     record: Record
     start: Start = field(default_factory=Start)
     window: Window | None = None
+    like: str = ""
 
     def simulated(
         self, posterior: Posterior, theta: FloatArray, generator: np.random.Generator
@@ -61,9 +71,9 @@ class OtherRecord:
         begun = started(posterior, theta, planned, self.start, generator)
         model = begun.advance(planned.voltage)[0][0]
         if self.start.own_offset and self.record.displacement is not None:
-            model = model + np.ptp(posterior.readings.values) * generator.standard_normal()
-        noise = posterior.noise.at(planned.interval)
-        discrepancy, sensor = noise.draw(posterior.table.noise(theta), model.size, generator)
+            model = model + posterior.only.extent * generator.standard_normal()
+        noise = posterior.only.noise.at(planned.interval)
+        discrepancy, sensor = noise.draw(posterior.only.table.noise(theta), model.size, generator)
         truth = model + discrepancy
         reading = truth + sensor
         if self.record.displacement is not None:
@@ -87,30 +97,38 @@ class OtherRecord:
         return bands, slice(part.start + bands.scored_from, part.stop)
 
 
-def covered(every: list[tuple[Bands, slice]], made: Simulated) -> Iterator[tuple[Kind, int, float]]:
-    """Yield the part of a simulated record's samples that lie inside each kind and level of band.
+def covered(
+    every: Sequence[tuple[Bands, Simulated, slice]],
+) -> Iterator[tuple[Kind, int, float]]:
+    """Yield the part of simulated records' samples that lie inside each kind and level of band.
 
     The last samples of the bands are those of the slice of the record that they come with. The
     parameter band is for the model's displacement, the displacement band for the simulated truth,
     which has the discrepancy, and the sensor band for the readings, where there are any.
     """
-    target: dict[Kind, FloatArray | None]
-    target = {
+    for kind in KINDS:
+        for level in LEVELS:
+            inside = [
+                _inside(bands, (kind, level), _target(kind, made)[window])
+                for bands, made, window in every
+            ]
+            yield kind, level, float(np.mean(np.concatenate(inside)))
+
+
+def _target(kind: Kind, made: Simulated) -> FloatArray:
+    """Return what a kind of band is for, (samples,), um."""
+    assert made.record.truth is not None
+    targets: dict[Kind, FloatArray] = {
         "parameter": made.model,
         "displacement": made.record.truth,
-        "sensor": made.record.displacement,
+        "sensor": made.reading,
     }
-    for kind in KINDS:
-        values = target[kind]
-        assert values is not None
-        for level in LEVELS:
-            inside = [_inside(bands, (kind, level), values[window]) for bands, window in every]
-            yield kind, level, float(np.mean(np.concatenate(inside)))
+    return targets[kind]
 
 
 def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
     """Tell which of the values (samples,) that there are lie inside the end of a band."""
-    there = np.isfinite(values)
+    known = np.isfinite(values)
     low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
-    inside: FloatArray = ((low <= values) & (values <= high))[there].astype(np.float64)
+    inside: FloatArray = ((low <= values) & (values <= high))[known].astype(np.float64)
     return inside

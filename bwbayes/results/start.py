@@ -67,7 +67,7 @@ class Start:
     hold: Hold | None = None
 
     def window(self, record: Record) -> slice | None:
-        """Return the samples of the lead-in, or None if nothing is to be learnt from one.
+        """Return the samples of the lead-in, or None if nothing can be learned from one.
 
         Raises
         ------
@@ -151,7 +151,7 @@ def started(
     """
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
     span = _voltages(posterior, record)
-    actuator = replace(posterior.actuator, interval=record.interval, hold=hold, span=span)
+    actuator = replace(posterior.only.actuator, interval=record.interval, hold=hold, span=span)
     window = start.window(record)
     whole = _likelihood(posterior, actuator, record, start, window)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
@@ -171,15 +171,15 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     likelihood = posterior.likelihood
     start = likelihood.start(theta)
     unrest = _normal(start.mean, start.covariance, generator)
-    model, none = posterior.table.actuator(theta), np.zeros(len(theta))
+    model, none = posterior.only.table.actuator(theta), np.zeros(len(theta))
     which = np.zeros(len(theta), dtype=np.int64)
-    return Started((likelihood.actuator,), which, model, unrest, none, posterior.from_rest)
+    return Started((likelihood.actuator,), which, model, unrest, none, posterior.only.from_rest)
 
 
 def _voltages(posterior: Posterior, record: Record) -> Span:
-    """Return the least and the largest voltage of both records, V."""
-    both = record.voltage, posterior.voltage
-    return Span(min(float(np.min(v)) for v in both), max(float(np.max(v)) for v in both))
+    """Return the least and the largest voltage of this record and of those that were fitted, V."""
+    low, high = posterior.only.span
+    return Span(min(float(np.min(record.voltage)), low), max(float(np.max(record.voltage)), high))
 
 
 def _likelihood(
@@ -195,12 +195,12 @@ def _likelihood(
         record.voltage,
         readings,
         actuator,
-        posterior.noise,
+        posterior.only.noise,
         posterior.engine,
         start.from_rest,
         (high - low) / 2,
         # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
-        float(np.ptp(posterior.readings.values)) if own else 0.0,
+        posterior.only.extent if own else 0.0,
     )
 
 

@@ -120,10 +120,12 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     step
         The step.
     """
-    column = posterior.table.columns(posterior.prior.theta(draws))
+    _, alone, its = next(posterior.each(draws))
+    one = alone.only
+    column = one.table.columns(alone.prior.theta(its))
     nothing = np.zeros(len(draws))
     column |= {"initial": nothing, "offset": nothing}
-    actuator = replace(posterior.actuator.within(posterior.voltage), hold="zero")
+    actuator = replace(one.actuator.within(one.voltage), hold="zero")
     held = max(step.held, 10 * FIRST)
     time = np.geomspace(FIRST, held, round(PER_DECADE * np.log10(held / FIRST)) + 1)
     settled, without, creep = _responses(actuator, column, step.height, time)

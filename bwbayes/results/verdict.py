@@ -75,7 +75,7 @@ class Background:
     fitted
         Lowest and highest voltage that was fitted, V.
     extent
-        Range of all readings that were fitted, um, whatever their windows.
+        Range of all readings of a record that were fitted, um, whatever their windows.
     """
 
     memory: float = 0.0
@@ -86,16 +86,20 @@ class Background:
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
         """Return what a posterior and its draws (draws, free) say."""
-        noise = posterior.table.noise(posterior.prior.theta(draws))
-        memory = float(np.quantile(posterior.noise.memory(noise), LONG))
-        sds = posterior.noise.marginal_sd(noise)
-        sizes = np.log(np.sqrt(sum(sd**2 for sd in sds)))
-        voltage = np.concatenate([posterior.voltage[window] for window in posterior.training])
+        memory, unsure = [], []
+        for _, alone, its in posterior.each(draws):
+            one = alone.only
+            noise = one.table.noise(alone.prior.theta(its))
+            memory.append(float(np.quantile(one.noise.memory(noise), LONG)))
+            sds = one.noise.marginal_sd(noise)
+            unsure.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
+        every = posterior.datasets
+        voltage = np.concatenate([one.voltage[window] for one in every for window in one.training])
         return cls(
-            memory,
-            float(np.std(sizes)),
+            max(memory),
+            max(unsure),
             (float(voltage.min()), float(voltage.max())),
-            float(np.ptp(posterior.readings.values)),
+            max(one.extent for one in every),
         )
 
 
@@ -357,7 +361,7 @@ def _odd(start: OddStart | None) -> list[str]:
 
 
 def _moved(moved: Moved | None) -> list[str]:
-    """Say that the parameters of a fit hang on the record's start."""
+    """Say that the parameters of a fit depend on the record's start."""
     if moved is None:
         return []
     (whole, sd), (rest, its_sd) = moved.whole, moved.rest

@@ -25,7 +25,15 @@ from scipy.special import ndtri
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.ensemble import autocorrelation_time
 
-__all__ = ["Check", "as_chains", "check", "effective_draws", "nested_rhat", "pareto_k"]
+__all__ = [
+    "Check",
+    "as_chains",
+    "check",
+    "effective_draws",
+    "nested_rhat",
+    "pareto_k",
+    "smoothed_weights",
+]
 
 LARGEST_RHAT = 1.01
 
@@ -88,33 +96,33 @@ class Check:
         First what more draws need not cure. Of effective draws, and of autocorrelation times, a
         ``part`` is enough. Every comparison is written so that nan fails it.
         """
-        found = self.disagreements()
+        reasons = self.disagreements()
         fewest = np.min([self.ess_bulk, self.ess_tail])
         if not fewest >= part * ess:
-            found.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
+            reasons.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
         times = self.steps / np.max(self.autocorrelation)
         if not times >= part * LENGTH:
             least = f"{part * LENGTH:g}"
-            found.append(
+            reasons.append(
                 f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
             )
-        return found
+        return reasons
 
     def disagreements(self) -> list[str]:
         """Say what is wrong with the draws that there are; empty if nothing is."""
-        found = []
+        reasons = []
         if not (self.rhat < LARGEST_RHAT).all():
             rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
-            found.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
+            reasons.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
             rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
-            found.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
+            reasons.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
         if self.stuck:
-            found.append(f"{self.stuck} walkers are stuck")
+            reasons.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
             shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
-            found.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
-        return found
+            reasons.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
+        return reasons
 
 
 def _told(value: float, limit: float, digits: int = 0) -> str:
@@ -203,6 +211,24 @@ def pareto_k(log_weights: FloatArray) -> float:
     except (ValueError, IndexError):  # nothing
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
+
+
+def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
+    """Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
+
+    The largest weights are replaced by the order statistics of the generalised Pareto distribution
+    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted.
+
+    Notes
+    -----
+    A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling,
+    Journal of Machine Learning Research 25 (2024).
+    """
+    if log_weights.size and np.ptp(log_weights) < EQUAL:
+        return np.full(log_weights.size, 1 / log_weights.size), 0.0
+    smoothed, shape = array_stats.psislw(-log_weights)
+    weights = np.exp(smoothed - np.max(smoothed))
+    return weights / np.sum(weights), float(shape) if np.isfinite(shape) else np.inf
 
 
 def as_chains(draws: FloatArray) -> FloatArray:

@@ -28,6 +28,8 @@ COMMANDS = (
     "predict",
     "report",
     "calibrate",
+    "export",
+    "track",
     "config",
     "models",
 )

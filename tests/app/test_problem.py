@@ -57,7 +57,7 @@ KNOWN |= {"discrepancy_time": 0.5}
 
 def test_single_training_window_needs_no_list_of_its_own(folder: Path) -> None:
     one, other = (of(RECORD + f"train = {text}", folder) for text in ("[0, 2.0]", "[[0, 2.0]]"))
-    assert (slice(0, 200),) == one.posterior.training == other.posterior.training
+    assert (slice(0, 200),) == one.posterior.only.training == other.posterior.only.training
 
 
 def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> None:
@@ -148,7 +148,7 @@ def test_resolved_config_says_every_choice_in_numbers(folder: Path) -> None:
         assert parameter.label
         assert parameter.description
     assert set(problem.config.parameters) == {p.name for p in problem.parameters}
-    assert problem.posterior.actuator.hold == "zero"
+    assert problem.posterior.only.actuator.hold == "zero"
     assert problem.config.sampling.walkers == problem.plan.walkers
 
 
@@ -165,7 +165,7 @@ def test_resolved_config_resolves_to_the_same_numbers(
     np.testing.assert_array_equal(first.record.truth, again.record.truth)
     assert first.parameters == again.parameters
     assert first.plan == again.plan
-    assert first.posterior.training == again.posterior.training
+    assert first.posterior.only.training == again.posterior.only.training
     for name, one in first.validations.items():
         other = again.validations[name]
         assert (one.window, one.start) == (other.window, other.start)
@@ -182,14 +182,14 @@ def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
     text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\nexclude = [1.5, 1.7]\n" + train
     first = of(text, folder)
     assert (300, 0.01, 0.0) == (first.record.samples, first.record.interval, first.record.start)
-    np.testing.assert_array_equal(record().voltage[:300], first.posterior.voltage)
+    np.testing.assert_array_equal(record().voltage[:300], first.posterior.only.voltage)
     assert [*range(100, 150, 2), *range(170, 300, 2)] == np.flatnonzero(
         first.record.has_reading
     ).tolist()
-    assert (slice(100, 200 if train else 299),) == first.posterior.training
+    assert (slice(100, 200 if train else 299),) == first.posterior.only.training
     again = load_run(RunFolder.create(folder / "run", first, overwrite=False))
     assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
-    assert again.posterior.training == first.posterior.training
+    assert again.posterior.only.training == first.posterior.only.training
     assert again.parameters == first.parameters
     assert again.config == first.config
 
@@ -233,24 +233,24 @@ def test_automatic_hold_follows_what_the_voltage_is(
     silent = [row for row in rows if not row.startswith("#")]
     (folder / "record.csv").write_text("\n".join(silent) + "\n")
     problem = of(RECORD + said, folder)
-    assert hold == problem.posterior.actuator.hold
+    assert hold == problem.posterior.only.actuator.hold
     # Kept as it was asked for: another record has a hold of its own.
     assert problem.config.model.hold == "auto"
 
 
 def test_automatic_hold_of_the_test_stand_is_zero_order(tmp_path: Path) -> None:
-    assert "zero" == resolve(small.config(), tmp_path).posterior.actuator.hold
+    assert "zero" == resolve(small.config(), tmp_path).posterior.only.actuator.hold
 
 
 def test_hold_that_is_given_is_kept(folder: Path) -> None:
     text = RECORD + "voltage_is = 'command'\n[model]\nhold = 'first'"
-    assert "first" == of(text, folder).posterior.actuator.hold
+    assert "first" == of(text, folder).posterior.only.actuator.hold
 
 
 def test_model_that_need_not_be_passive_stays_so(folder: Path) -> None:
-    assert of(RECORD, folder).posterior.actuator.hysteresis == BoucWen(passive=True)
+    assert of(RECORD, folder).posterior.only.actuator.hysteresis == BoucWen(passive=True)
     problem = of(RECORD + "[model]\npassive = false", folder)
-    assert problem.posterior.actuator.hysteresis == BoucWen(passive=False)
+    assert problem.posterior.only.actuator.hysteresis == BoucWen(passive=False)
     assert not problem.config.model.passive
     assert "passive = false" in dump(problem.config)
 
@@ -386,10 +386,10 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
     write_record(transient, tmp_path / "record.h5")
     text = '[record]\nfile = "record.h5"\n'
     whole = of(text, tmp_path)
-    (finding,) = whole.findings
+    (finding,) = whole.findings["record"]
     assert f"record: {finding}" in whole.remarks
     later = of(f"{text}train = [[{finding.stop + 0.01}, 5.0]]\n", tmp_path)
-    assert () == later.findings
+    assert () == later.findings["record"]
     (remark,) = of(
         f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
     ).remarks
@@ -414,13 +414,15 @@ def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
     reading[[100, 333]] += (20, -20)
     write_record(Record(voltage, reading, 0.01), folder / "record.csv")
     problem = of(RECORD + "[model]\noutliers = true\n", folder)
-    assert [100, 333] == np.flatnonzero(np.isnan(problem.posterior.displacement)).tolist()
+    assert [100, 333] == np.flatnonzero(np.isnan(problem.posterior.only.displacement)).tolist()
     assert "2 readings set aside as isolated outliers, at 1, 3.33 s" in problem.remarks
-    assert [1.0, 3.33] == pytest.approx(problem.config.record.outliers)
+    assert [1.0, 3.33] == pytest.approx(problem.config.records["record"].outliers)
     (folder / "records").mkdir()
     write_record(problem.record, folder / "records" / "record.h5")
     again = resolve(problem.config, folder)
-    assert problem.posterior.readings.rows.tolist() == again.posterior.readings.rows.tolist()
+    assert (
+        problem.posterior.only.readings.rows.tolist() == again.posterior.only.readings.rows.tolist()
+    )
 
 
 def test_steps_are_drawn_up_from_levels_and_their_dwell() -> None:

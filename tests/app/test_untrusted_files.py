@@ -197,7 +197,10 @@ CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "read_pickl
 
 
 # What this program's own processes send to each other comes from no file.
-BETWEEN_PROCESSES = {"app/running/workers.py": {"pickle", "cloudpickle"}}
+BETWEEN_PROCESSES = {
+    "app/running/workers.py": {"pickle", "cloudpickle"},
+    "app/running/cluster.py": {"pickle", "cloudpickle"},
+}
 
 
 def called(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:

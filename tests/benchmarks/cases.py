@@ -92,10 +92,10 @@ def variant(
     posterior: Posterior, dynamics: str, noise: str, samples: int | None = None
 ) -> Posterior:
     """Return a posterior of the same record with another model, repeated to so many samples."""
-    voltage, displacement = posterior.voltage, posterior.displacement
+    voltage, displacement = posterior.only.voltage, posterior.only.displacement
     if samples is not None:
         voltage, displacement = np.resize(voltage, samples), np.resize(displacement, samples)
-    actuator = replace(posterior.actuator, dynamics=dynamics)
+    actuator = replace(posterior.only.actuator, dynamics=dynamics)
     known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
     other = posterior_of(voltage, displacement, actuator, noise, known)
     return replace(other, engine=posterior.engine)
@@ -106,9 +106,11 @@ def with_parts(posterior: Posterior, *, from_rest: bool) -> dict[str, Posterior]
 
     Without a start from rest the state of everything at the first sample is unknown.
     """
-    voltage, displacement = posterior.voltage, posterior.displacement
+    voltage, displacement = posterior.only.voltage, posterior.only.displacement
     span = Span(float(np.min(voltage)), float(np.max(voltage)))
-    plain = Actuator("lag", posterior.actuator.hold, posterior.actuator.interval, span=span)
+    plain = Actuator(
+        "lag", posterior.only.actuator.hold, posterior.only.actuator.interval, span=span
+    )
     gain = PolynomialGain(reference=span)
     actuators = {
         name: replace(plain, hysteresis=made("hysteresis", name, HYSTERESIS, {}))

@@ -93,7 +93,7 @@ def parts(posterior: Posterior, effort: Effort) -> Table:
             calls[f"{name}, {start}"] = partial(one.log_likelihood, theta)
     cost = interleaved(calls, effort.rounds)
     usual = cost["bouc-wen, from rest"].wall
-    work = MODELS * posterior.voltage.size
+    work = MODELS * posterior.only.voltage.size
     rows = [
         dict[str, Cell](model=name, ns=1e9 * one.wall / work, times=one.wall / usual)
         for name, one in cost.items()
@@ -117,7 +117,7 @@ def lengths(posterior: Posterior, effort: Effort) -> Table:
 
 def hysteresis_alone(posterior: Posterior, effort: Effort) -> Table:
     """Measure the hysteresis without the rest."""
-    voltage, shape = posterior.voltage, shape_of(posterior)
+    voltage, shape = posterior.only.voltage, shape_of(posterior)
     calls: Mapping[str, Call] = {
         "numpy": lambda: hysteresis(voltage, **shape),
         "stock": lambda: hysteresis_loop(voltage, **shape),
@@ -171,7 +171,7 @@ PER_SAMPLE = "ns per sample and model on one core, best of several; stock: a loo
 
 
 def _row(posterior: Posterior, count: int, rounds: int) -> dict[str, Cell]:
-    work = count * posterior.voltage.size
+    work = count * posterior.only.voltage.size
     calls = {
         name: likelihood_of(posterior, name, count)
         for name in CONTESTANTS

@@ -46,13 +46,14 @@ class StockPosterior(Posterior):
         """Log likelihood (models,) at θ (models, parameters)."""
         column = dict(zip(self.prior.names, theta.T, strict=True))
         shape = (column[name] for name in ("alpha", "beta", "gamma", "initial"))
-        drive = column["d"][:, np.newaxis] * self.voltage - hysteresis_loop(self.voltage, *shape)
+        one = self.only
+        drive = column["d"][:, np.newaxis] * one.voltage - hysteresis_loop(one.voltage, *shape)
         rest = drive[:, :1].copy()
-        (recursion,) = self.actuator.sections(column).recursions
+        (recursion,) = one.actuator.sections(column).recursions
         moved = recursion.run(drive - rest, recursion.at_rest())
-        residual = self.displacement - moved - rest - column["offset"][:, np.newaxis]
-        noise = theta[:, len(self.actuator.parameters) :]
-        parts = [self.noise.log_density(noise, residual[:, window]) for window in self.training]
+        residual = one.displacement - moved - rest - column["offset"][:, np.newaxis]
+        noise = theta[:, len(one.actuator.parameters) :]
+        parts = [one.noise.log_density(noise, residual[:, window]) for window in one.training]
         return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
 
 

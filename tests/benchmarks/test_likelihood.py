@@ -31,12 +31,12 @@ def measure(benchmark: BenchmarkFixture, call: Call, work: int) -> None:
 @pytest.mark.parametrize("count", BATCHES)
 @each_engine
 def test_batch(benchmark: BenchmarkFixture, paper: Posterior, engine: str, count: int) -> None:
-    measure(benchmark, likelihood_of(paper, engine, count), count * paper.voltage.size)
+    measure(benchmark, likelihood_of(paper, engine, count), count * paper.only.voltage.size)
 
 
 @pytest.mark.benchmark(group="batch")
 def test_batch_of_the_stock_path(benchmark: BenchmarkFixture, paper: Posterior) -> None:
-    measure(benchmark, likelihood_of(paper, "stock"), MODELS * paper.voltage.size)
+    measure(benchmark, likelihood_of(paper, "stock"), MODELS * paper.only.voltage.size)
 
 
 @pytest.mark.benchmark(group="model")
@@ -51,7 +51,7 @@ def test_model(
     noise: str,
 ) -> None:
     call = likelihood_of(variant(paper, dynamics, noise), engine)
-    measure(benchmark, call, MODELS * paper.voltage.size)
+    measure(benchmark, call, MODELS * paper.only.voltage.size)
 
 
 @pytest.mark.benchmark(group="length")
@@ -66,8 +66,8 @@ def test_length(benchmark: BenchmarkFixture, paper: Posterior, engine: str, samp
 @pytest.mark.parametrize("function", [hysteresis, hysteresis_loop])
 def test_hysteresis(benchmark: BenchmarkFixture, paper: Posterior, function: Call) -> None:
     shape = shape_of(paper)
-    work = MODELS * paper.voltage.size
-    measure(benchmark, lambda: function(paper.voltage, **shape), work)  # type: ignore[call-arg]
+    work = MODELS * paper.only.voltage.size
+    measure(benchmark, lambda: function(paper.only.voltage, **shape), work)  # type: ignore[call-arg]
 
 
 @pytest.mark.benchmark(group="threads")
@@ -79,4 +79,4 @@ def test_two_batches(benchmark: BenchmarkFixture, paper: Posterior, threads: int
         def both() -> list[object]:
             return [future.result() for future in [pool.submit(call), pool.submit(call)]]
 
-        measure(benchmark, both, 2 * MODELS * paper.voltage.size)
+        measure(benchmark, both, 2 * MODELS * paper.only.voltage.size)

@@ -6,8 +6,6 @@ and another rate for all of it would move h by γ α v² < 0.03 um, and the log 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -45,7 +43,7 @@ def test_the_stock_path_has_the_same_log_density(posterior: Posterior) -> None:
 
 
 def test_training_windows_count_alone(posterior: Posterior) -> None:
-    part = replace(posterior, training=(slice(100, 300), slice(700, SAMPLES)))
+    part = posterior.altered(training=(slice(100, 300), slice(700, SAMPLES)))
     theta = trial(part, 3)
     np.testing.assert_allclose(
         stock(part).log_likelihood(theta), part.log_likelihood(theta), rtol=0, atol=1

@@ -171,6 +171,20 @@ def test_spikes_are_neither_edges_nor_turns() -> None:
     assert [200] == spikes(triangle + noise + 2.0 * (np.arange(400) == 200), triangle).tolist()
 
 
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("pairs", [False, True])
+def test_every_spike_counts_once_and_its_neighbours_do_not(seed: int, pairs: bool) -> None:
+    """On a steep drive with little noise too, where a spike moves the medians beside it."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0, 12, 0.005)
+    voltage = 100 * np.maximum(1 - 0.08 * time, 0) * np.sin(2 * np.pi * time)
+    values = 0.6 * voltage + 0.2 * generator.standard_normal(time.size)
+    planted = np.sort(10 * generator.choice(np.arange(1, 230), 10, replace=False))
+    planted = np.sort(np.concatenate([planted, planted + 1])) if pairs else planted
+    values[planted] += 25.0 * generator.choice([-1, 1])
+    assert planted.tolist() == spikes(values, 0.6 * voltage, 1.2).tolist()
+
+
 def test_a_decay_and_a_trend_are_measured() -> None:
     at: FloatArray = np.linspace(0.0, 1.999, 2000)
     size, constant = decay(at, 3 - 5 * np.exp(-at / 0.1), 1.0)

@@ -25,7 +25,7 @@ from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Ranges
@@ -141,7 +141,8 @@ def posterior_of(
     parameters = parameters_of(Table(actuator, model).declarations, known, fixed, priors)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
-    return Posterior(voltage, displacement, windows, actuator, model, prior, from_rest=from_rest)
+    one = Dataset(voltage, displacement, windows, actuator, model, from_rest)
+    return Posterior((one,), prior)
 
 
 def short_posterior(

@@ -28,7 +28,7 @@ MASS = {"mass": 0.00134, "stiffness": 4.1e5}
 def assert_engines_agree(posterior: Posterior, theta: FloatArray) -> None:
     expected = replace(posterior, engine="numpy").log_likelihood(theta)
     got = replace(posterior, engine="numba").log_likelihood(theta)
-    samples = sum(window.stop - window.start for window in posterior.training)
+    samples = sum(window.stop - window.start for window in posterior.only.training)
     np.testing.assert_array_less(np.abs(got - expected), 1e-10 * (samples + np.abs(expected)))
 
 
@@ -56,7 +56,7 @@ def test_engines_agree_on_prior_draws(noise: str, dynamics: str) -> None:
 @pytest.mark.parametrize("hold", ["first", "zero"])
 def test_engines_agree_on_either_hold(hold: Hold) -> None:
     posterior = short_posterior(dynamics="lag")
-    posterior = replace(posterior, actuator=replace(posterior.actuator, hold=hold))
+    posterior = posterior.altered(actuator=replace(posterior.only.actuator, hold=hold))
     assert_engines_agree(posterior, prior_draws(posterior, 40))
 
 
@@ -148,8 +148,8 @@ def test_engines_agree_on_any_path(path: list[float], seed: int) -> None:
     """Plateaus, steps, turns at every sample."""
     reference = short_posterior(dynamics="lag", fixed={})
     voltage = np.array(path)
-    measured = ring_bender(reference.actuator, "discrepancy", voltage, seed)
-    posterior = posterior_of(voltage, measured, reference.actuator, "discrepancy", {})
+    measured = ring_bender(reference.only.actuator, "discrepancy", voltage, seed)
+    posterior = posterior_of(voltage, measured, reference.only.actuator, "discrepancy", {})
     assert_engines_agree(posterior, prior_draws(reference, 5, seed))
 
 

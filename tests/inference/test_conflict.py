@@ -182,7 +182,7 @@ def judged(posterior: Posterior, ranges: Ranges) -> list[str]:
     point = fit(posterior, generator)
     draws = around(posterior.prior, point, generator)
     return conflicts(
-        posterior.prior, draws, default_priors(posterior.table.declarations, context(ranges))
+        posterior.prior, draws, default_priors(posterior.only.table.declarations, context(ranges))
     )
 
 
@@ -197,7 +197,7 @@ def test_forty_good_records_raise_no_remark() -> None:
             {"initial": 0.0} if seed % 8 < 4 else {},
             seed=seed,
         )
-        ranges = ranges_of(posterior.voltage, posterior.displacement, INTERVAL)
+        ranges = ranges_of(posterior.only.voltage, posterior.only.displacement, INTERVAL)
         alarms += judged(posterior, ranges)
     assert [] == alarms
 
@@ -205,8 +205,8 @@ def test_forty_good_records_raise_no_remark() -> None:
 def test_displacement_in_another_unit_contradicts_an_informed_prior() -> None:
     """A record in nm that is taken for um, and a user who knows the actuator's d."""
     good = short_posterior("white", 200, priors={"d": normal(0.7, 0.07)})
-    wrong = replace(good, displacement=4 * good.displacement)
-    ranges = ranges_of(wrong.voltage, wrong.displacement, INTERVAL)
+    wrong = good.altered(displacement=4 * good.only.displacement)
+    ranges = ranges_of(wrong.only.voltage, wrong.only.displacement, INTERVAL)
     known = joint_prior(good.prior.names, ranges, {"initial": 0.0}, {"d": normal(0.7, 0.07)})
     remarks = judged(replace(wrong, prior=known), ranges)
     assert any(remark.startswith("d: ") for remark in remarks), remarks

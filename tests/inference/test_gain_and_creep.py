@@ -53,10 +53,9 @@ def test_engines_agree_along_records_that_are_long_for_the_filter(
     """Most of the record passes the short form, in which slow responses are only followed."""
     posterior = moving(noise, "lag", missing=missing, parts=PARTS[parts])
     repeated = 12
-    posterior = replace(
-        posterior,
-        voltage=np.tile(posterior.voltage, repeated),
-        displacement=np.tile(posterior.displacement, repeated),
+    posterior = posterior.altered(
+        voltage=np.tile(posterior.only.voltage, repeated),
+        displacement=np.tile(posterior.only.displacement, repeated),
         training=(slice(0, 200 * repeated),),
     )
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
@@ -75,7 +74,7 @@ def test_engines_agree_along_records_that_are_long_for_the_filter(
 def test_creep_after_a_step_is_that_of_its_lags() -> None:
     """Σ cᵢ (1 − exp(−t/Tᵢ)) of the step, without hysteresis, dynamics or growth."""
     posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": CREEP})
-    actuator, names = posterior.actuator, posterior.actuator.parameters
+    actuator, names = posterior.only.actuator, posterior.only.actuator.parameters
     value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0}
     strength = {"creep_1": 0.01, "creep_2": 0.02, "creep_3": 0.03}
     theta = [[(value | strength).get(name, 0.0) for name in names]]
@@ -95,12 +94,12 @@ def test_creep_after_a_step_is_that_of_its_lags() -> None:
 
 def test_creep_that_grows_is_as_strong_as_stated_at_the_largest_voltage() -> None:
     posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": GROWING})
-    names = posterior.actuator.parameters
+    names = posterior.only.actuator.parameters
     value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0, "creep_1": 0.05}
     voltage = np.concatenate([[0.0], np.full(3000, 90.0)])
     for growth in (0.0, 0.5):
         theta = [[(value | {"creep_growth": growth}).get(name, 0.0) for name in names]]
-        x = posterior.actuator.displacement(theta, voltage)[0]
+        x = posterior.only.actuator.displacement(theta, voltage)[0]
         assert x[-1] == pytest.approx(90 * (1 + 0.05 * (1 + growth)), rel=1e-9)
 
 
@@ -108,14 +107,14 @@ def test_pieces_equal_the_whole_with_gain_and_creep() -> None:
     posterior = moving("white", "second-order", {"mass": 300.0, "stiffness": 4.1e5},
                        parts=PARTS["both"])  # fmt: skip
     actuator = posterior.likelihood.actuator
-    theta = posterior.table.actuator(
+    theta = posterior.only.table.actuator(
         posterior.prior.theta(posterior.prior.draw(np.random.default_rng(6), 4))
     )
     unrest = np.random.default_rng(7).normal(size=(4, actuator.unknowns))
-    whole = actuator.advance(theta, posterior.voltage, unrest=unrest)[0]
+    whole = actuator.advance(theta, posterior.only.voltage, unrest=unrest)[0]
     state, parts = None, []
     for first, last in ((0, 1), (1, 70), (70, 200)):
-        part, state = actuator.advance(theta, posterior.voltage[first:last], state, unrest)
+        part, state = actuator.advance(theta, posterior.only.voltage[first:last], state, unrest)
         parts.append(part)
     np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, rtol=1e-11, atol=1e-9)
 

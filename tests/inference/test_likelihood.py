@@ -93,7 +93,7 @@ def moving(
     posterior = posterior_of(
         voltage, np.nan_to_num(displacement), actuator, noise, fixed or {}, training=training
     )
-    return replace(posterior, displacement=displacement, from_rest=False)
+    return posterior.altered(displacement=displacement, from_rest=False)
 
 
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
@@ -139,7 +139,7 @@ def test_a_shape_takes_what_an_unknown_of_that_shape_would(
 def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
     posterior = moving()
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 70))
-    place = np.linspace(-1, 1, posterior.readings.rows.size)
+    place = np.linspace(-1, 1, posterior.only.readings.rows.size)
     shapes = np.stack([place, place**2, place**3])
     others = np.array([[2.0, 0.0, 1.0], [0.0, -1.0, 1.0], [1.0, 1.0, 1.0]]) @ shapes
     likelihood = replace(posterior.likelihood, offset_sd=3.0)
@@ -197,7 +197,7 @@ def test_a_memory_is_kept_as_long_as_it_is_heard() -> None:
 def test_the_starts_sd_is_the_gain_times_half_the_range() -> None:
     posterior = moving()
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(12), 5))
-    expected = theta[:, posterior.prior.names.index("d")] * np.ptp(posterior.voltage) / 2
+    expected = theta[:, posterior.prior.names.index("d")] * np.ptp(posterior.only.voltage) / 2
     np.testing.assert_allclose(posterior.likelihood.start_sd(theta)[:, 0], expected, rtol=1e-12)
 
 
@@ -205,22 +205,21 @@ def test_from_rest_means_a_path_from_zero_volts() -> None:
     """A record from rest at 50 V is one from zero volts whose first samples were not read."""
     usual = short_posterior(samples=200, dynamics="lag", fixed={})
     approach = np.concatenate([np.zeros(1), np.full(400, 50.0)])
-    voltage = 50 + usual.voltage / 4
+    voltage = 50 + usual.only.voltage / 4
     whole = np.concatenate([approach, voltage])
-    reading = ring_bender(usual.actuator, "discrepancy", whole, 9)
+    reading = ring_bender(usual.only.actuator, "discrepancy", whole, 9)
     theta = usual.prior.theta(usual.prior.draw(np.random.default_rng(10), 5))
     theta[:, usual.prior.names.index("initial")] = 0.0
-    settled = replace(
-        usual,
+    settled = usual.altered(
         voltage=whole,
         displacement=reading,
         training=(slice(approach.size, whole.size),),
     )
-    at_rest = replace(usual, voltage=voltage, displacement=reading[approach.size :])
+    at_rest = usual.altered(voltage=voltage, displacement=reading[approach.size :])
     np.testing.assert_allclose(
         at_rest.log_likelihood(theta), settled.log_likelihood(theta), rtol=1e-9
     )
-    wrong = replace(at_rest, voltage=voltage - 50).log_likelihood(theta)
+    wrong = at_rest.altered(voltage=voltage - 50).log_likelihood(theta)
     assert np.min(np.abs(wrong - at_rest.log_likelihood(theta))) > 1
 
 
@@ -233,7 +232,7 @@ def test_a_transient_at_the_start_does_not_bias_the_gain() -> None:
     known |= {"initial": 0.0, "offset": 0.0, "sensor_sd": 0.3}
     known |= {"discrepancy_sd": 0.8, "discrepancy_time": 0.2}
     theta[0] = [known.get(name, 1.0) for name in names]
-    unknown, rest = (replace(posterior, from_rest=known) for known in (False, True))
+    unknown, rest = (posterior.altered(from_rest=known) for known in (False, True))
     assert unknown.log_likelihood(theta)[0] > rest.log_likelihood(theta)[0] + 10
 
 

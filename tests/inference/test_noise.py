@@ -109,7 +109,7 @@ def test_windows_of_a_record_are_one_multivariate_normal(kind: str) -> None:
     posterior = short_posterior(kind, 150, "lag", {}, training=windows)
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(11), 20))
     rows = np.concatenate([np.arange(window.start, window.stop) for window in windows])
-    residual = posterior.displacement[rows] - posterior.simulate(theta)[:, rows]
+    residual = posterior.only.displacement[rows] - posterior.simulate(theta)[:, rows]
     got = posterior.log_likelihood(theta)
     for row, values in enumerate(residual):
         named = dict(zip(posterior.prior.names, theta[row].tolist(), strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -132,13 +132,11 @@ def mirrored(worse: float = 0.0) -> Posterior:
         fixed={"initial": 0.0, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172},
         priors={"offset": Distribution("normal", {"mean": 0.0, "sd": 10.0})},
     )
-    return Posterior(
-        usual.voltage,
-        usual.displacement + 6.0,
-        usual.training,
-        MirrorActuator("none", "first", 0.01, worse=worse),
-        WhiteNoise(),
-        usual.prior,
+    return usual.altered(
+        displacement=usual.only.displacement + 6.0,
+        actuator=MirrorActuator("none", "first", 0.01, worse=worse),
+        noise=WhiteNoise(),
+        from_rest=False,
     )
 
 
@@ -177,7 +175,7 @@ def test_noise_alone_can_be_fitted() -> None:
     known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
     posterior = short_posterior("white", 400, fixed={**known, "offset": 0.0})
     point = fit(posterior, np.random.default_rng(8))
-    residual = posterior.displacement - posterior.simulate(truth(posterior))[0]
+    residual = posterior.only.displacement - posterior.simulate(truth(posterior))[0]
     sensor = posterior.prior.constrain(point.mode[np.newaxis])[0][0, 0]
     np.testing.assert_allclose(np.sqrt(np.mean(residual**2)), sensor, rtol=0.01)
 
@@ -196,8 +194,8 @@ class Impossible(WhiteNoise):
 def test_without_a_finite_density_there_is_no_fit() -> None:
     usual = short_posterior("white", 50)
     posterior = posterior_of(
-        usual.voltage, usual.displacement, usual.actuator, "white", {"initial": 0.0}
+        usual.only.voltage, usual.only.displacement, usual.only.actuator, "white", {"initial": 0.0}
     )
-    posterior = replace(posterior, noise=Impossible())
+    posterior = posterior.altered(noise=Impossible())
     with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
         fit(posterior, np.random.default_rng(9))

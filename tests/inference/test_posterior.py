@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 
 import numpy as np
@@ -47,8 +47,8 @@ def scalar_displacement(theta: dict[str, float], voltage: FloatArray) -> FloatAr
 
 def dense_log_likelihood(posterior: Posterior, theta: FloatArray) -> float:
     named = dict(zip(posterior.prior.names, theta.tolist(), strict=True))
-    residual = posterior.displacement - scalar_displacement(named, posterior.voltage)
-    rows = posterior.readings.rows
+    residual = posterior.only.displacement - scalar_displacement(named, posterior.only.voltage)
+    rows = posterior.only.readings.rows
     apart = np.abs(np.subtract.outer(rows, rows))
     covariance = named["sensor_sd"] ** 2 * np.eye(rows.size)
     if "discrepancy_sd" in named:
@@ -97,7 +97,7 @@ def test_samples_outside_the_training_windows_do_not_count() -> None:
     held_out = np.ones(150, dtype=bool)
     for window in WINDOWS:
         held_out[window] = False
-    posterior.displacement[held_out] = np.nan
+    posterior.only.displacement[held_out] = np.nan
     np.testing.assert_array_equal(before, posterior.log_likelihood(theta))
 
 
@@ -109,7 +109,7 @@ def test_windows_share_one_simulation_from_the_first_sample() -> None:
     simulated = whole.simulate(theta)
     assert (1, 120) == posterior.simulate(theta).shape
     np.testing.assert_array_equal(simulated[:, :120], posterior.simulate(theta))
-    residual = (whole.displacement - simulated)[:, 70:120]
+    residual = (whole.only.displacement - simulated)[:, 70:120]
     expected = WhiteNoise().log_density(theta[:, -1:], residual)
     np.testing.assert_allclose(expected, posterior.log_likelihood(theta), rtol=1e-12)
 
@@ -153,15 +153,7 @@ class BrokenNoise(WhiteNoise):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_likelihood_that_is_not_finite_is_no_evidence(value: float) -> None:
     sound = short_posterior("white", 100)
-    broken = Posterior(
-        sound.voltage,
-        sound.displacement,
-        sound.training,
-        sound.actuator,
-        BrokenNoise(value=value),
-        sound.prior,
-        from_rest=True,
-    )
+    broken = sound.altered(noise=BrokenNoise(value=value))
     z = sound.prior.unconstrain(sound.prior.draw(np.random.default_rng(3), 6))
     expected = sound.log_density(z)
     expected[::2] = -np.inf
@@ -202,21 +194,7 @@ def test_windows_must_be_in_order_and_apart(windows: tuple[slice, ...]) -> None:
 def test_parameters_must_be_those_of_the_model() -> None:
     sound = short_posterior("white", 50)
     with pytest.raises(InputError, match=r"^prior: its parameters must be d, .*, in this order"):
-        Posterior(
-            sound.voltage,
-            sound.displacement,
-            sound.training,
-            sound.actuator,
-            DiscrepancyNoise(INTERVAL),
-            sound.prior,
-        )
+        sound.altered(noise=DiscrepancyNoise(INTERVAL))
     offset = single("offset", sound.prior.free[-2].prior or pytest.fail("has a prior"))
     with pytest.raises(InputError, match="in this order"):
-        Posterior(
-            sound.voltage,
-            sound.displacement,
-            sound.training,
-            sound.actuator,
-            sound.noise,
-            offset,
-        )
+        replace(sound, prior=offset)

@@ -118,10 +118,10 @@ def closed_form(posterior: Posterior) -> Normal:
     prior_mean, prior_sd = prior_moments(posterior)
     known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
     case = Case(
-        posterior.voltage,
-        posterior.displacement,
+        posterior.only.voltage,
+        posterior.only.displacement,
         INTERVAL,
-        posterior.training,
+        posterior.only.training,
         "lag",
         "first",
         posterior.prior.names,
@@ -137,10 +137,10 @@ def closed_form(posterior: Posterior) -> Normal:
     columns = [displacement(prior_mean + step) - base for step in np.eye(prior_mean.size)]
     design = np.stack(columns, axis=1)[rows]
     # One discrepancy goes through both windows.
-    noise = covariance(known, posterior.voltage.size)[np.ix_(rows, rows)]
+    noise = covariance(known, posterior.only.voltage.size)[np.ix_(rows, rows)]
     weighted = linalg.solve(noise, design, assume_a="pos")
     precision = design.T @ weighted + np.diag(prior_sd**-2.0)
-    shift = linalg.solve(precision, weighted.T @ (posterior.displacement - base)[rows])
+    shift = linalg.solve(precision, weighted.T @ (posterior.only.displacement - base)[rows])
     return Normal(prior_mean + shift, linalg.inv(precision))
 
 

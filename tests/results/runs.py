@@ -172,7 +172,7 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     """
     posterior, record = problem.posterior, problem.record
     draws = posterior_draws(posterior, source)
-    windows = {"training": posterior.training[0]}
+    windows = {"training": posterior.only.training[0]}
     windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
     bands = predict_windows(posterior, draws, record, windows, source)
     for name, other in problem.validations.items():
@@ -184,9 +184,11 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     odd = innovations(posterior, best, record.start)
-    seen = any(one.kind == "switch-on transient" for one in problem.findings)
+    seen = any(one.kind == "switch-on transient" for one in problem.findings["record"])
     moved = without_start(posterior, draws, source, record.start, seen=seen) if again else None
-    verdicts = judged(problem, bands, Background.of(posterior, draws), odd, moved)
+    verdicts = judged(
+        problem, bands, Background.of(posterior, draws), {"record": odd}, {"record": moved}
+    )
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 
 

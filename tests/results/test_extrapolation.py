@@ -5,8 +5,6 @@ False alarms: none in 300 drives of the fitted kind, with noise and other sampli
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -28,8 +26,7 @@ def sine(
 
 def fitted(voltage: FloatArray, interval: float) -> Posterior:
     """Return a posterior trained with a drive; only its voltage matters here."""
-    return replace(
-        short_posterior(samples=20),
+    return short_posterior(samples=20).altered(
         voltage=voltage,
         displacement=0.5 * voltage,
         training=(slice(0, voltage.size),),

@@ -30,15 +30,15 @@ def record_after(reach: float) -> Record:
     time = np.arange(int(2 * RATE)) / RATE
     before = reach * np.sin(2 * np.pi * np.arange(int(2 * RATE)) / RATE)
     voltage = np.concatenate([before, 95 * np.sin(2 * np.pi * time)])
-    theta = DRAWS[:1, : len(POSTERIOR.actuator.parameters)]
-    displacement = POSTERIOR.actuator.displacement(theta, voltage, from_rest=True)[0]
+    theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
+    displacement = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
     return Record(95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, 1 / RATE)
 
 
 def likelihoods(spans: list[Span]) -> tuple[Likelihood, ...]:
     return tuple(
-        replace(POSTERIOR.likelihood, actuator=replace(POSTERIOR.actuator, span=span))
+        replace(POSTERIOR.likelihood, actuator=replace(POSTERIOR.only.actuator, span=span))
         for span in spans
     )
 
@@ -103,11 +103,13 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     window = start.window(record)
     assert window is not None
     assert record.displacement is not None
-    posterior = replace(
-        POSTERIOR, voltage=record.voltage, displacement=record.displacement, training=(window,)
+    posterior = POSTERIOR.altered(
+        voltage=record.voltage, displacement=record.displacement, training=(window,)
     )
     every = tuple(
-        replace(posterior.likelihood, offset_sd=50.0, actuator=replace(posterior.actuator, span=s))
+        replace(
+            posterior.likelihood, offset_sd=50.0, actuator=replace(posterior.only.actuator, span=s)
+        )
         for s in spans
     )
     parts = edged(np.linspace(0, 1, 4001))

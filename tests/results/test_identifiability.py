@@ -7,7 +7,6 @@ at 1000 Hz among the slow tests.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -97,10 +96,10 @@ def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float)
     known = {"alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0, "offset": 0.0}
     prior = {"d": Distribution("lognormal", {"median": 0.7, "sigma": sigma})}
     posterior = short_posterior("white", 400, fixed=known, priors=prior)
-    voltage = posterior.voltage
+    voltage = posterior.only.voltage
     turns = 1 + np.count_nonzero(np.diff(np.sign(np.diff(voltage))))
     lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
-    floor = 0.01 * np.ptp(posterior.displacement)
+    floor = 0.01 * np.ptp(posterior.only.displacement)
     covariance = floor**2 * np.exp(-lags / (200 / turns)) + TRUE_NOISE["sensor_sd"] ** 2 * np.eye(
         400
     )
@@ -132,15 +131,16 @@ def test_a_stretch_that_ends_early_takes_the_same_way() -> None:
 
 
 def windowed(posterior: Posterior, *training: slice) -> Posterior:
-    return replace(posterior, training=training)
+    return posterior.altered(training=training)
 
 
 def test_what_comes_after_the_training_window_does_not_matter() -> None:
     """Periods that the likelihood does not see are no reason to count those it sees less."""
     posterior = measured(sine(100.0, 1.0))
     seen = slice(0, 2250)
-    alone = replace(
-        posterior, voltage=posterior.voltage[seen], displacement=posterior.displacement[seen]
+    alone = posterior.altered(
+        voltage=posterior.only.voltage[seen],
+        displacement=posterior.only.displacement[seen],
     )
     expected, got = (left(windowed(p, seen)) for p in (alone, posterior))
     np.testing.assert_allclose(expected, got, rtol=0.05)
@@ -161,7 +161,7 @@ def test_parts_are_between_none_and_all_and_the_largest_comes_first() -> None:
 
 
 def at_rest(posterior: Posterior) -> Posterior:
-    return replace(posterior, voltage=0 * posterior.voltage)
+    return posterior.altered(voltage=0 * posterior.only.voltage)
 
 
 def test_a_constant_voltage_tells_nothing_about_the_loop() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.special import ndtr
+from scipy.special import logsumexp, ndtr
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
@@ -244,3 +244,13 @@ def test_crps_is_the_integral_of_the_squared_distance_to_the_step() -> None:
     below, above = (quad(squared, a, b, limit=200, epsabs=1e-9)[0] for a, b in ((-9, y), (y, 20)))
     expected = below + above
     assert expected == pytest.approx(crps(means, sds, np.array([y]))[0], abs=1e-6)
+
+
+def test_the_log_density_is_that_of_all_components() -> None:
+    """Also where none of them is anything that a float can hold."""
+    means = np.random.default_rng(1).normal(size=(300, 5))
+    widths = np.random.default_rng(2).uniform(0.1, 2.0, 300)
+    values = np.array([0.0, 1.0, -3.0, 40.0, 1e4])
+    expected = logsumexp(norm.logpdf(values, means, widths[:, None]), axis=0) - np.log(300)
+    got = mixture.log_density(means, widths, values)
+    np.testing.assert_allclose(got, expected, rtol=1e-12)

@@ -14,7 +14,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
@@ -82,15 +82,9 @@ def posterior(record: Record) -> Posterior:
         for name, value in TRUTH.items()
     ]
     assert record.displacement is not None
-    return Posterior(
-        record.voltage,
-        record.displacement,
-        (slice(0, 600),),
-        actuator,
-        noise,
-        JointPrior(parameters),
-        from_rest=True,
-    )
+    windows = (slice(0, 600),)
+    one = Dataset(record.voltage, record.displacement, windows, actuator, noise, from_rest=True)
+    return Posterior((one,), JointPrior(parameters))
 
 
 @pytest.fixture(scope="module")
@@ -158,8 +152,8 @@ def test_walking_through_in_other_pieces_changes_nothing(
 def test_the_mean_is_that_of_the_draws_simulations(
     posterior: Posterior, draws: FloatArray, record: Record
 ) -> None:
-    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
-    expected = posterior.actuator.displacement(theta, record.voltage).mean(axis=0)
+    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
+    expected = posterior.only.actuator.displacement(theta, record.voltage).mean(axis=0)
     bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)}, random())[
         0
     ]
@@ -185,14 +179,14 @@ def start_of(
 
 
 def initial(posterior: Posterior, begun: Started) -> FloatArray:
-    states: FloatArray = begun.model[:, posterior.actuator.parameters.index("initial")]
+    states: FloatArray = begun.model[:, posterior.only.actuator.parameters.index("initial")]
     return states
 
 
 def test_reachable_states_stay_inside_the_ceiling(posterior: Posterior, draws: FloatArray) -> None:
     planned = replace(made(), displacement=None, truth=None)
     begun = start_of(posterior, draws, planned, Start())
-    column = posterior.actuator.parameters.index
+    column = posterior.only.actuator.parameters.index
     model = begun.model
     top = model[:, column("alpha")] / (model[:, column("beta")] + model[:, column("gamma")])
     part = initial(posterior, begun) / top
@@ -227,7 +221,7 @@ def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
     same = np.repeat(draws[:1], 4000, axis=0)
     start = Start(lead_in=0.3, lead_in_from=lead_in_from)
     begun = start_of(posterior, same, record, start)
-    offset = posterior.actuator.parameters.index("offset")
+    offset = posterior.only.actuator.parameters.index("offset")
     rows = np.arange(30) + round(lead_in_from / INTERVAL)
     theta = posterior.prior.theta(draws[:1])
     sensor, sd, time = theta[0, -3:]
@@ -235,13 +229,13 @@ def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
     noise = sd**2 * np.exp(-lags / time) + sensor**2 * np.eye(30)
     lag = theta[0, posterior.prior.names.index("lag")]
     response = np.stack([np.ones(30), np.exp(-rows * INTERVAL / lag)])
-    wide = np.ptp(posterior.readings.values), theta[0, 0] * np.ptp(record.voltage) / 2
+    wide = np.ptp(posterior.only.readings.values), theta[0, 0] * np.ptp(record.voltage) / 2
     # Of the starts drawn, those whose h lies near the median's: given h all is normal.
     states = initial(posterior, begun)
     near = np.abs(states - np.median(states)) < 0.2 * np.std(states)
     model = begun.model[near].mean(axis=0)[np.newaxis]
     model[:, offset] = 0.0
-    clean = posterior.actuator.displacement(model, record.voltage)[0]
+    clean = posterior.only.actuator.displacement(model, record.voltage)[0]
     residual = record.displacement[rows] - clean[rows]
     centre = np.array([np.mean(record.displacement[rows]), 0.0])
     inverse = np.linalg.inv(noise)
@@ -298,12 +292,12 @@ def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior
     likelihood = Likelihood(
         record.voltage,
         Readings.of(record.displacement, [window]),
-        posterior.actuator,
-        posterior.noise,
+        posterior.only.actuator,
+        posterior.only.noise,
         "numpy",
         from_rest=False,
-        half_range=float(np.ptp(np.concatenate([record.voltage, posterior.voltage]))) / 2,
-        offset_sd=float(np.ptp(posterior.readings.values)),
+        half_range=float(np.ptp(np.concatenate([record.voltage, posterior.only.voltage]))) / 2,
+        offset_sd=float(np.ptp(posterior.only.readings.values)),
     )
     density = likelihood.log_density(theta)
     weight = np.exp(density - density.max())
@@ -322,9 +316,9 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
     command = predicted(
         posterior, draws, replace(planned, voltage_is="command"), Start(from_rest=True)
     )
-    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
-    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
-    held = replace(posterior.actuator, hold="zero").displacement(theta, planned.voltage)
+    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
+    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
+    held = replace(posterior.only.actuator, hold="zero").displacement(theta, planned.voltage)
     np.testing.assert_allclose(held.mean(axis=0), command.mean, rtol=1e-9)
     assert np.max(np.abs(command.mean - output.mean)) > 0.5
     given = predicted(
@@ -339,10 +333,10 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
 def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
     planned = replace(made(start=1.2), displacement=None, truth=None)
     bands = predicted(posterior, draws, planned, Start(from_rest=True))
-    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
-    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
+    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
+    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
     path = np.concatenate([[0.0], np.full(3000, planned.voltage[0]), planned.voltage])
-    expected = posterior.actuator.displacement(theta, path)[:, 3001:].mean(axis=0)
+    expected = posterior.only.actuator.displacement(theta, path)[:, 3001:].mean(axis=0)
     np.testing.assert_allclose(expected, bands.mean, atol=1e-6)
 
 
@@ -400,9 +394,9 @@ def test_a_planned_voltage_has_the_training_records_offset(
 ) -> None:
     planned = replace(made(), displacement=None, truth=None)
     bands = predicted(posterior, draws, planned, Start(from_rest=True))
-    theta = posterior.prior.theta(draws)[:, : len(posterior.actuator.parameters)]
-    theta[:, posterior.actuator.parameters.index("initial")] = 0.0
-    expected = posterior.actuator.displacement(theta, planned.voltage).mean(axis=0)
+    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
+    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
+    expected = posterior.only.actuator.displacement(theta, planned.voltage).mean(axis=0)
     np.testing.assert_allclose(expected, bands.mean, rtol=1e-9)
     assert bands.measured is bands.pit is bands.crps is None
     assert bands.scored_from == 0

@@ -95,7 +95,7 @@ def test_each_band_is_held_against_what_it_is_for() -> None:
         lower={key: np.full(20, middle - 1) for key, middle in around.items()},
         upper={key: np.full(20, middle + 1) for key, middle in around.items()},
     )
-    parts = list(covered([(bands, slice(60, 80))], Simulated(record, model)))
+    parts = list(covered([(bands, Simulated(record, model), slice(60, 80))]))
     assert [(kind, level, 1.0) for kind, level in around] == parts
 
 
@@ -106,7 +106,7 @@ def test_missing_readings_are_not_counted() -> None:
     edges = dict.fromkeys(bands.lower, np.ones(20))
     bands = replace(bands, lower={key: -edge for key, edge in edges.items()}, upper=edges)
     record = Record(values, reading, 0.01, truth=values)
-    parts = covered([(bands, slice(60, 80))], Simulated(record, values))
+    parts = covered([(bands, Simulated(record, values), slice(60, 80))])
     assert {1.0} == {part for _, _, part in parts}
 
 
@@ -193,9 +193,9 @@ def test_another_record_starts_anywhere() -> None:
     drive = theta[0, posterior.prior.names.index("d")] * other.record.voltage[0]
     many = [other.simulated(posterior, theta, np.random.default_rng(i)).model for i in range(400)]
     late, first = np.array(many)[:, -1], np.array(many)[:, 0] - drive
-    offset_sd = np.ptp(posterior.readings.values)
+    offset_sd = np.ptp(posterior.only.readings.values)
     assert np.std(late) == pytest.approx(offset_sd, rel=0.12)
-    unrest_sd = theta[0, 0] * np.ptp(posterior.voltage) / 2
+    unrest_sd = theta[0, 0] * np.ptp(posterior.only.voltage) / 2
     assert np.std(first - late) == pytest.approx(unrest_sd, rel=0.12)
 
 
@@ -204,7 +204,7 @@ def test_another_record_from_rest_with_the_same_offset_is_simulated_so() -> None
     rested = Start(from_rest=True, own_offset=False)
     other = another(start=rested)
     made = other.simulated(posterior, theta, np.random.default_rng(1))
-    actuator = replace(posterior.actuator, interval=0.005)
+    actuator = replace(posterior.only.actuator, interval=0.005)
     model = theta[:, : len(actuator.parameters)]
     expected = actuator.displacement(model, other.record.voltage, from_rest=True)[0]
     np.testing.assert_allclose(expected, made.model)
@@ -251,7 +251,8 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
     experiment = Experiment(posterior, PLAN)
     away = []
     for seed in range(200):
-        theta, made = module._simulated(experiment, np.random.default_rng(seed))
+        theta, records = module._simulated(experiment, np.random.default_rng(seed))
+        made = records["record"]
         assert made.record.truth is not None
         away.append((made.record.truth - made.model) / theta["discrepancy_sd"])
     last_but_one, last, first = np.array(away)[:, 28:31].T
@@ -263,19 +264,21 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
 def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
     """The dynamics' state at the first sample has the spread that the likelihood expects."""
     posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
-    moving = Experiment(replace(posterior, from_rest=False), PLAN)
-    names = posterior.actuator.parameters
+    moving = Experiment(posterior.altered(from_rest=False), PLAN)
+    names = posterior.only.actuator.parameters
     away = []
     for seed in range(300):
-        theta, (_, model) = module._simulated(moving, np.random.default_rng(seed))
-        rest = theta["d"][0] * posterior.voltage[0] - theta["initial"][0] + theta["offset"][0]
-        away.append((model[0] - rest) / (theta["d"][0] * np.ptp(posterior.voltage) / 2))
+        theta, records = module._simulated(moving, np.random.default_rng(seed))
+        model = records["record"].model
+        rest = theta["d"][0] * posterior.only.voltage[0] - theta["initial"][0] + theta["offset"][0]
+        away.append((model[0] - rest) / (theta["d"][0] * np.ptp(posterior.only.voltage) / 2))
     assert "lag" in names
     assert np.std(away) == pytest.approx(1.0, rel=0.2)
 
 
 def test_reading_is_truth_and_sensor_noise() -> None:
-    theta, (record, _) = module._simulated(small(), np.random.default_rng(1))
+    theta, records = module._simulated(small(), np.random.default_rng(1))
+    record = records["record"].record
     assert record.displacement is not None
     assert record.truth is not None
     noise = (record.displacement - record.truth) / theta["sensor_sd"]
@@ -316,12 +319,12 @@ def test_first_measure_is_the_log_likelihood() -> None:
 @pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])
 def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None) -> None:
     voltage = decaying_sine(80) + shift
-    posterior = replace(small().posterior, voltage=voltage)
+    posterior = small().posterior.altered(voltage=voltage)
     expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
     assert expected == Experiment(posterior, PLAN).level
 
 
 def test_voltage_without_a_loop_is_refused() -> None:
-    posterior = replace(small().posterior, voltage=np.linspace(0.0, 100.0, 80))
-    with pytest.raises(InputError, match="does not go forth and back"):
+    posterior = small().posterior.altered(voltage=np.linspace(0.0, 100.0, 80))
+    with pytest.raises(InputError, match="does not go back and forth"):
         Experiment(posterior, PLAN)

@@ -150,10 +150,10 @@ def test_a_forecast_is_the_end_of_a_record_that_goes_on() -> None:
     """State, offset and random draws are those of the whole record's simulation."""
     actuator = Actuator("lag", "first", INTERVAL, creep=Creep((0.1, 1.0, 10.0)))
     of, draws = problem(actuator)
-    record = Record(of.voltage, of.displacement, INTERVAL, start=3.0)
+    record = Record(of.only.voltage, of.only.displacement, INTERVAL, start=3.0)
     planned = np.full(500, 40.0)
     got = forecast(of, draws, record, planned, np.random.default_rng(5))
-    whole = Record(np.concatenate([of.voltage, planned]), None, INTERVAL, start=3.0)
+    whole = Record(np.concatenate([of.only.voltage, planned]), None, INTERVAL, start=3.0)
     (expected,) = predict_windows(
         of, draws, whole, {"all": slice(0, 800)}, np.random.default_rng(5)
     )
@@ -170,6 +170,6 @@ def test_a_forecast_is_the_end_of_a_record_that_goes_on() -> None:
 @pytest.mark.parametrize("voltage", [np.zeros((2, 2)), np.array([]), np.array([1.0, np.nan])])
 def test_a_forecast_needs_a_voltage(voltage: FloatArray) -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
-    record = Record(of.voltage, of.displacement, INTERVAL)
+    record = Record(of.only.voltage, of.only.displacement, INTERVAL)
     with pytest.raises(InputError, match="give one finite row"):
         forecast(of, draws, record, voltage, np.random.default_rng(1))

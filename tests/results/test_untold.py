@@ -84,11 +84,13 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     """What it shows is d - alpha and alpha beta: both may grow while beta falls."""
     fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
     posterior = measured(sine(10.0, 1.0, 3.0), rate=250.0)
-    actuator = posterior.actuator
-    small = posterior_of(posterior.voltage, posterior.displacement, actuator, "discrepancy", fixed)
+    actuator = posterior.only.actuator
+    small = posterior_of(
+        posterior.only.voltage, posterior.only.displacement, actuator, "discrepancy", fixed
+    )
     (remark,) = remarks(small, *near_truth(small))
     assert remark.startswith("the record does not determine alpha with d against beta: ")
-    assert remark.endswith("drive further than 20 V from end to end, if the actuator may")
+    assert remark.endswith("drive over more than 20 V peak to peak, if the actuator allows it")
 
 
 def test_decaying_amplitudes_need_no_words() -> None:
@@ -107,16 +109,18 @@ def test_prior_that_decides_is_said_to(amplitude: float, said: str) -> None:
     """A user's priors of alpha and beta, and half a loop, which hardly closes or not at all."""
     voltage = decaying_sine(200, periods=0.5, amplitude=amplitude)
     usual = short_posterior(samples=200, dynamics="none")
-    displacement = ring_bender(usual.actuator, "white", voltage, 1)
+    displacement = ring_bender(usual.only.actuator, "white", voltage, 1)
     priors = {
         "beta": Distribution("lognormal", {"median": 0.05, "sigma": 0.3}),
         "alpha": Distribution("lognormal", {"median": 0.25, "sigma": 0.2}),
     }
     known = {"gamma": 0.0, "initial": 0.0}
-    posterior = posterior_of(voltage, displacement, usual.actuator, "white", known, priors=priors)
+    posterior = posterior_of(
+        voltage, displacement, usual.only.actuator, "white", known, priors=priors
+    )
     remark = judged(posterior)[0]
     assert said in remark
-    asked = "drive the actuator up and down several times" if amplitude > 20 else "drive further"
+    asked = "drive the actuator up and down several times" if amplitude > 20 else "drive over more"
     assert asked in remark
 
 

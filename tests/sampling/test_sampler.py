@@ -346,7 +346,7 @@ def test_one_parameter_alone_is_sampled() -> None:
         outcome = sample(posterior, plan, chain, executor)
     assert outcome.converged
     zero = posterior.prior.theta(np.zeros((1, 1)))
-    residual = posterior.displacement - posterior.simulate(zero)[0]
+    residual = posterior.only.displacement - posterior.simulate(zero)[0]
     expected = stats.norm(np.mean(residual), 0.3 / np.sqrt(50))
     found = draws(posterior, chain).ravel()
     error = 4 * expected.std() / np.sqrt(outcome.check.ess_bulk[0])

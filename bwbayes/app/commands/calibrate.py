@@ -1,4 +1,4 @@
-"""``bwbayes calibrate``: is the posterior what it says? Simulated records tell."""
+"""``bwbayes calibrate``: simulation-based calibration, whether posteriors are what they say."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bwbayes.app.commands.shared import (
     FILE,
     INTERRUPTED,
     NOT_CONVERGED,
+    executor_option,
     quiet_option,
 )
 from bwbayes.app.config.limits import LARGEST_SEED
@@ -34,8 +35,9 @@ REPLICATES = 500
 )
 @click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
-@click.option("--overwrite", is_flag=True, help="Replace a calibration that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
 @click.option("--workers", type=click.IntRange(1), help="Replicates side by side; default: cores.")
+@executor_option
 @quiet_option
 def calibrate(
     config: Path | None,
@@ -45,11 +47,12 @@ def calibrate(
     seed: int | None,
     overwrite: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
 
-    Each replicate draws parameters from the config's prior, simulates its record anew and fits it
+    Each replicate draws parameters from the config's prior, simulates its record and fits it
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
     replicates did not converge.
 
@@ -63,27 +66,31 @@ def calibrate(
     if begun is not None:
         if out is not None or seed is not None or overwrite:
             raise InputError("calibrate: --resume goes on as begun; leave the other options out")
-        return _calibrate(CalibrationFolder.open(begun), replicates, workers, quiet)
+        return _calibrate(CalibrationFolder.open(begun), replicates, workers, how, quiet)
     assert config is not None
     changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
     from bwbayes.app.config.config import load
 
-    wanted = load(config)
-    wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
+    chosen = load(config)
+    chosen = chosen.model_copy(update=changes | ({"name": chosen.name} if chosen.name else {}))
     where = out or Path("results") / f"{config.stem}-calibration"
-    folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
-    return _calibrate(folder, None, workers, quiet)
+    folder = start(chosen, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
+    return _calibrate(folder, None, workers, how, quiet)
 
 
 def _calibrate(
-    folder: CalibrationFolder, replicates: int | None, workers: int | None, quiet: bool
+    folder: CalibrationFolder,
+    replicates: int | None,
+    workers: int | None,
+    how: str | None,
+    quiet: bool,
 ) -> int:
     from bwbayes.app.jobs.calibrate import carry_on
     from bwbayes.app.screen import show_calibration
 
     console = Console(stderr=True, quiet=quiet)
     try:
-        calibration = carry_on(folder, console, workers=workers, count=replicates)
+        calibration = carry_on(folder, console, workers=workers, count=replicates, how=how)
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `{folder.GO_ON} {folder.path}`", err=True)
         return INTERRUPTED

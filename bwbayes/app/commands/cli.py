@@ -11,11 +11,16 @@ import signal
 import sys
 import warnings
 from concurrent.futures import BrokenExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 import click
 
 from bwbayes.app.commands.calibrate import calibrate
+from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
+from bwbayes.app.commands.compare import compare
+from bwbayes.app.commands.compensate import compensate
+from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
 from bwbayes.app.commands.reference import config, models
@@ -23,6 +28,7 @@ from bwbayes.app.commands.report import report
 from bwbayes.app.commands.run import resume, run
 from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
 from bwbayes.app.commands.simulate import simulate
+from bwbayes.app.commands.track import track
 from bwbayes.errors import InputError
 
 __all__ = ["main"]
@@ -47,6 +53,11 @@ for command in (
     report,
     simulate,
     calibrate,
+    campaign,
+    compensate,
+    export,
+    track,
+    compare,
     config,
     models,
 ):
@@ -77,8 +88,11 @@ def main() -> None:
         where = f"{error.filename}: " if error.filename else ""
         click.echo(f"bwbayes: {where}{error.strerror or error}; fix it and resume", err=True)
         status = BAD_INPUT
-    except BrokenExecutor:
-        click.echo("bwbayes: a worker process was ended; mind the memory, and resume", err=True)
+    except BrokenExecutor as error:
+        # Python's own says nothing of use.
+        said = "" if isinstance(error, BrokenProcessPool) else str(error)
+        said = said or "a worker process was killed; free some memory, and resume"
+        click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:
         click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)

@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from bwbayes.app.commands.init import config_or_proposal
-from bwbayes.app.commands.shared import FILE, finish, quiet_option, workers_option
+from bwbayes.app.commands.shared import FILE, executor_option, finish, quiet_option, workers_option
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.inference.engine import Engine
 
@@ -21,8 +21,9 @@ __all__ = ["resume", "run"]
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
-@click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing run.")
 @workers_option
+@executor_option
 @quiet_option
 def run(
     config: Path,
@@ -31,6 +32,7 @@ def run(
     seed: int | None,
     overwrite: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Sample a posterior and predict, from a CONFIG in TOML, or from a record without one.
@@ -38,20 +40,23 @@ def run(
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     from bwbayes.app.running.run import load_run, start
-    from bwbayes.app.screen import show_priors
+    from bwbayes.app.screen import show_priors, show_remarks
+    from bwbayes.data.io.formats import SUFFIXES
 
-    wanted = config_or_proposal(config, Console(quiet=quiet))
+    chosen = config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
-        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        wanted = wanted.model_copy(update={"record": source})
+        chosen = chosen.with_record(record)
     if seed is not None:
-        wanted = wanted.model_copy(update={"seed": seed})
-    if wanted.name is None:
-        wanted = wanted.model_copy(update={"name": config.stem})
-    folder = start(wanted, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+        chosen = chosen.model_copy(update={"seed": seed})
+    if chosen.name is None:
+        chosen = chosen.model_copy(update={"name": config.stem})
+    folder = start(chosen, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
     if not quiet:
-        show_priors(load_run(folder).posterior.prior, Console())
-    return finish(folder.path, workers, quiet)
+        problem = load_run(folder)
+        if config.suffix.lower() not in SUFFIXES:  # of a record alone they are shown already
+            show_remarks(problem.remarks, Console())
+        show_priors(problem.posterior.prior, Console())
+    return finish(folder.path, workers, quiet, how=how)
 
 
 @click.command()
@@ -60,6 +65,7 @@ def run(
 @click.option("--steps", type=click.IntRange(1), help="A new budget of steps.")
 @click.option("--engine", type=click.Choice(get_args(Engine)), help="Go on with this engine.")
 @workers_option
+@executor_option
 @quiet_option
 def resume(
     folder: Path,
@@ -67,10 +73,11 @@ def resume(
     steps: int | None,
     engine: Engine | None,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Go on with the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine)
+    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine, how=how)

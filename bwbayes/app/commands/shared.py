@@ -17,6 +17,7 @@ __all__ = [
     "FILE",
     "INTERRUPTED",
     "NOT_CONVERGED",
+    "executor_option",
     "finish",
     "overwrite_option",
     "quiet_option",
@@ -32,9 +33,13 @@ FILE = click.Path(path_type=Path)
 workers_option = click.option(
     "--workers", type=click.IntRange(1), help="Ensembles side by side; default: all cores."
 )
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace files that are there already."
+executor_option = click.option(
+    "--executor",
+    "how",
+    metavar="KIND",
+    help="local (default), threads, processes, dask, or dask://HOST:PORT.",
 )
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 
@@ -46,6 +51,7 @@ def finish(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    how: str | None = None,
 ) -> int:
     """Sample the run in a folder to its end, say how it went, and return the exit status."""
     from bwbayes.app.running.folder import RunFolder
@@ -55,7 +61,9 @@ def finish(
     folder = RunFolder.open(path)
     console = Console(stderr=True, quiet=quiet)
     try:
-        result = carry_on(folder, console, workers=workers, ess=ess, steps=steps, engine=engine)
+        result = carry_on(
+            folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+        )
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
         return INTERRUPTED

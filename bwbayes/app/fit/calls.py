@@ -7,11 +7,13 @@ what either has written, and :func:`resume_run` goes on with it.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.fit.fitted import Fit, carried_on, to_know
+from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
@@ -22,11 +24,12 @@ __all__ = ["fit", "open_run", "resume_run"]
 
 
 def fit(
-    record: Record | str | Path,
+    record: Record | str | Path | Sequence[Any] | Mapping[str, Any],
     *,
     folder: str | Path | None = None,
     overwrite: bool = False,
     workers: int | None = None,
+    executor: Any = None,
     progress: bool = True,
     **keys: Any,
 ) -> Fit:
@@ -35,14 +38,20 @@ def fit(
     Parameters
     ----------
     record
-        The training record, or its file.
+        The training record, or its file. Several records of one actuator are fitted jointly: a list
+        of them, or a dict by name, in which a record may be a dict of the keys of [record.NAME],
+        with ``record`` the record itself: ``{"loops": loops, "step": {"record": step, "train":
+        (0, 3)}}``.
     folder
-        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is there after
+        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
     overwrite
         Replace a run that is in the folder already.
     workers
         Ensembles side by side; by default one a core. The draws do not depend on it.
+    executor
+        Where they run: "local", "threads", "processes", "dask" or "dask://HOST:PORT", a
+        ``distributed.Client``, or any executor with the methods of ``concurrent.futures``.
     progress
         Show how far it is.
     keys
@@ -68,7 +77,9 @@ def fit(
     warn(problem.remarks, 3)
     scratch = Scratch() if folder is None else None
     path = scratch.path / "run" if scratch is not None else Path(str(folder))
-    made = carried_on(RunFolder.create(path, problem, overwrite), scratch, progress, workers)
+    made = carried_on(
+        RunFolder.create(path, problem, overwrite), scratch, progress, workers, how=executor
+    )
     warn([one for one in to_know(made) if one not in problem.remarks], 3)
     return made
 
@@ -96,6 +107,7 @@ def resume_run(
     steps: int | None = None,
     engine: Engine | None = None,
     workers: int | None = None,
+    executor: Any = None,
     progress: bool = True,
 ) -> Fit:
     """Go on with a run in a folder that was interrupted or is short of its target.
@@ -108,13 +120,13 @@ def resume_run(
         A new target of effective draws, a new budget of steps; by default as before.
     engine
         Go on with this engine, whatever the chain was begun with.
-    workers, progress
+    workers, executor, progress
         As in :func:`fit`.
 
     Raises
     ------
     InputError
-        No such run, or its files do not fit together.
+        No such run, or its files do not belong together.
 
     Warns
     -----
@@ -122,6 +134,6 @@ def resume_run(
         As :func:`fit` does.
     """
     where = RunFolder.open(Path(folder))
-    made = carried_on(where, None, progress, workers, ess, steps, engine)
+    made = carried_on(where, None, progress, workers, ess, steps, engine, executor)
     warn(to_know(made), 3)
     return made

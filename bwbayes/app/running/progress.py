@@ -7,6 +7,7 @@ then. Quiet means nothing at all.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from typing import Self
 
 import numpy as np
@@ -18,7 +19,7 @@ from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.sampler import SamplingPlan
 
-__all__ = ["Progress", "ReplicateProgress"]
+__all__ = ["CampaignProgress", "Progress", "ReplicateProgress"]
 
 # Seconds between lines where there is no terminal.
 PAUSE = 10.0
@@ -69,6 +70,27 @@ class ReplicateProgress(_Line):
             f"replicate {self.done} of {self.total}   {60 * rate:.1f} a minute   "
             f"ETA {_minutes((self.total - self.done) / rate)}   "
             f"not converged {self.unconverged}"
+        )
+
+
+class CampaignProgress(_Line):
+    """Watches the records of a campaign, of which ``done`` are there and some missing."""
+
+    def __init__(self, console: Console, done: int, missing: int) -> None:
+        super().__init__(console)
+        self.before = self.done = done
+        self.total = done + missing
+        self.short = Counter[str]()
+
+    def __call__(self, short: str) -> None:
+        """Take note of a record that came to its end, and of what it is short of, if anything."""
+        self.done += 1
+        self.short[short] += 1
+        rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
+        self.show(
+            f"record {self.done} of {self.total}   {60 * rate:.1f} a minute   "
+            f"ETA {_minutes((self.total - self.done) / rate)}   "
+            f"not converged {self.short['not converged']}   refused {self.short['refused']}"
         )
 
 

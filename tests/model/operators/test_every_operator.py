@@ -47,18 +47,18 @@ def test_engines_agree(name: str, from_rest: bool, parts: bool) -> None:
     one = replace(of, engine="numpy").log_likelihood(theta)
     other = replace(of, engine="numba").log_likelihood(theta)
     assert np.isfinite(one).all()
-    size = of.voltage.size + np.abs(one)
+    size = of.only.voltage.size + np.abs(one)
     assert np.max(np.abs(one - other) / size) < 1e-10
 
 
 @every_operator
 def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
     of = posterior(name, parts=True)
-    actuator, theta = of.likelihood.actuator, of.table.actuator(drawn(of, 5))
-    whole = actuator.displacement(theta, of.voltage)
+    actuator, theta = of.likelihood.actuator, of.only.table.actuator(drawn(of, 5))
+    whole = actuator.displacement(theta, of.only.voltage)
     state, parts = None, []
     for first, last in ((0, 1), (1, 2), (2, 77), (77, 240)):
-        part, state = actuator.advance(theta, of.voltage[first:last], state)
+        part, state = actuator.advance(theta, of.only.voltage[first:last], state)
         parts.append(part)
     size = np.ptp(whole)
     np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, atol=1e-9 * size)
@@ -68,10 +68,10 @@ def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
 def test_states_that_are_reachable_are_inside_the_prior(name: str) -> None:
     of = posterior(name)
     column = of.table.columns(drawn(of, 200))
-    (initial,) = (p for p in of.prior.free if p.name == "initial")
+    (initial,) = (p for p in of.prior.parameters if p.name == "initial")
     low, high = initial.limits(column)
-    least, most = of.actuator.hysteresis.reachable(
-        column, float(of.voltage[0]), Span(-100.0, 100.0)
+    least, most = of.only.actuator.hysteresis.reachable(
+        column, float(of.only.voltage[0]), Span(-100.0, 100.0)
     )
     assert (least <= most).all()
     slack = 1e-9 * (np.abs(least) + np.abs(most))
@@ -116,7 +116,7 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
     remarks = [
         *identifiability.remarks(of, point, draws),
         *conflicts(of.prior, draws, {}),
-        *of.actuator.hysteresis.remarks(column, of.names),
+        *of.only.actuator.hysteresis.remarks(column, of.names),
     ]
     assert all(isinstance(text, str) and text for text in remarks)
 
@@ -124,9 +124,9 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
 def assert_finite(name: str, draws: int) -> None:
     """Every draw of the default priors has a likelihood, on both engines."""
     of = posterior(name, parts=True)
-    voltage = of.voltage[::8].copy()
-    displacement = of.displacement[::8].copy()
-    of = replace(of, voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
+    voltage = of.only.voltage[::8].copy()
+    displacement = of.only.displacement[::8].copy()
+    of = of.altered(voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
     theta = drawn(of, draws)
     for engine in ("numpy", "numba"):
         density = replace(of, engine=engine).log_likelihood(theta)

@@ -1,0 +1,63 @@
+"""``bwbayes export``: the model of a run for a controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from bwbayes.app.commands.shared import FILE, overwrite_option
+
+if TYPE_CHECKING:
+    from bwbayes.model.linear import Hold
+
+__all__ = ["export"]
+
+
+@click.command()
+@click.argument("folder", type=FILE)
+@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/export.")
+@click.option(
+    "--limits",
+    type=(float, float),
+    help="Lowest and highest voltage that the inverse may give, V; default: the record's.",
+)
+@click.option(
+    "--rate", type=float, help="The controller's samples a second; default: the record's."
+)
+@click.option(
+    "--hold",
+    type=click.Choice(["first", "zero"]),
+    help="The voltage between samples: straight lines, or held; default: as in the record.",
+)
+@overwrite_option
+def export(
+    folder: Path,
+    out: Path | None,
+    limits: tuple[float, float] | None,
+    rate: float | None,
+    hold: str | None,
+    overwrite: bool,
+) -> int:
+    """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
+
+    It is the posterior's mean. The C file needs math.h alone and does a sample a call.
+
+    Example: bwbayes export results/ring_bender --rate 1000 --hold zero
+    """
+    from bwbayes.app.jobs.export import export as write
+
+    made, files = write(
+        folder,
+        out,
+        limits=limits,
+        rate=rate,
+        hold=cast("Hold | None", hold),
+        overwrite=overwrite,
+    )
+    if made.without_inverse is not None:
+        click.echo(f"bwbayes: no inverse in it: {made.without_inverse}", err=True)
+    for path in files:
+        click.echo(f"wrote {path}")
+    return 0

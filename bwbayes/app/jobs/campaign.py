@@ -1,0 +1,234 @@
+"""A campaign: one posterior for each record of a folder, and what they say together.
+
+:func:`start` makes the folder; :func:`carry_on` fits the records whose runs have not ended, side by
+side, and writes table and page over all of them. A record's run depends on the config, the seed and
+the record alone, and the tables on the runs alone, so it does not matter in how many pieces or with
+how many workers a campaign is done, and records that come later are fitted by themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+
+from rich.console import Console
+
+from bwbayes.app.config.config import checked, dump, load
+from bwbayes.app.figures import save
+from bwbayes.app.figures.campaign import draw_campaign
+from bwbayes.app.problem.problem import generator
+from bwbayes.app.report.campaign_report import render
+from bwbayes.app.running.campaign_folder import CampaignFolder, Finished, Origin, records_in
+from bwbayes.app.running.campaign_result import CampaignResult, Row, summary, table
+from bwbayes.app.running.one_record import SPECIMEN, Ended, Task, fit_one
+from bwbayes.app.running.progress import CampaignProgress
+from bwbayes.app.running.workers import executor, one_thread, side_by_side
+from bwbayes.errors import InputError
+from bwbayes.population.population import FEWEST, population
+from bwbayes.population.specimen import Specimen
+from bwbayes.results.outputs import write_summary
+from bwbayes.results.replicates import as_done
+
+__all__ = ["carry_on", "config_text", "start"]
+
+
+def config_text(path: Path) -> str:
+    """Return the config of all records as TOML, every default explicit.
+
+    It need not name a record.
+
+    Raises
+    ------
+    InputError
+        The config cannot be read, or says what no config can say.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        record = table.setdefault("record", {})
+        bare = isinstance(record, dict) and not {"file", "signal"} & set(record)
+    except (OSError, ValueError, RecursionError):
+        bare = False
+    if bare:
+        record["file"] = "each"
+        return dump(checked(table, str(path)))
+    return dump(load(path))
+
+
+def start(
+    records: Path,
+    config: str,
+    where: Path,
+    out: Path,
+    *,
+    pictures: bool = True,
+    overwrite: bool = False,
+) -> CampaignFolder:
+    """Make the folder of a campaign, or open the same one that was begun.
+
+    Parameters
+    ----------
+    records
+        The folder of the records.
+    config
+        The config of all, as TOML; empty lets each record propose its own.
+    where
+        The folder that the config's files are relative to.
+    out
+        The campaign's folder.
+    pictures
+        Draw every run's figures and report, too.
+    overwrite
+        Replace a campaign that is there.
+
+    Raises
+    ------
+    InputError
+        No records, or a folder of something else.
+    """
+    records_in(records)
+    origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
+    return CampaignFolder.create(out, config, origin, overwrite=overwrite)
+
+
+def carry_on(
+    folder: CampaignFolder,
+    console: Console,
+    *,
+    workers: int | None = None,
+    how: str | Executor | None = None,
+) -> CampaignResult:
+    """Fit the records that are missing, and write table and page over all.
+
+    Parameters
+    ----------
+    folder
+        The campaign's folder.
+    console
+        Where progress goes.
+    workers
+        Records side by side, in processes if more than one; by default as many as cores. The result
+        does not depend on it.
+    how
+        Which executor, as in :func:`~bwbayes.app.running.workers.executor`. The machines of a
+        cluster must all see the campaign's folder and that of the records by the same path.
+
+    Raises
+    ------
+    InputError
+        The folder's files do not fit together, or another process is writing them.
+    """
+    with folder.locked(), one_thread():
+        origin, finished = folder.origin(), folder.finished()
+        files = records_in(Path(origin.records))
+        refused = _namesakes(files)
+        fitted = [file for file in files if file.name not in refused]
+        missing = [file for file in fitted if not folder.is_done(file, finished)]
+        folder.summary.unlink(missing_ok=True)
+        if missing:
+            done = len(fitted) - len(missing)
+            refused |= _fit(folder, origin, missing, done, workers, console, how)
+        console.print("combining the records ...", highlight=False)
+        campaign = _together(folder, files, refused)
+        _write(folder, campaign)
+    return campaign
+
+
+def _namesakes(files: Sequence[Path]) -> dict[str, str]:
+    """Refuse files that would share a folder, by file name."""
+    stems = Counter(file.stem.lower() for file in files)
+    return {
+        file.name: f"{file}: shares its name with another record; rename one of them"
+        for file in files
+        if stems[file.stem.lower()] > 1
+    }
+
+
+def _fit(
+    folder: CampaignFolder,
+    origin: Origin,
+    missing: Sequence[Path],
+    done: int,
+    workers: int | None,
+    console: Console,
+    how: str | Executor | None,
+) -> dict[str, str]:
+    """Fit records side by side, note each that is done, and return the refusals by file name."""
+    config = folder.config.read_text(encoding="utf-8")
+    tasks = [
+        Task(
+            file.stem,
+            file,
+            config,
+            Path(origin.where),
+            folder.run(file.stem).absolute(),
+            origin.pictures,
+        )
+        for file in missing
+    ]
+    names = {file.stem: file.name for file in missing}
+    count = min(workers or os.cpu_count() or 1, len(tasks))
+    refused: dict[str, str] = {}
+    with (
+        executor(count, how=how) as pool,
+        CampaignProgress(console, done, len(missing)) as progress,
+    ):
+        one: Ended
+        together = side_by_side(pool, workers, len(tasks))
+        for one in as_done(pool, together, fit_one, ((task,) for task in tasks)):
+            if one.refusal:
+                refused[names[one.name]] = one.refusal
+            else:
+                folder.note(Finished(name=one.name, file=one.file, summary=one.summary))
+            progress("refused" if one.refusal else "" if one.converged else "not converged")
+    return refused
+
+
+def _together(
+    folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]
+) -> CampaignResult:
+    """Read what the runs have left."""
+    rows = [_row(folder, file, refused.get(file.name, "")) for file in files]
+    specimens = [
+        Specimen.load(row.name, folder.run(row.name) / SPECIMEN) for row in rows if row.parameters
+    ]
+    if len(specimens) < FEWEST:
+        return CampaignResult(tuple(rows), None, f"a population needs {FEWEST} records or more")
+    try:
+        return CampaignResult(tuple(rows), population(specimens, generator(1, "population")))
+    except InputError as error:
+        return CampaignResult(tuple(rows), None, str(error))
+
+
+def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
+    """Return the row of a record."""
+    if refusal:
+        return Row(file.stem, file.name, "refused", refusal, {})
+    path = folder.run(file.stem)
+    numbers = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    if not numbers["converged"]:
+        reason = f"{numbers['stop_reason']}; go on with `{numbers['go_on']}`"
+        return Row(file.stem, file.name, "not converged", reason, numbers)
+    failed = [name for name, one in numbers["validation"].items() if one.get("holds") is False]
+    if failed:
+        reason = f"bands do not hold: {', '.join(failed)}"
+        return Row(file.stem, file.name, "does not hold", reason, numbers)
+    return Row(file.stem, file.name, "done", "", numbers)
+
+
+def _write(folder: CampaignFolder, campaign: CampaignResult) -> None:
+    """Write the campaign's files; the summary last, as the sign that all is done.
+
+    Nothing in them depends on when or how it was computed.
+    """
+    draft = folder.table.with_suffix(".partial")
+    draft.write_text(table(campaign), encoding="utf-8")
+    draft.replace(folder.table)
+    pictures = save(draw_campaign(campaign), folder.path / "figures")
+    page = render(folder.path.name, campaign, pictures)
+    folder.page.write_text(page, encoding="utf-8")
+    write_summary(folder.summary, summary(campaign))

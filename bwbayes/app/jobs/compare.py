@@ -1,0 +1,301 @@
+"""``bwbayes compare``: which model? Finished runs, or models that are run for it.
+
+:func:`compare_runs` compares the runs in folders, :func:`compare_models` runs a config with one
+model after the other first, each into a folder of its own, and goes on with those that are there
+already. Both leave a page, a JSON and a CSV file. Runs of different readings are refused: their
+numbers would not be about the same thing.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from bwbayes.app.config.config import Config, ModelConfig, dump
+from bwbayes.app.config.models import slug
+from bwbayes.app.problem.model import actuator_of, in_words
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.report.comparison_report import render
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.predictions import scoring
+from bwbayes.app.running.run import finished, go_on
+from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.comparison.candidates import Candidate
+from bwbayes.comparison.choice import Comparison, choose
+from bwbayes.comparison.evidence import evidence
+from bwbayes.comparison.future import future, joint_log_score
+from bwbayes.comparison.table import numbers, table
+from bwbayes.errors import InputError
+from bwbayes.inference.noise import noise_model
+from bwbayes.inference.table import Table
+from bwbayes.model.operators.no_hysteresis import NoHysteresis
+from bwbayes.results.bands import Bands
+from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.outputs import write_summary
+from bwbayes.results.prediction import predict_record, predict_windows, thinned
+from bwbayes.results.scores import score
+from bwbayes.results.verdict import Background, assess
+from bwbayes.sampling.sampler import Outcome, draws, log_densities
+from bwbayes.sampling.storage import ChainFile
+
+__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "require_same", "write"]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A run to compare: its name, problem, chain and outcome."""
+
+    name: str
+    problem: Problem
+    chain: ChainFile
+    outcome: Outcome
+
+
+def compare_runs(
+    folders: Sequence[Path],
+    out: Path,
+    console: Console,
+    *,
+    workers: int | None = None,
+    with_future: bool = True,
+    overwrite: bool = False,
+) -> Comparison:
+    """Compare the runs in folders, and write what comes of it to the folder ``out``.
+
+    Raises
+    ------
+    InputError
+        No such run, runs of different readings, or files that are there already.
+    """
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("compare: the same run is there twice; leave one out")
+    _require_free(out, overwrite)
+    names = [folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    runs = []
+    for name, path in zip(names, folders, strict=True):
+        runs.append(Fitted(name, *finished(RunFolder.open(path))))
+        require_same(runs[0], runs[-1])
+    made = compare(runs, console, workers=workers, with_future=with_future)
+    write(made, runs, out)
+    return made
+
+
+def compare_models(
+    config: Config,
+    where: Path,
+    models: Mapping[str, ModelConfig],
+    out: Path,
+    console: Console,
+    *,
+    workers: int | None = None,
+    with_future: bool = True,
+    overwrite: bool = False,
+) -> Comparison:
+    """Run a config with each of the models, in folders below ``out``, and compare them.
+
+    The config's files are relative to the folder ``where``. Runs that are there already, of the
+    same config, are gone on with.
+
+    Raises
+    ------
+    InputError
+        The config, its records or a folder cannot be used, or a folder has another run.
+    """
+    _require_free(out, overwrite)
+    plain = resolve(config.model_copy(update={"parameters": {}, "truth": {}}), where)
+    problems = {
+        name: resolve(_with_model(config, model, name, plain), where)
+        for name, model in models.items()
+    }
+    runs = []
+    for name, problem in problems.items():
+        folder = _folder(out / slug(name), problem, overwrite)
+        console.print(f"{name} ...", highlight=False)
+        if not folder.summary.is_file():
+            go_on(folder, console, workers=workers)
+        runs.append(Fitted(name, *finished(folder)))
+        require_same(runs[0], runs[-1])
+    made = compare(runs, console, workers=workers, with_future=with_future)
+    write(made, runs, out)
+    return made
+
+
+def _with_model(config: Config, model: ModelConfig, name: str, plain: Problem) -> Config:
+    """Return the config with another model, and of its parameters those that this model has."""
+    actuator = actuator_of(model, plain.record)
+    names = Table(actuator, noise_model(model.noise, plain.record.interval)).names
+    changes = {
+        key: {p: given for p, given in getattr(config, key).items() if p in names}
+        for key in ("parameters", "truth")
+    }
+    return config.model_copy(update={"model": model, "name": name, **changes})
+
+
+def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
+    """Make a model's folder, or take the one that is there, if it is the same run's."""
+    if path.exists() and not overwrite:
+        folder = RunFolder.open(path)
+        if folder.config.read_text(encoding="utf-8") != dump(problem.config):
+            raise InputError(
+                f"{path}: holds another run; choose another folder with --out, or give --overwrite"
+            )
+        return folder
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return RunFolder.create(path, problem, overwrite)
+
+
+def _require_free(out: Path, overwrite: bool) -> None:
+    target = out / "comparison.json"
+    if target.exists() and not overwrite:
+        raise InputError(f"{target}: exists; choose another folder with --out, or give --overwrite")
+
+
+def require_same(one: Fitted, other: Fitted) -> None:
+    """Refuse runs that are not about the same readings.
+
+    Raises
+    ------
+    InputError
+        Records, training windows or what is held out differ.
+    """
+    ours, theirs = one.problem, other.problem
+    pair = f"compare: {one.name} and {other.name}"
+    if ours.record.sha256 != theirs.record.sha256:
+        raise InputError(
+            f"{pair}: fitted to different records, or in different units; compare fits of one "
+            "record, with the same readings left out"
+        )
+    if ours.posterior.only.training != theirs.posterior.only.training:
+        raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
+    held = [_held_out(problem) for problem in (ours, theirs)]
+    if held[0] != held[1]:
+        names = [key for key in {**held[0], **held[1]} if held[0].get(key) != held[1].get(key)]
+        raise InputError(
+            f"{pair}: differ in what is held out ({', '.join(names)}); give both the same "
+            "[validation]"
+        )
+
+
+def _held_out(problem: Problem) -> dict[str, object]:
+    """Return what is held out, by name, so that it can be compared."""
+    return {
+        name: (
+            one.window,
+            None if one.record is None else one.record.sha256,
+            replace(one.start, hold=None),
+            one.judged,
+        )
+        for name, one in problem.validations.items()
+    }
+
+
+def compare(
+    runs: Sequence[Fitted],
+    console: Console,
+    *,
+    workers: int | None = None,
+    with_future: bool = True,
+) -> Comparison:
+    """Compare runs of the same readings."""
+    seed = runs[0].problem.config.seed
+    candidates = []
+    for run in runs:
+        if not console.quiet:
+            console.print(f"judging {run.name} ...", highlight=False)
+        with one_thread(), executor(workers, run.problem.posterior.engine) as pool:
+            candidates.append(candidate(run, pool, with_future=with_future))
+    return choose(candidates, generator(seed, "comparison"))
+
+
+def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candidate:
+    """Work out all that a comparison knows of a run."""
+    problem, posterior, seed = run.problem, run.problem.posterior, run.problem.config.seed
+    plain = Candidate(
+        run.name,
+        f"{in_words(problem.config.model)}, {problem.config.model.noise} noise",
+        run.outcome.converged,
+        run.outcome.stop_reason,
+        posterior.prior.dimensions,
+        posterior.only.readings.rows.size,
+        not isinstance(posterior.only.actuator.hysteresis, NoHysteresis),
+    )
+    if not run.outcome.converged:
+        return plain
+    sampled, density = draws(posterior, run.chain), log_densities(run.chain)
+    flat = sampled.reshape(-1, sampled.shape[-1])
+    bands = tuple(one for one in held_out(problem, flat) if one.measured is not None)
+    windows = [v.window for v in problem.validations.values() if v.window is not None]
+    log_prior = posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
+    return replace(
+        plain,
+        held_out=bands,
+        scores={one.name: score(one, scoring(seed, one)) for one in bands},
+        not_holding=_not_holding(problem, flat, bands),
+        joint=joint_log_score(posterior, flat, windows, generator(seed, "joint"))
+        if windows
+        else None,
+        future=future(posterior, problem.plan, problem.record, generator(seed, "future"), pool)
+        if with_future
+        else None,
+        evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
+        log_likelihood=float(np.max(density.ravel() - log_prior)),
+    )
+
+
+def _not_holding(problem: Problem, flat: FloatArray, bands: Sequence[Bands]) -> tuple[str, ...]:
+    """Return the names of the bands that do not hold."""
+    background = Background.of(problem.posterior, flat)
+    verdicts = {
+        one.name: assess(
+            one, background, beyond=beyond_training(problem.posterior, one.voltage, one.interval)
+        )
+        for one in bands
+    }
+    return tuple(name for name, v in verdicts.items() if v is not None and v.holds is False)
+
+
+def held_out(problem: Problem, flat: FloatArray) -> list[Bands]:
+    """Predict all that was held out, as a run does."""
+    posterior, seed = problem.posterior, problem.config.seed
+    chosen = thinned(flat, generator(seed, "draws"))
+    windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
+    source = generator(seed, f"predict {problem.record.sha256}")
+    bands = predict_windows(posterior, chosen, problem.record, windows, source) if windows else []
+    for name, one in problem.validations.items():
+        if one.record is not None:
+            source = generator(seed, f"predict {one.record.sha256}")
+            of = posterior, chosen, one.record, one.start, source, name, one.judged
+            bands.append(predict_record(*of))
+    return bands
+
+
+def write(comparison: Comparison, runs: Sequence[Fitted], out: Path) -> None:
+    """Write page, table and numbers; the numbers last, as the sign that all is there.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        page = render(comparison, runs[0].problem)
+        (out / "comparison.html").write_text(page, encoding="utf-8")
+        flat = table(comparison)
+        with (out / "comparison.csv").open("w", newline="", encoding="utf-8") as file:
+            columns = list(dict.fromkeys(key for row in flat for key in row))
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows(flat)
+        write_summary(out / "comparison.json", numbers(comparison))
+    except OSError as error:
+        raise InputError(f"{out}: {error.strerror}; choose another folder with --out") from None

@@ -1,0 +1,110 @@
+"""``bwbayes export``: the posterior's mean model for a controller, as JSON and as C.
+
+Two files come of it: ``model.json`` has the parts, all coefficients with units, and the linear part
+as matrices; ``actuator.c`` is the model and its inverse, one sample a call.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.problem.problem import Problem
+from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import Exported, exported
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Hold
+
+__all__ = ["at_rate", "export", "export_draws"]
+
+# Fastest sampling of a controller, Hz.
+LARGEST_RATE = 1e7
+
+
+def export(path: Path, out: Path | None = None, **options: Any) -> tuple[Exported, list[Path]]:
+    """Write the mean model of the run in a folder, by default to ``export`` in it.
+
+    Options, errors and what is returned are as of :func:`export_draws`; a run that has not
+    converged is refused.
+    """
+    problem, flat = drawn(path)
+    return export_draws(problem, flat, out or path / "export", **options)
+
+
+def export_draws(
+    problem: Problem,
+    flat: FloatArray,
+    folder: Path,
+    *,
+    limits: tuple[float, float] | None = None,
+    rate: float | None = None,
+    hold: Hold | None = None,
+    overwrite: bool = False,
+) -> tuple[Exported, list[Path]]:
+    """Write the mean model of draws for a controller; return it, and the files.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    flat
+        Its draws, (draws, free), parameters in their own units.
+    folder
+        Where the files go.
+    limits
+        Voltages that the inverse may give, V; by default those of the record.
+    rate
+        The controller's samples a second; by default the record's.
+    hold
+        ``"zero"`` if the voltage is held between samples, ``"first"`` if it goes straight; by
+        default as in the record.
+    overwrite
+        Whether files may be replaced.
+
+    Raises
+    ------
+    InputError
+        A hysteresis that has no step of bounded time, options that make no sense, or files that
+        exist or cannot be written.
+    """
+    posterior = problem.posterior
+    # Of several records the first: what belongs to a record matters little to a controller.
+    one = posterior.datasets[0]
+    theta = one.table.actuator(posterior.table.of(posterior.prior.theta(flat), one.name))
+    actuator = at_rate(one.actuator, rate, hold)
+    sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
+    name = problem.config.name or problem.record.origin
+    made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, limits), sds)
+    return made, _written(made, folder, overwrite)
+
+
+def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuator:
+    """Return an actuator at a controller's pace: so many samples a second, with this hold.
+
+    Raises
+    ------
+    InputError
+        A rate that is none.
+    """
+    if rate is not None and not 0 < rate <= LARGEST_RATE:
+        raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")
+    interval = actuator.interval if rate is None else 1 / rate
+    return replace(actuator, interval=interval, hold=hold or actuator.hold)
+
+
+def _written(made: Exported, folder: Path, overwrite: bool) -> list[Path]:
+    """Write the two files, and return them."""
+    numbers, code = folder / "model.json", folder / "actuator.c"
+    refuse_existing([numbers, code], overwrite)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(made.numbers(), indent=2, allow_nan=False)
+        numbers.write_text(f"{text}\n", encoding="utf-8")
+        code.write_text(made.c_code(), encoding="ascii")
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; choose another place with --out") from None
+    return [numbers, code]

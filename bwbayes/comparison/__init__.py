@@ -1,0 +1,1 @@
+"""Models compared: what each was worth on data it had not seen, and what that can tell apart."""

@@ -1,0 +1,1 @@
+"""Put a fitted model to work: inverse, compensation, closed loop, and code for a controller."""

@@ -1,0 +1,243 @@
+"""A model for a controller: its coefficients with units, and a C file that does a sample a call.
+
+The C file needs no library but ``math.h`` and allocates nothing. It holds the same recursions as
+:class:`~bwbayes.control.sampled.SampledModel`, forward and, where the model has one, inverse; both
+take a bounded time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.discrete import linear_part
+from bwbayes.control.sampled import (
+    BISECTION_ROUNDS,
+    NEWTON_ROUNDS,
+    SampledModel,
+    require_inverse,
+    resolution,
+)
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.operator import Span
+
+__all__ = ["Exported", "exported"]
+
+BETWEEN = {"first": "voltage's drive goes straight", "zero": "voltage is held"}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A model of an actuator that is ready for a controller.
+
+    Parameters
+    ----------
+    name
+        What it is called.
+    model
+        The one model, a sample at a time.
+    limits
+        The voltages that its inverse may give, V.
+    sds
+        Standard deviations of its parameters, by name, if they are known.
+    without_inverse
+        Why it has no inverse; None if it has one.
+    """
+
+    name: str
+    model: SampledModel
+    limits: Span
+    sds: Mapping[str, float]
+    without_inverse: str | None
+
+    @property
+    def linear(self) -> Any:
+        """The linear part, a discrete ``scipy.signal.StateSpace``."""
+        return linear_part(self.model.actuator, self._theta)
+
+    @property
+    def _theta(self) -> FloatArray:
+        return np.array([self.model.column[one][0] for one in self.model.actuator.parameters])
+
+    def numbers(self) -> dict[str, Any]:
+        """Return what ``model.json`` says: parts, parameters and coefficients, with their units."""
+        actuator = self.model.actuator
+        linear = self.linear
+        return {
+            "name": self.name,
+            "bwbayes": version("bwbayes"),
+            "interval_s": actuator.interval,
+            "hold": actuator.hold,
+            "limits_V": list(self.limits),
+            "inverse": self.without_inverse is None,
+            "without_inverse": self.without_inverse,
+            "parts": {
+                "hysteresis": self.model.step.coefficients()["kind"],
+                "gain": list(actuator.gain.terms) if actuator.gain else [],
+                "dynamics": actuator.dynamics,
+                "creep_times_s": list(actuator.creep.times) if actuator.creep else [],
+            },
+            "parameters": {
+                one.name: {
+                    "mean": float(self.model.column[one.name][0]),
+                    "sd": self.sds.get(one.name),
+                    "unit": one.unit,
+                    "description": one.description,
+                }
+                for one in actuator.declarations
+            },
+            "hysteresis": self._hysteresis,
+            "gain": self._gain,
+            "creep_growth_per_V": self._growth,
+            "sections": {
+                "unit": "um of displacement for a um of drive, both from rest",
+                "recursions": self._sections,
+            },
+            "state_space": {
+                "unit": "um of displacement for a um of drive, both from rest",
+                **{name: getattr(linear, name).tolist() for name in "ABCD"},
+                "dt_s": actuator.interval,
+            },
+        }
+
+    def c_code(self) -> str:
+        """Return the C file."""
+        environment = Environment(
+            loader=PackageLoader("bwbayes.control"),
+            autoescape=False,  # it is C, and all that fills it in are numbers and plain words
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            keep_trailing_newline=True,
+            finalize=_in_c,
+        )
+        actuator, hysteresis = self.model.actuator, self.model.step.coefficients()
+        parts = [hysteresis["kind"], f"dynamics {actuator.dynamics}"]
+        parts += ["polynomial gain"] if actuator.gain else []
+        parts += ["creep"] if actuator.creep else []
+        return environment.get_template("actuator.c.j2").render(
+            title=f"Model of {_plain(self.name)}",
+            parts=f"Parts: {_plain(', '.join(parts))}.",
+            version=_plain(version("bwbayes")),
+            interval=actuator.interval,
+            between=BETWEEN[actuator.hold],
+            held=actuator.hold == "zero",
+            low=self.limits.low,
+            high=self.limits.high,
+            linear=hysteresis["kind"] == "linear",
+            hysteresis=hysteresis,
+            plays=hysteresis.get("weights", ()),
+            sections=self._sections,
+            gain=self._gain,
+            growth=self._growth,
+            inverse=self.without_inverse is None,
+            without_inverse=_plain(self.without_inverse or ""),
+            close=resolution(self.limits),
+            newton=NEWTON_ROUNDS,
+            bisection=BISECTION_ROUNDS,
+        )
+
+    @property
+    def _sections(self) -> list[dict[str, Any]]:
+        numerator, denominator, gains, crept = (part[0] for part in self.model.sections)
+        return [
+            {
+                "what": "creep" if is_creep else "dynamics",
+                "numerator": top.tolist(),
+                "denominator": bottom.tolist(),
+                "gain": float(gain),
+            }
+            for top, bottom, gain, is_creep in zip(
+                numerator, denominator, gains, crept, strict=True
+            )
+        ]
+
+    @property
+    def _hysteresis(self) -> dict[str, Any]:
+        units = {
+            "d": "um/V",
+            "alpha": "um/V",
+            "against": "1/V",
+            "ahead": "1/V",
+            "weights": "um/V",
+            "thresholds": "V",
+        }
+        known = self.model.step.coefficients()
+        return {
+            name: {"value": v, "unit": units[name]} for name, v in known.items() if name in units
+        }
+
+    @property
+    def _gain(self) -> dict[str, float] | None:
+        gain = self.model.actuator.gain
+        if gain is None or not gain.reference.half > 0:
+            return None
+        terms = {
+            f"{name}_um": float(self.model.column[name][0]) if name in gain.terms else 0.0
+            for name in ("quadratic", "cubic")
+        }
+        return {"middle_V": gain.reference.middle, "half_V": gain.reference.half, **terms}
+
+    @property
+    def _growth(self) -> float:
+        creep = self.model.actuator.creep
+        if creep is None or not creep.growing:
+            return 0.0
+        return float(self.model.column["creep_growth"][0]) * float(creep.size(np.array(1.0)))
+
+
+def exported(
+    name: str,
+    actuator: Actuator,
+    theta: FloatArray,
+    limits: Span,
+    sds: Mapping[str, float] | None = None,
+) -> Exported:
+    """Return a model that is ready for a controller.
+
+    Parameters
+    ----------
+    name
+        What it is called.
+    actuator
+        Parts, hold and the controller's sampling interval.
+    theta
+        (parameters,), the columns and their units as in ``actuator.declarations``.
+    limits
+        The voltages that its inverse may give, V.
+    sds
+        Standard deviations of its parameters, by name.
+
+    Raises
+    ------
+    InputError
+        A hysteresis that has no step of bounded time, or limits that are none.
+    """
+    if not (np.isfinite(limits).all() and limits.low < limits.high):
+        raise InputError(
+            f"limits: {limits.low:g} to {limits.high:g} V; give two voltages, the lower one first"
+        )
+    model = SampledModel.of(actuator, np.atleast_2d(theta))
+    try:
+        require_inverse(model, limits)
+    except InputError as error:
+        return Exported(name, model, limits, sds or {}, str(error))
+    return Exported(name, model, limits, sds or {}, None)
+
+
+def _in_c(value: Any) -> Any:
+    """Return a number as C has it, to the last bit."""
+    return repr(float(value)) if isinstance(value, float) else value
+
+
+def _plain(text: str) -> str:
+    """Return a text that ends no comment of C."""
+    return re.sub(r"[^\w .,:;=+()-]", "_", text, flags=re.ASCII)

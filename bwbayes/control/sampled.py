@@ -1,0 +1,328 @@
+"""A model that runs at a controller's pace: one sample in, one sample out, forward or backward.
+
+:class:`SampledModel` is what ``bwbayes export`` writes as C and what ``bwbayes track`` closes the
+loop around. It is the actuator's own recursion, with a voltage for each model; backward it finds
+the voltage that brings the displacement where it is to be, by a safeguarded Newton iteration whose
+number of rounds is bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.control.steps import Gone, HysteresisStep, step_of
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.operator import Span
+
+ComplexArray = NDArray[np.complex128]
+
+__all__ = [
+    "BISECTION_ROUNDS",
+    "NEWTON_ROUNDS",
+    "SampledModel",
+    "Sections",
+    "SteppedState",
+    "require_inverse",
+    "resolution",
+    "sections_of",
+    "zeros",
+]
+
+# Rounds of the solver at most: some of Newton's, of which it needs a few, and should they not do,
+# bisection to the last bit of a voltage.
+NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
+
+# A zero that is nearer to -1 than this leaves an inverse that swings for thousands of samples.
+LARGEST_ZERO = 0.999
+
+
+class Sections(NamedTuple):
+    """Linear recursions side by side, (models, sections, 3) and (models, sections).
+
+    ``crept`` (models, sections) tells the sections whose drive is that of the creep.
+    """
+
+    numerator: FloatArray
+    denominator: FloatArray
+    gains: FloatArray
+    crept: BoolArray
+
+
+class SteppedState(NamedTuple):
+    """What the models remember between two samples.
+
+    ``memory`` is the hysteresis' own, ``voltage`` (models,) the last one, V, ``rest`` (models,) and
+    ``crept_rest`` (models,) are the drives at the start, um, and ``filters`` (models, sections, 2)
+    the recursions' states.
+    """
+
+    memory: FloatArray
+    voltage: FloatArray
+    rest: FloatArray
+    crept_rest: FloatArray
+    filters: FloatArray
+
+
+@dataclass(frozen=True)
+class SampledModel:
+    """A batch of models, a sample at a time.
+
+    They start demagnetised at zero volts, go to a first voltage and settle there, with dynamics and
+    creep at rest. The displacement is without the sensor's offset.
+
+    Parameters
+    ----------
+    actuator
+        Parts, hold and sampling interval.
+    column
+        The columns (models,) of θ by name.
+    step
+        The operator's step.
+    sections
+        Dynamics and creep.
+    """
+
+    actuator: Actuator
+    column: dict[str, FloatArray]
+    step: HysteresisStep
+    sections: Sections
+
+    @classmethod
+    def of(cls, actuator: Actuator, theta: FloatArray) -> Self:
+        """Return the models with parameters θ (models, parameters).
+
+        Raises
+        ------
+        InputError
+            The hysteresis has no step of bounded time.
+        """
+        column = {name: values.copy() for name, values in actuator.columns(theta).items()}
+        return cls(
+            actuator, column, step_of(actuator.hysteresis, column), sections_of(actuator, column)
+        )
+
+    @property
+    def models(self) -> int:
+        """How many there are."""
+        return int(self.sections.gains.shape[0])
+
+    def begin(self, voltage: FloatArray) -> SteppedState:
+        """Return the state of actuators that have settled at a voltage (models,), V."""
+        rest, _, memory = self.drive(self.step.demagnetised(), voltage)
+        filters = np.zeros((*self.sections.gains.shape, 2))
+        return SteppedState(memory, voltage, rest, rest * self._growth(voltage), filters)
+
+    def level(self, state: SteppedState) -> FloatArray:
+        """Return the displacement (models,) at which they began, um."""
+        before = np.where(self.sections.crept, state.crept_rest[:, None], state.rest[:, None])
+        return (self.sections.gains * before).sum(axis=1)
+
+    def displacement(self, state: SteppedState) -> FloatArray:
+        """Return the displacement (models,), um, that a held voltage has led to."""
+        return self.level(state) + (self.sections.gains * state.filters[..., 0]).sum(axis=1)
+
+    def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
+        """Return the displacement (models,), um, at a sample with this voltage, and the state.
+
+        If the voltage is held, the displacement is that just before it changes.
+        """
+        numerator, denominator, gains, crept = self.sections
+        w, _, memory = self.drive(state.memory, voltage)
+        creeping = w if self._even else w * self._growth(voltage)
+        drives = np.where(
+            crept, (creeping - state.crept_rest)[:, np.newaxis], (w - state.rest)[:, np.newaxis]
+        )
+        moved = numerator[..., 0] * drives + state.filters[..., 0]
+        ahead = numerator[..., 1:] * drives[..., np.newaxis]
+        ahead -= denominator[..., 1:] * moved[..., np.newaxis]
+        ahead[..., 0] += state.filters[..., 1]
+        displacement = self.level(state) + (gains * moved).sum(axis=1)
+        return displacement, state._replace(memory=memory, voltage=voltage, filters=ahead)
+
+    def inverse(
+        self,
+        state: SteppedState,
+        displacement: FloatArray,
+        limits: Span,
+        guess: FloatArray | None = None,
+        close: float | None = None,
+    ) -> tuple[FloatArray, SteppedState]:
+        """Return the voltage (models,), V, that gives a displacement (models,), um, and the state.
+
+        If the voltage is held, it is the displacement of the next sample. What would need a voltage
+        outside of the limits gets the limit. The search starts at a ``guess``, or else the last
+        voltage, and ends when it is ``close``, V, by default to the last bits.
+        """
+        drive, crept, missing = self._instant(state, displacement)
+        first = np.clip(state.voltage if guess is None else guess, *limits)
+        close = resolution(limits) if close is None else close
+        voltage = self._solve(state.memory, first, (drive, crept, missing), limits, close)
+        return voltage, self.forward(state, voltage)[1]
+
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
+        """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
+        least, largest = self.step.slopes()
+        if self.actuator.gain is None:
+            return least, largest
+        # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
+        added = self._gain_slope(np.linspace(limits.low, limits.high, 1001)[np.newaxis])
+        return least + added.min(axis=1), largest + added.max(axis=1)
+
+    def _instant(
+        self, state: SteppedState, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the drives w and w (1 + κ |u| / U) count at once, and their sum, um."""
+        numerator, denominator, gains, crept = self.sections
+        carried = state.filters[..., 0]
+        now = numerator[..., 0]
+        if self.actuator.hold == "zero":
+            # The next sample; this one is out of reach.
+            carried = state.filters[..., 1] - denominator[..., 1] * carried
+            now = numerator[..., 1]
+        counts = gains * now
+        drive = np.where(crept, 0.0, counts).sum(axis=1)
+        creep = np.where(crept, counts, 0.0).sum(axis=1)
+        missing = displacement - self.level(state) - (gains * carried).sum(axis=1)
+        return drive, creep, missing + drive * state.rest + creep * state.crept_rest
+
+    def _solve(
+        self,
+        memory: FloatArray,
+        voltage: FloatArray,
+        demand: tuple[FloatArray, FloatArray, FloatArray],
+        limits: Span,
+        close: float,
+    ) -> FloatArray:
+        """Solve (b + b_c (1 + κ |u| / U)) w(u) = missing, rising in u, between limits."""
+        drive, crept, missing = demand
+        low, high = np.full_like(missing, limits.low), np.full_like(missing, limits.high)
+        for done in range(NEWTON_ROUNDS + BISECTION_ROUNDS):
+            w, slope, _ = self.drive(memory, voltage)
+            factor = drive + crept * self._growth(voltage)
+            excess = factor * w - missing
+            steepness = factor * slope + crept * w * self._growth_slope(voltage)
+            low = np.where(excess < 0, voltage, low)
+            high = np.where(excess < 0, high, voltage)
+            better = (low + high) / 2
+            if done < NEWTON_ROUNDS:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    newton = np.clip(voltage - excess / steepness, limits.low, limits.high)
+                better = np.where((newton >= low) & (newton <= high), newton, better)
+            moved, voltage = np.abs(better - voltage), better
+            if np.all(moved <= close):
+                break
+        return voltage
+
+    def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return hysteresis and gain once the voltage has gone there."""
+        w, slope, after = self.step.go(memory, voltage)
+        gain = self.actuator.gain
+        if gain is None:
+            return Gone(w, slope, after)
+        x = gain.scaled(voltage)
+        for name, power in (("quadratic", 2), ("cubic", 3)):
+            if name in gain.terms:
+                w = w + self.column[name] * x**power
+        return Gone(w, slope + self._gain_slope(voltage[:, np.newaxis])[:, 0], after)
+
+    def _gain_slope(self, voltage: FloatArray) -> FloatArray:
+        """Return the gain's slope (models, any), um/V, at voltages (models or 1, any)."""
+        gain = self.actuator.gain
+        assert gain is not None
+        x, half = gain.scaled(voltage), gain.reference.half
+        slope = np.zeros((self.models, 1)) * x
+        for name, power in (("quadratic", 2), ("cubic", 3)):
+            if name in gain.terms and half > 0:
+                slope = slope + self.column[name][:, np.newaxis] * power * x ** (power - 1) / half
+        return slope
+
+    @property
+    def _even(self) -> bool:
+        """Whether the creep does not grow with the voltage."""
+        return self.actuator.creep is None or not self.actuator.creep.growing
+
+    def _growth(self, voltage: FloatArray) -> FloatArray:
+        """Return 1 + κ |u| / U (models,)."""
+        creep = self.actuator.creep
+        if creep is None or self._even:
+            return np.ones_like(voltage)
+        grown: FloatArray = 1 + self.column["creep_growth"] * creep.size(voltage)
+        return grown
+
+    def _growth_slope(self, voltage: FloatArray) -> FloatArray:
+        """Return the slope of 1 + κ |u| / U, 1/V."""
+        creep = self.actuator.creep
+        if creep is None or self._even:
+            return np.zeros_like(voltage)
+        slope: FloatArray = (
+            np.sign(voltage) * self.column["creep_growth"] * creep.size(np.array(1.0))
+        )
+        return slope
+
+
+def sections_of(actuator: Actuator, column: dict[str, FloatArray]) -> Sections:
+    """Return dynamics and creep of models given by the columns (models,) of θ."""
+    made = actuator.sections(column)
+    taps = [
+        np.stack([_padded(getattr(one, name)) for one in made.recursions], axis=1)
+        for name in ("numerator", "denominator")
+    ]
+    gains = np.stack(made.gains, axis=1)
+    # The first is that of the dynamics.
+    crept = np.broadcast_to(np.arange(gains.shape[1]) > 0, gains.shape)
+    return Sections(taps[0], taps[1], gains, crept)
+
+
+def _padded(taps: FloatArray) -> FloatArray:
+    """Return taps (models, up to 3) as (models, 3)."""
+    return np.pad(taps, ((0, 0), (0, 3 - taps.shape[1])))
+
+
+def require_inverse(model: SampledModel, limits: Span) -> None:
+    """Refuse models that have no inverse a sample at a time.
+
+    Raises
+    ------
+    InputError
+        The displacement may turn back while the voltage goes on, or the dynamics between samples
+        are such that the voltage would swing ever wider from sample to sample.
+    """
+    least = float(model.slopes(limits)[0].min())
+    if not least > 0:
+        raise InputError(
+            f"inverse: the model's slope may be as low as {least:.3g} um/V within {limits.low:g} "
+            f"to {limits.high:g} V, so that a displacement has more than one voltage"
+        )
+    for row in range(model.models):
+        for zero in zeros(model.sections, row):
+            if abs(zero) >= 1 or (zero.real < 0 and abs(zero) > LARGEST_ZERO):
+                raise InputError(
+                    "inverse: from sample to sample the voltage would swing on and on (the sampled "
+                    f"dynamics have a zero at {zero.real:.4g}); sample more slowly, or hold the "
+                    "voltage"
+                )
+
+
+def resolution(limits: Span) -> float:
+    """Return the change of a voltage at which its search ends, V: some units in its last place."""
+    return float(4 * np.finfo(np.float64).eps * max(abs(limits.low), abs(limits.high)))
+
+
+def zeros(sections: Sections, row: int) -> ComplexArray:
+    """Return the zeros of a model's recursion: its inverse has them for poles."""
+    total = np.zeros(1)
+    for number, gain in enumerate(sections.gains[row]):
+        part = gain * np.trim_zeros(sections.numerator[row, number], "b")
+        for other in range(sections.gains.shape[1]):
+            if other != number:
+                part = np.polymul(part, np.trim_zeros(sections.denominator[row, other], "b"))
+        # Polynomials in 1/z: they begin together.
+        longest = max(total.size, part.size)
+        total = np.pad(total, (0, longest - total.size)) + np.pad(part, (0, longest - part.size))
+    return np.asarray(np.roots(np.trim_zeros(total, "f")), dtype=np.complex128)

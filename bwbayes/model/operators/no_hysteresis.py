@@ -1,0 +1,64 @@
+"""No hysteresis: displacement in proportion to the voltage.
+
+The model to hold all others against. Where it does as well as they do, a record shows no
+hysteresis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.one_state import OneState, d, initial_anywhere, refuse
+
+__all__ = ["NoHysteresis"]
+
+
+@dataclass(frozen=True)
+class NoHysteresis(OneState):
+    """No hysteresis, w = d u in um, with d in um/V and the voltage u in V.
+
+    It remembers nothing: ``initial`` is fixed at zero and has no effect.
+
+    Notes
+    -----
+    The linear actuator of IEEE Standard on Piezoelectricity 176 (1987), at one frequency.
+    """
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, and the initial state that there is not."""
+        slope = replace(
+            d(),
+            label="d",
+            default=lambda known: lognormal(known.ranges.gain, 0.6),
+            bounds=None,
+        )
+        return slope, replace(initial_anywhere(), default=lambda _: 0.0)
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError where a parameter is not finite."""
+        for name in ("d", "initial"):
+            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
+
+    def trace(
+        self, column: Values, voltage: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w = d u (models, samples), and the state as it was."""
+        return column["d"][:, np.newaxis] * voltage, state
+
+    def reachable(
+        self, column: Values, voltage: float, span: Span
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return zero: no drive leaves anything."""
+        del voltage, span
+        nothing = np.zeros_like(column["d"])
+        return nothing, nothing
+
+    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+        """Return d."""
+        return column["d"]

@@ -1,0 +1,156 @@
+"""Population mean and spread of one parameter where each specimen's likelihood is normal.
+
+The closed form that everything else here leans on: a specimen's parameter y is drawn from
+N(μ, τ²), and its record says N(m; y, s²). Given the spread τ all else is normal, so the only
+integral is one over τ, done on a grid.
+
+Source: A. Gelman et al., Bayesian Data Analysis, third edition, section 5.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["Hyperprior", "NormalLikelihoods", "Spreads", "left_out", "spreads"]
+
+# Values of the spread: at u/(1 − u) of their scale, for even u.
+CELLS = 400
+
+
+@dataclass(frozen=True)
+class Hyperprior:
+    """What is known of a population beforehand: μ ~ N(mean, sd²), τ ~ half-normal(scale)."""
+
+    mean: float
+    sd: float
+    scale: float
+
+    def log_density(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
+        """Log density of means and spreads, arrays of one shape; −∞ for spreads below zero."""
+        z, t = (mean - self.mean) / self.sd, spread / self.scale
+        constant = np.log(self.sd * self.scale * np.pi)
+        return np.where(spread < 0, -np.inf, -0.5 * (z**2 + t**2) - constant)
+
+
+@dataclass(frozen=True)
+class NormalLikelihoods:
+    """The specimens' likelihoods N(mean; y, 1/precision), (specimens,) each.
+
+    A precision of zero is that of a record that tells nothing of the parameter.
+    """
+
+    mean: FloatArray
+    precision: FloatArray
+
+    def marginal(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
+        """Log density (specimens, n) of each record given means and spreads (n,) of populations.
+
+        ∫ N(m; y, s²) N(y; μ, τ²) dy = N(m; μ, s² + τ²); zero of a record that tells nothing.
+        """
+        weight = self.weight(spread)
+        with np.errstate(divide="ignore"):
+            logs = np.where(weight > 0, np.log(weight / (2 * np.pi)), 0.0)
+        return 0.5 * (logs - weight * (self.mean[:, np.newaxis] - mean) ** 2)
+
+    def weight(self, spread: FloatArray) -> FloatArray:
+        """1/(s² + τ²), (specimens, n)."""
+        precision = self.precision[:, np.newaxis]
+        weight: FloatArray = precision / (1 + precision * spread**2)
+        return weight
+
+    def shrunk(
+        self, one: int, mean: FloatArray, spread: FloatArray, generator: np.random.Generator
+    ) -> FloatArray:
+        """Draw a specimen's parameter (n,), one for each population (n,).
+
+        Given μ and τ it is normal, with the precision 1/s² + 1/τ² and the mean
+        (m τ² + μ s²) / (s² + τ²).
+        """
+        precision = self.precision[one]
+        part = 1 / (1 + precision * spread**2)  # of the population's mean
+        centre = part * mean + (1 - part) * self.mean[one]
+        drawn: FloatArray = centre + spread * np.sqrt(part) * generator.standard_normal(mean.size)
+        return drawn
+
+
+@dataclass(frozen=True)
+class Spreads:
+    """The posterior of the spread on its grid, and of the mean given each spread, (cells,) each.
+
+    ``spread`` are the cells' middles, ``edges`` (cells + 1,) their borders (the last is infinite),
+    ``probability`` what they hold; given a spread the mean is N(``mean``, ``variance``).
+    """
+
+    spread: FloatArray
+    edges: FloatArray
+    probability: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+
+    def draw(self, generator: np.random.Generator, size: int) -> tuple[FloatArray, FloatArray]:
+        """Draw means and spreads, (size,) each."""
+        cell = generator.choice(self.spread.size, size, p=self.probability)
+        low = self.edges[cell]
+        width = np.minimum(self.edges[cell + 1], 2 * self.spread[cell] - low) - low
+        spread = low + width * generator.uniform(size=size)
+        mean = self.mean[cell] + np.sqrt(self.variance[cell]) * generator.standard_normal(size)
+        return mean, spread
+
+
+def spreads(likelihoods: NormalLikelihoods, prior: Hyperprior) -> Spreads:
+    """Return the posterior of a population's spread, and of its mean given the spread.
+
+    With wᵢ = 1/(sᵢ² + τ²), and the prior of the mean counted as one more specimen:
+
+        V = 1/Σ wᵢ,   μ̂ = V Σ wᵢ mᵢ,   log p(τ) = log p₀(τ) + ½ (log V + Σ (log wᵢ − wᵢ (mᵢ − μ̂)²))
+
+    up to a constant.
+    """
+    known = likelihoods.precision > 0
+    centres = likelihoods.mean[known]
+    extent = np.std(centres) if known.any() else 0.0
+    errors = np.median(likelihoods.precision[known] ** -0.5) if known.any() else prior.scale
+    u = np.linspace(0, 1, CELLS + 1)
+    middle = (u[1:] + u[:-1]) / 2
+    size = min(extent + errors, prior.scale)
+    with np.errstate(divide="ignore"):
+        edges = size * u / (1 - u)
+    spread = size * middle / (1 - middle)
+    weight = likelihoods.weight(spread)
+    own = 1 / prior.sd**2
+    variance = 1 / (own + np.sum(weight, axis=0))
+    mean = variance * (own * prior.mean + weight.T @ likelihoods.mean)
+    far = weight * (likelihoods.mean[:, np.newaxis] - mean) ** 2
+    with np.errstate(divide="ignore"):
+        logs = np.where(weight > 0, np.log(weight), 0.0)
+    density = 0.5 * (np.log(variance) + np.sum(logs - far, axis=0))
+    density -= 0.5 * own * (prior.mean - mean) ** 2 + 0.5 * (spread / prior.scale) ** 2
+    density -= 2 * np.log1p(-middle)  # dτ/du
+    probability = np.exp(density - np.max(density))
+    probability /= np.sum(probability)
+    return Spreads(spread, edges, probability, mean, variance)
+
+
+def left_out(likelihoods: NormalLikelihoods, prior: Hyperprior) -> FloatArray:
+    """Two-sided p (specimens,) of each record, given the population that all others show.
+
+    Under the model each is uniform from 0 to 1, whatever the population. One for a record that
+    tells nothing.
+    """
+    count = likelihoods.mean.size
+    p = np.ones(count)
+    for one in np.flatnonzero(likelihoods.precision > 0):
+        rest = np.arange(count) != one
+        others = NormalLikelihoods(likelihoods.mean[rest], likelihoods.precision[rest])
+        seen = spreads(others, prior)
+        sd = np.sqrt(1 / likelihoods.precision[one] + seen.spread**2 + seen.variance)
+        z = (likelihoods.mean[one] - seen.mean) / sd
+        # From the nearer tail, which keeps its digits.
+        tails = [np.sum(seen.probability * stats.norm.cdf(side * z)) for side in (1, -1)]
+        p[one] = 2 * min(tails)
+    return p

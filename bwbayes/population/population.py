@@ -1,0 +1,379 @@
+"""Population mean and spread of each parameter, shrunk specimens, and the specimen to come.
+
+Each parameter by itself: specimens' coordinates y are drawn from N(μ, τ²), of which little is known
+beforehand. The posterior of μ and τ comes from the draws of the specimens' own posteriors, with
+their prior divided out,
+
+    p(data of i | μ, τ) ∝ 1/S Σ_s N(y_is; μ, τ²) / π_i(y_is),
+
+so nothing is sampled again. Populations are proposed from the closed form for normal likelihoods
+(:mod:`bwbayes.population.normal`), then, if need be, from a Student distribution around what that
+came to, and reweighted. Pareto k says where that is not to be trusted: a specimen whose draws do
+not reach where the population has it (k above 0.7, or few effective draws) is taken for normal, and
+so are all if the populations' own weights fail.
+
+Source: D. Lunn et al., Fully Bayesian hierarchical modelling in two stages, with application to
+meta-analysis, J. R. Stat. Soc. C 62 (2013) 551; A. Vehtari et al., Pareto smoothed importance
+sampling, J. Mach. Learn. Res. 25 (2024).
+"""
+
+# mypy: allow-untyped-calls
+# arviz_stats says that it has types, but its functions have none.
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from scipy import stats
+from scipy.special import logsumexp
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
+from bwbayes.population.specimen import Specimen, likelihoods, shared
+
+__all__ = ["FEWEST", "Among", "Population", "Spread", "population"]
+
+# Specimens below which nothing is said of a spread.
+FEWEST = 3
+
+# Populations that are drawn, and draws of each shrunk specimen.
+DRAWS = 1000
+# Of how many populations one serves as a prior of a specimen; so many are enough for that.
+EVERY = 4
+
+LARGEST_PARETO_K = 0.7
+# Effective draws of a specimen's weights that its own draws must keep.
+LEAST_EFFECTIVE = 50
+
+# Rounds of proposals, and the degrees of freedom of those after the first.
+ROUNDS = 4
+DEGREES = 5
+
+# Probability of a single false alarm among all specimens and parameters of a sound campaign.
+FALSE_ALARM = 0.05
+
+
+@dataclass(frozen=True)
+class Among:
+    """One specimen's parameter among the others.
+
+    ``lower``, ``median`` and ``upper`` are the 95 % interval with the population for a prior, and
+    ``own_lower``, ``own_median``, ``own_upper`` that of the record alone, both in the parameter's
+    unit. ``p`` is how likely the record would be as far off, either way, from the population that
+    all others show; ``outlier`` whether that is less than chance makes likely anywhere in the
+    campaign. ``pareto_k`` judges the reweighting, and ``normal`` tells whether the specimen's
+    likelihood was taken for normal because of it.
+    """
+
+    lower: float
+    median: float
+    upper: float
+    own_lower: float
+    own_median: float
+    own_upper: float
+    p: float
+    outlier: bool
+    pareto_k: float
+    normal: bool
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A population's distribution of one parameter.
+
+    Parameters
+    ----------
+    name, unit
+        The parameter's.
+    logarithmic
+        Whether the population is normal in the logarithm. Then ``mean`` is its median and
+        ``spread`` the sd of the logarithm, which is the relative one where it is small.
+    mean, spread
+        (DRAWS,) posterior draws, in the parameter's unit; of a logarithm, the spread is a number.
+    new
+        (DRAWS,) the parameter of a specimen that was not measured.
+    specimens
+        What is said of each, by name.
+    pareto_k
+        Of the populations' own weights.
+    """
+
+    name: str
+    unit: str
+    logarithmic: bool
+    mean: FloatArray
+    spread: FloatArray
+    new: FloatArray
+    specimens: Mapping[str, Among]
+    pareto_k: float
+
+    def numbers(self) -> dict[str, object]:
+        """Return it as ``campaign.json`` holds it."""
+        return {
+            "unit": self.unit,
+            "logarithmic": self.logarithmic,
+            "mean": _interval(self.mean),
+            "spread": _interval(self.spread),
+            "new_specimen": _interval(self.new),
+            "pareto_k": self.pareto_k,
+            "outliers": self.outliers,
+        }
+
+    @property
+    def outliers(self) -> list[str]:
+        """Names of the specimens that lie off the population."""
+        return [name for name, one in self.specimens.items() if one.outlier]
+
+
+@dataclass(frozen=True)
+class Population:
+    """What specimens say together: a :class:`Spread` for each parameter, by its name."""
+
+    names: tuple[str, ...]
+    parameters: Mapping[str, Spread]
+
+    def summary(self) -> dict[str, object]:
+        """Return it as ``campaign.json`` holds it."""
+        return {name: one.numbers() for name, one in self.parameters.items()}
+
+    def to_pandas(self) -> object:
+        """Return a pandas.DataFrame, a row for each parameter."""
+        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
+
+        rows = {}
+        for name, one in self.parameters.items():
+            rows[name] = {
+                f"{what}_{key}": value
+                for what, values in (
+                    ("mean", one.mean),
+                    ("spread", one.spread),
+                    ("new", one.new),
+                )
+                for key, value in _interval(values).items()
+            } | {"unit": one.unit, "outliers": ", ".join(one.outliers)}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def population(specimens: Sequence[Specimen], generator: np.random.Generator) -> Population:
+    """Return what specimens say together of the parameters that all of them have.
+
+    Beforehand the population's mean is known as well as a specimen's parameter is under its prior,
+    and its spread is half-normal, as wide as that: μ ~ N(m₀, s₀²), τ ~ |N(0, s₀²)|.
+
+    Raises
+    ------
+    InputError
+        Fewer than ``FEWEST`` specimens, or no parameter that all have.
+    """
+    every = list(specimens)
+    if len(every) < FEWEST:
+        raise InputError(f"population: needs {FEWEST} specimens or more; there are {len(every)}")
+    names = shared(every)
+    if not names:
+        raise InputError("population: the specimens have no parameter of the actuator in common")
+    tests = len(every) * len(names)
+    return Population(
+        tuple(one.name for one in every),
+        {name: _spread(every, name, generator, tests) for name in names},
+    )
+
+
+def _spread(
+    specimens: list[Specimen], name: str, generator: np.random.Generator, tests: int
+) -> Spread:
+    """Find the population of one parameter."""
+    columns = [one.names.index(name) for one in specimens]
+    first, at = specimens[0], columns[0]
+    logarithmic = bool(first.logarithmic[at])
+    pairs = list(zip(specimens, columns, strict=True))
+    width = float(np.mean([one.prior_sd[i] for one, i in pairs]))
+    prior = Hyperprior(float(np.mean([one.prior_mean[i] for one, i in pairs])), width, width)
+    normal = likelihoods(specimens, name)
+    draws = [(one.draws[:, i], one.log_prior[:, i]) for one, i in pairs]
+    reweighted = _reweighted(draws, normal, prior, generator)
+    p = left_out(normal, prior)
+    scale = np.exp if logarithmic else _same
+    among = {}
+    for i, (one, k, taken) in enumerate(
+        zip(specimens, reweighted.shapes, reweighted.normal, strict=True)
+    ):
+        lower, median, upper = scale(
+            np.quantile(reweighted.shrunk[i], [0.025, 0.5, 0.975])
+        ).tolist()
+        own = scale(np.quantile(draws[i][0], [0.025, 0.5, 0.975])).tolist()
+        among[one.name] = Among(
+            lower,
+            median,
+            upper,
+            own_lower=own[0],
+            own_median=own[1],
+            own_upper=own[2],
+            p=float(p[i]),
+            outlier=bool(p[i] * tests < FALSE_ALARM),
+            pareto_k=float(k),
+            normal=bool(taken),
+        )
+    new = reweighted.mean + reweighted.spread * generator.standard_normal(DRAWS)
+    return Spread(
+        name,
+        first.units[at],
+        logarithmic,
+        scale(reweighted.mean),
+        reweighted.spread,
+        scale(new),
+        among,
+        reweighted.pareto_k,
+    )
+
+
+@dataclass(frozen=True)
+class _Reweighted:
+    """Draws of populations and of shrunk specimens (specimens, DRAWS), and what judges them."""
+
+    mean: FloatArray
+    spread: FloatArray
+    shrunk: FloatArray
+    shapes: FloatArray
+    normal: BoolArray
+    pareto_k: float
+
+
+def _reweighted(
+    draws: Sequence[tuple[FloatArray, FloatArray]],
+    normal: NormalLikelihoods,
+    prior: Hyperprior,
+    generator: np.random.Generator,
+) -> _Reweighted:
+    """Propose populations, weigh them by the specimens' draws, and shrink the specimens."""
+    seen = spreads(normal, prior)
+    mean, spread = seen.draw(generator, DRAWS)
+    shapes, taken = _judged(draws, float(np.median(mean)), float(np.median(spread)))
+    proposed = prior.log_density(mean, spread) + np.sum(normal.marginal(mean, spread), axis=0)
+    weights, k = np.zeros(DRAWS), 0.0
+    for _ in range(ROUNDS):
+        target = prior.log_density(mean, spread)
+        target += np.sum(_marginals(draws, taken, normal, mean, spread), axis=0)
+        weights, k = _smoothed(target - proposed)
+        if k <= LARGEST_PARETO_K:
+            break
+        mean, spread, proposed = _around(mean, spread, weights, generator)
+    else:
+        # Nothing that reweights can be trusted: the normal likelihoods alone.
+        mean, spread = seen.draw(generator, DRAWS)
+        taken, weights = np.ones(len(draws), dtype=np.bool_), np.full(DRAWS, -np.log(DRAWS))
+    chosen = generator.choice(DRAWS, DRAWS, p=np.exp(weights))
+    mean, spread = mean[chosen], spread[chosen]
+    shrunk = [
+        normal.shrunk(i, mean, spread, generator)
+        if taken[i]
+        else _resampled(y, log_prior, mean, spread, generator)
+        for i, (y, log_prior) in enumerate(draws)
+    ]
+    return _Reweighted(mean, spread, np.stack(shrunk), shapes, taken, k)
+
+
+def _judged(
+    draws: Sequence[tuple[FloatArray, FloatArray]], mean: float, spread: float
+) -> tuple[FloatArray, BoolArray]:
+    """Pareto k of each specimen's draws reweighted to a typical population; and which fail."""
+    shapes = np.empty(len(draws))
+    effective = np.empty(len(draws))
+    for i, (y, log_prior) in enumerate(draws):
+        logs = _log_normal(y, mean, spread) - log_prior
+        smoothed, shapes[i] = _smoothed(logs)
+        effective[i] = np.exp(-logsumexp(2 * smoothed))
+    return shapes, ~((shapes <= LARGEST_PARETO_K) & (effective >= LEAST_EFFECTIVE))
+
+
+def _marginals(
+    draws: Sequence[tuple[FloatArray, FloatArray]],
+    taken: BoolArray,
+    normal: NormalLikelihoods,
+    mean: FloatArray,
+    spread: FloatArray,
+) -> FloatArray:
+    """Log p(data of i | μ, τ), (specimens, n), each up to a constant of its own."""
+    logs = normal.marginal(mean, spread)
+    for i, (y, log_prior) in enumerate(draws):
+        if not taken[i]:
+            weights, largest = _weights(y, log_prior, mean, spread)
+            logs[i] = largest + np.log(np.sum(weights, axis=0))
+    return logs
+
+
+def _weights(
+    y: FloatArray, log_prior: FloatArray, mean: FloatArray, spread: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """N(y_s; μ, τ²)/π(y_s), (draws, n), over its largest of each population, and log of that."""
+    weights = y[:, np.newaxis] - mean
+    weights /= spread
+    weights *= weights
+    weights *= -0.5
+    weights -= log_prior[:, np.newaxis]
+    largest = np.max(weights, axis=0)
+    weights -= largest
+    np.exp(weights, out=weights)
+    return weights, largest - np.log(spread)
+
+
+def _resampled(
+    y: FloatArray,
+    log_prior: FloatArray,
+    mean: FloatArray,
+    spread: FloatArray,
+    generator: np.random.Generator,
+) -> FloatArray:
+    """Draw a specimen's coordinate with populations (n,) for its prior, from its own draws."""
+    some = slice(None, None, EVERY)
+    each, _ = _weights(y, log_prior, mean[some], spread[some])
+    weights = np.mean(each / np.sum(each, axis=0), axis=1)
+    drawn: FloatArray = generator.choice(y, DRAWS, p=weights / np.sum(weights))
+    return drawn
+
+
+def _around(
+    mean: FloatArray, spread: FloatArray, weights: FloatArray, generator: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Propose populations around weighted ones: means, spreads, log density, (DRAWS,) each.
+
+    A Student distribution of μ and log τ with the weighted moments.
+    """
+    places = np.stack([mean, np.log(spread)], axis=1)
+    w = np.exp(weights)
+    centre = w @ places
+    away = places - centre
+    covariance = (away * w[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
+    student = stats.multivariate_t(centre, covariance, df=DEGREES, seed=generator)
+    drawn = student.rvs(DRAWS)
+    # The density of τ is that of log τ over τ.
+    return drawn[:, 0], np.exp(drawn[:, 1]), student.logpdf(drawn) - drawn[:, 1]
+
+
+def _smoothed(logs: FloatArray) -> tuple[FloatArray, float]:
+    """Pareto-smoothed log weights (n,), their sum one, and their k."""
+    logs = logs - logsumexp(logs)
+    if not np.isfinite(logs).all() or np.ptp(logs) < 1e-9:
+        # Equal weights have no tail; what is not finite is not to be trusted.
+        k = 0.0 if np.isfinite(logs).all() else np.inf
+        return np.full(logs.size, -np.log(logs.size)), k
+    smoothed, k = array_stats.psislw(-logs)
+    smoothed = np.asarray(smoothed, dtype=np.float64)
+    return smoothed - logsumexp(smoothed), float(k)
+
+
+def _log_normal(y: FloatArray, mean: FloatArray | float, spread: FloatArray | float) -> FloatArray:
+    logs: FloatArray = -0.5 * ((y - mean) / spread) ** 2 - np.log(spread)
+    return logs
+
+
+def _same(values: FloatArray) -> FloatArray:
+    return values
+
+
+def _interval(values: FloatArray) -> dict[str, float]:
+    lower, median, upper = np.quantile(values, [0.025, 0.5, 0.975])
+    return {"lower_95": float(lower), "median": float(median), "upper_95": float(upper)}

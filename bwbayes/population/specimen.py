@@ -1,0 +1,214 @@
+"""One specimen as a population sees it: draws of its parameters, and the prior to divide out.
+
+A population is normal in coordinates without a scale of their own: the logarithm of a parameter
+that lies above zero, any other parameter as it is. Each specimen was fitted by itself, with a prior
+of its own record's ranges perhaps; that prior is known, so what the record says remains when it is
+divided out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Posterior
+from bwbayes.population.normal import NormalLikelihoods
+
+__all__ = ["Specimen", "likelihoods", "shared", "specimen_of"]
+
+# Draws of a specimen that are kept.
+DRAWS = 1000
+
+# Places along a parameter, and draws of all others at each, that tell what the constraints cut off.
+PLACES, OTHERS = 33, 400
+
+# Draws of the cut prior that its moments come from.
+MOMENTS = 2000
+
+# Below this part of the prior's precision a record tells nothing of a parameter.
+LEAST = 0.02
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """What is kept of one specimen's posterior.
+
+    Parameters
+    ----------
+    name
+        The specimen's name.
+    names, units
+        The actuator's free parameters, and their units.
+    logarithmic
+        (parameters,) whether the coordinate is the logarithm.
+    draws
+        (draws, parameters) coordinates y of posterior draws: log x, or x.
+    log_prior
+        (draws, parameters) log marginal density of each coordinate under the specimen's prior, up
+        to a constant.
+    prior_mean, prior_sd
+        (parameters,) of each coordinate under the prior.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    logarithmic: BoolArray
+    draws: FloatArray
+    log_prior: FloatArray
+    prior_mean: FloatArray
+    prior_sd: FloatArray
+
+    def save(self, path: Path) -> None:
+        """Write it to an .npz file, whole or not at all."""
+        draft = path.with_suffix(".partial")
+        with draft.open("wb") as file:
+            np.savez(
+                file,
+                names=np.array(self.names),
+                units=np.array(self.units),
+                logarithmic=self.logarithmic,
+                draws=self.draws,
+                log_prior=self.log_prior,
+                prior_mean=self.prior_mean,
+                prior_sd=self.prior_sd,
+            )
+        draft.replace(path)
+
+    @classmethod
+    def load(cls, name: str, path: Path) -> Specimen:
+        """Read it back."""
+        with np.load(path) as file:
+            return cls(
+                name,
+                tuple(file["names"].tolist()),
+                tuple(file["units"].tolist()),
+                file["logarithmic"],
+                file["draws"],
+                file["log_prior"],
+                file["prior_mean"],
+                file["prior_sd"],
+            )
+
+
+def specimen_of(
+    name: str, posterior: Posterior, draws: FloatArray, generator: np.random.Generator
+) -> Specimen:
+    """Keep of a posterior what a population needs.
+
+    Parameters
+    ----------
+    name
+        The specimen's name.
+    posterior
+        What was sampled.
+    draws
+        (draws, free) in their own units; ``DRAWS`` of them are chosen.
+    generator
+        Chooses them, and draws of the prior.
+    """
+    prior = posterior.prior
+    table = posterior.table
+    own = {
+        column.name
+        for column in table.layout
+        if column.name in table.physical and column.declaration.scope == "actuator"
+    }
+    columns = [i for i, p in enumerate(prior.free) if p.name in own]
+    chosen = draws
+    if len(draws) > DRAWS:
+        chosen = draws[generator.choice(len(draws), DRAWS, replace=False)]
+    before = prior.draw(generator, MOMENTS)
+    logarithmic = np.array([_is_logarithmic(prior.free[i]) for i in columns], dtype=np.bool_)
+    y = _coordinates(chosen[:, columns], logarithmic)
+    known = _coordinates(before[:, columns], logarithmic)
+    log_prior = [_log_prior(prior, i, chosen[:, i], generator) for i in columns]
+    log_prior = [
+        # dx/dy = x of the logarithm.
+        density + (y[:, n] if logarithmic[n] else 0.0)
+        for n, density in enumerate(log_prior)
+    ]
+    return Specimen(
+        name,
+        tuple(prior.free[i].name for i in columns),
+        tuple(prior.free[i].unit for i in columns),
+        logarithmic,
+        y,
+        np.stack(log_prior, axis=1) if columns else np.empty((len(y), 0)),
+        np.mean(known, axis=0),
+        np.std(known, axis=0),
+    )
+
+
+def likelihoods(specimens: list[Specimen], name: str) -> NormalLikelihoods:
+    """Return normal likelihoods of one parameter: each posterior's less its prior's.
+
+    With the moments of posterior and prior, 1/s² = 1/v₁ − 1/v₀ and m/s² = m₁/v₁ − m₀/v₀.
+    """
+    means, precisions = [], []
+    for one in specimens:
+        i = one.names.index(name)
+        after, before = np.var(one.draws[:, i]) ** -1.0, one.prior_sd[i] ** -2.0
+        precision = after - before
+        if precision < LEAST * before:
+            means.append(float(one.prior_mean[i]))
+            precisions.append(0.0)
+            continue
+        pull = np.mean(one.draws[:, i]) * after - one.prior_mean[i] * before
+        means.append(float(pull / precision))
+        precisions.append(float(precision))
+    return NormalLikelihoods(np.array(means), np.array(precisions))
+
+
+def shared(specimens: list[Specimen]) -> tuple[str, ...]:
+    """Return the parameters that all specimens have, in the same coordinate."""
+    first, *others = specimens
+    logarithmic = dict(zip(first.names, first.logarithmic, strict=True))
+    return tuple(
+        name
+        for name in first.names
+        if all(
+            name in one.names and one.logarithmic[one.names.index(name)] == logarithmic[name]
+            for one in others
+        )
+    )
+
+
+def _is_logarithmic(parameter: Parameter) -> bool:
+    return parameter.positive
+
+
+def _coordinates(values: FloatArray, logarithmic: BoolArray) -> FloatArray:
+    return np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+
+
+def _log_prior(
+    prior: JointPrior, column: int, x: FloatArray, generator: np.random.Generator
+) -> FloatArray:
+    """Log marginal density (draws,) of one parameter under the cut prior, up to a constant.
+
+    Its own prior's, times the part of all others' prior that the constraints leave at x: by draws
+    at some quantiles of x, and on straight lines between those.
+    """
+    own = prior.free[column].prior
+    assert own is not None
+    others = np.stack([_single(p, generator) for p in prior.free], axis=1)
+    places = np.quantile(x, np.linspace(0, 1, PLACES))
+    tried = np.tile(others, (PLACES, 1))
+    tried[:, column] = np.repeat(places, OTHERS)
+    inside = np.isfinite(prior.log_density(tried)).reshape(PLACES, OTHERS)
+    # A place where draws of the posterior lie has not nothing.
+    left = np.maximum(np.mean(inside, axis=1), 0.5 / OTHERS)
+    density: FloatArray = own.frozen.logpdf(x) + np.interp(x, places, np.log(left))
+    return density
+
+
+def _single(parameter: Parameter, generator: np.random.Generator) -> FloatArray:
+    """Draw from a parameter's own prior, whatever the others are, (OTHERS,)."""
+    assert parameter.prior is not None
+    uniform = generator.uniform(*parameter.mass_between, OTHERS)
+    return np.asarray(parameter.prior.frozen.ppf(uniform), dtype=np.float64)

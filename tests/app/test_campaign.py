@@ -1,0 +1,280 @@
+"""A campaign: every record in the table, however it ended; interrupted, continued, added to."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import subprocess
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bwbayes as bw
+from bwbayes.app.config.config import parse
+from bwbayes.app.jobs import campaign as module
+from bwbayes.app.jobs.campaign import carry_on, config_text, start
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.campaign_result import CampaignResult, Row
+from bwbayes.app.running.run import go_on
+from bwbayes.app.running.run import start as begin
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.results.result import summary
+from tests.app import small
+from tests.app.specimens import CONFIG, POPULATION, record, specimens
+
+COUNT = 4
+FILES = ("campaign.json", "campaign.csv", "campaign.html", "figures/parameters.png")
+BROKEN = "time_s,voltage_V,displacement_um\n0,0,x\n"
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with four records, one that is broken, and a config; for reading."""
+    path = tmp_path_factory.mktemp("given")
+    specimens(path / "records", COUNT)
+    (path / "records/broken.csv").write_text(BROKEN)
+    (path / "records/notes.md").write_text("no record")
+    (path / "small.toml").write_text(CONFIG)
+    return path
+
+
+def begun(given: Path, path: Path, **options: bool) -> CampaignFolder:
+    config = config_text(given / "small.toml")
+    return start(given / "records", config, given, path, **{"pictures": False, **options})
+
+
+def ended(folder: CampaignFolder, **options: Any) -> CampaignResult:
+    return carry_on(folder, small.quiet(), **{"workers": 1, **options})
+
+
+@pytest.fixture(scope="module")
+def whole(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the campaign made in one piece; for reading."""
+    path = tmp_path_factory.mktemp("whole") / "batch"
+    ended(begun(given, path))
+    return path
+
+
+def rows(path: Path) -> dict[str, dict[str, str]]:
+    with (path / "campaign.csv").open(encoding="utf-8") as file:
+        return {row["record"]: row for row in csv.DictReader(file)}
+
+
+def assert_same_end(expected: Path, got: Path) -> None:
+    for name in FILES:
+        assert (expected / name).read_bytes() == (got / name).read_bytes(), name
+
+
+def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
+    table = rows(whole)
+    assert ["broken", "s000", "s001", "s002", "s003"] == list(table)
+    assert "refused" == table["broken"]["status"]
+    assert "broken.csv:2: displacement_um: 'x' is not a number" in table["broken"]["reason"]
+    summary = json.loads((whole / "campaign.json").read_text())
+    assert {"refused": 1, "not converged": 0, "does not hold": 0, "done": COUNT} == (
+        summary["counts"]
+    )
+    for name in list(table)[1:]:
+        own = json.loads((whole / f"records/{name}/summary.json").read_text())
+        for key in ("mean", "lower_95"):
+            number = own["parameters"]["d"][key]
+            assert float(table[name][f"d_{key}_um/V"]) == pytest.approx(number, rel=1e-6)
+            assert number == summary["records"][name]["parameters"]["d"][key]
+
+
+def test_a_records_run_is_what_the_run_command_makes(
+    given: Path, whole: Path, tmp_path: Path
+) -> None:
+    file = given / "records/s000.csv"
+    text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
+    alone = go_on(
+        begin(parse(text, "alone"), given, tmp_path / "alone"),
+        small.quiet(),
+        workers=1,
+        files=False,
+    )
+    own = json.loads((whole / "records/s000/summary.json").read_text())
+    for key, value in json.loads(json.dumps(summary(alone.result))).items():
+        assert value == own[key], key
+
+
+def test_the_command_says_which_records_were_refused_and_ends_with_2(
+    given: Path, whole: Path, tmp_path: Path
+) -> None:
+    """Two workers in processes end in the same bytes as one worker in this process."""
+    arguments = ["records", "--config", "small.toml", "--no-pictures", "--workers", "2"]
+    out = tmp_path / "batch"
+    done = subprocess.run(
+        small.command("campaign", *arguments, "--out", out),
+        cwd=given,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert 2 == done.returncode, done.stderr
+    assert "REFUSED: broken: broken.csv:2:" in done.stderr
+    assert "5 records: 1 refused, 4 done" in done.stdout
+    assert_same_end(whole, out)
+
+
+def test_a_finished_campaign_fits_nothing_again(
+    given: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(whole, tmp_path / "batch")
+    asked: list[list[str]] = []
+    fit = module._fit
+
+    def noted(folder: CampaignFolder, origin: Any, missing: list[Path], *rest: Any) -> Any:
+        asked.append([path.stem for path in missing])
+        return fit(folder, origin, missing, *rest)
+
+    monkeypatch.setattr(module, "_fit", noted)
+    ended(begun(given, tmp_path / "batch"))
+    assert [["broken"]] == asked
+    assert_same_end(whole, tmp_path / "batch")
+
+
+def test_half_a_line_of_the_journal_is_done_again(whole: Path, tmp_path: Path) -> None:
+    folder = CampaignFolder(tmp_path / "batch")
+    shutil.copytree(whole, folder.path)
+    content = folder.journal.read_bytes()
+    folder.journal.write_bytes(content[: content.rfind(b"\n", 0, -1) + 30])
+    assert COUNT - 1 == len(folder.finished())
+    ended(folder)
+    assert COUNT == len(folder.finished())
+    assert_same_end(whole, folder.path)
+
+
+def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_path: Path) -> None:
+    shutil.copytree(given, tmp_path / "given")
+    folder = begun(tmp_path / "given", tmp_path / "batch")
+    first = ended(folder)
+    records = tmp_path / "given/records"
+    bw.write_record(record(17), records / "new.csv")
+    bw.write_record(record(18), records / "s001.csv")
+    shutil.copyfile(records / "s000.csv", records / "broken.csv")
+    (records / "s003.csv").unlink()
+    before = {path: path.stat().st_mtime_ns for path in folder.path.glob("records/*/chain.h5")}
+    second = ended(folder)
+    assert 0 == second.exit_status
+    assert ["broken", "new", "s000", "s001", "s002"] == [row.name for row in second.rows]
+    kept = [path.parent.name for path in before if path.stat().st_mtime_ns == before[path]]
+    assert ["s000", "s002", "s003"] == sorted(kept)
+    means = [
+        {r.name: r.parameters["d"]["mean"] for r in c.rows if r.parameters} for c in (first, second)
+    ]
+    assert means[0]["s001"] != means[1]["s001"]
+    assert means[1]["s000"] == means[1]["broken"]
+
+
+def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_path: Path) -> None:
+    """One that has not converged says how to go on, and counts once it has."""
+    text = CONFIG.replace("ess = 200", "ess = 200\nsteps = 40")
+    (tmp_path / "short.toml").write_text(text)
+    (tmp_path / "records").mkdir()
+    shutil.copyfile(given / "records/s000.csv", tmp_path / "records/s000.csv")
+    config = config_text(tmp_path / "short.toml")
+    folder = start(tmp_path / "records", config, tmp_path, tmp_path / "batch", pictures=False)
+    (row,) = ended(folder).rows
+    assert "not converged" == row.status
+    assert "budget of 40 steps used up" in row.reason
+    assert "specimen" not in str(list(folder.run("s000").iterdir()))
+    arguments = re.findall(r"`bwbayes (resume .*)`", row.reason)[0].split()
+    subprocess.run(small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True)
+    again = ended(folder)
+    assert ("done", 0) == (again.rows[0].status, again.exit_status)
+
+
+@pytest.mark.parametrize(
+    ("status", "endings"),
+    [
+        (0, ["done"]),
+        (3, ["done", "does not hold"]),
+        (4, ["done", "does not hold", "not converged"]),
+        (2, ["refused", "done", "does not hold", "not converged"]),
+    ],
+)
+def test_the_worst_ending_is_the_exit_status(status: int, endings: list[str]) -> None:
+    rows = tuple(Row(ending, "x.csv", ending, "", {}) for ending in endings)
+    assert status == CampaignResult(rows, None).exit_status
+
+
+def test_another_config_or_folder_is_refused(given: Path, whole: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text(CONFIG.replace("seed = 3", "seed = 4"))
+    with pytest.raises(InputError, match="is a campaign of another config or other records"):
+        start(given / "records", config_text(tmp_path / "other.toml"), given, whole, pictures=False)
+    with pytest.raises(InputError, match="no campaign here"):
+        start(given / "records", "", given, given)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="has no record"):
+        start(tmp_path / "empty", "", given, tmp_path / "batch")
+
+
+def test_files_that_share_a_name_are_refused_and_others_fitted(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+    specimens(records, 1)
+    for name in ("twice.csv", "twice.h5"):
+        bw.write_record(record(5), records / name)
+    (tmp_path / "small.toml").write_text(CONFIG)
+    config = config_text(tmp_path / "small.toml")
+    folder = start(records, config, tmp_path, tmp_path / "batch", pictures=False)
+    by_file = {row.file: row.status for row in ended(folder).rows}
+    assert {"s000.csv": "done", "twice.csv": "refused", "twice.h5": "refused"} == by_file
+
+
+def test_the_population_is_that_of_the_truths(whole: Path) -> None:
+    told = json.loads((whole / "campaign.json").read_text())["population"]
+    assert {"d", "alpha"} == set(told)
+    for name, (median, spread) in POPULATION.items():
+        assert told[name]["mean"]["lower_95"] < median < told[name]["mean"]["upper_95"]
+        assert told[name]["spread"]["lower_95"] < spread < told[name]["spread"]["upper_95"]
+        assert told[name]["logarithmic"]
+
+
+def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
+    page = (whole / "campaign.html").read_text(encoding="utf-8")
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
+    assert 1 == page.count("data:image/png;base64,")
+    for text in ("broken.csv:2", "1 refused", 'data-name="alpha"', "Taken for normal"):
+        assert text in page
+    row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
+    assert "<b>x" not in module.render("x", CampaignResult((row,), None, "few"), {})
+
+
+def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> None:
+    records = {f"r{i}": record(i) for i in range(3)}
+    keys = {"dynamics": "none", "noise": "white", "seed": 3, "ess": 200, "walkers": 12}
+    keys |= {"block": 20, "pilot_steps": 60, "parameters": tomllib.loads(CONFIG)["parameters"]}
+    made = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
+    assert ["r0", "r1", "r2"] == list(made.table.index)
+    assert {"d", "alpha"} == set(made.population.parameters)
+    assert {"d", "alpha"} == set(made.population.to_pandas().index)  # type: ignore[attr-defined]
+    assert ({}, {}) == (made.short, made.outliers)
+    assert made.fit("r1").converged
+    # A specimen that was not measured is less sure than one that was.
+    planned = replace(record(9), displacement=None)
+    bands = made.predict(planned, from_rest=True)
+    own = made.fit("r1").predict(planned, from_rest=True)
+    wide, narrow = (
+        np.mean(b.upper["parameter", 95] - b.lower["parameter", 95]) for b in (bands, own)
+    )
+    assert wide > 5 * narrow
+    assert "3 records: 3 done" == repr(made)
+    assert made.plot().axes
+
+
+def test_python_warns_of_what_is_short(tmp_path: Path) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records/broken.csv").write_text(BROKEN)
+    with pytest.warns(InputWarning, match="broken: refused: broken.csv:2"):
+        made = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
+    with pytest.raises(InputError, match="no population: a population needs 3 records or more"):
+        _ = made.population
+    with pytest.raises(InputError, match="either config or keys"):
+        bw.campaign(tmp_path / "records", config="x.toml", dynamics="none")

@@ -1,0 +1,1 @@
+"""Tests of bwbayes.comparison: which model, and what can be told apart."""

@@ -1,0 +1,158 @@
+"""The log evidence is the integral that it stands for.
+
+Held against the closed form where the model is linear and Gaussian, against dynesty's nested
+sampling of the plain posterior (``tests/reference``), and against integrals over a grid.
+"""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import integrate, stats
+
+from bwbayes.app.config.config import load
+from bwbayes.app.problem.problem import generator, resolve
+from bwbayes.app.running.workers import one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
+from bwbayes.inference import pointfit
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.distributions import Distribution
+from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, log_densities, sample
+from tests.inference.test_solvable import (
+    TRUTH,
+    WINDOWS,
+    covariance,
+    every_case,
+    linear_posterior,
+    prior_moments,
+)
+from tests.reference.plain import FOLDER
+
+PLAN = SamplingPlan(ess=1000, walkers=24, block=25)
+
+
+def sampled(posterior: Posterior, plan: SamplingPlan = PLAN) -> tuple[FloatArray, FloatArray]:
+    """Draw by the normal path; draws and their log densities, nats."""
+    source = np.random.default_rng(1)
+    with ThreadPoolExecutor(1) as executor, one_thread():
+        chain = first_chain(posterior, pointfit.fit(posterior, source), plan, source)
+        outcome = sample(posterior, plan, chain, executor)
+    assert outcome.converged, outcome.stop_reason
+    return draws(posterior, chain), log_densities(chain)
+
+
+def estimated(posterior: Posterior, plan: SamplingPlan = PLAN, seed: int = 2) -> Evidence:
+    return evidence(posterior, *sampled(posterior, plan), np.random.default_rng(seed))
+
+
+def closed_form(posterior: Posterior) -> float:
+    """Log N(y; G m, C + G P Gᵀ), with the model's columns G and the prior N(m, P)."""
+    mean, sd = prior_moments(posterior)
+    base = posterior.prior.theta(mean[np.newaxis])
+    moved = posterior.prior.theta(mean + np.eye(mean.size))
+    rows = np.concatenate([np.arange(window.start, window.stop) for window in WINDOWS])
+    level = posterior.simulate(base, rows)[0]
+    design = (posterior.simulate(moved, rows) - level).T
+    known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
+    noise = covariance(known, posterior.only.voltage.size)[np.ix_(rows, rows)]
+    whole = noise + (design * sd**2) @ design.T
+    return float(stats.multivariate_normal(level, whole).logpdf(posterior.only.displacement[rows]))
+
+
+@every_case
+def test_a_linear_model_has_the_closed_form(free: tuple[str, ...], noise: str) -> None:
+    """Within 0.1 nats, and within five of its errors: one in a million by chance."""
+    posterior = linear_posterior(free, noise)
+    found, known = estimated(posterior), closed_form(posterior)
+    assert abs(found.log_evidence - known) < 0.1
+    assert abs(found.log_evidence - known) < 5 * found.error
+    assert found.error < 0.02
+    # The twin: a prior that was forgotten would cost more than that.
+    wrong = found.log_evidence + 0.5 * len(free) * np.log(2 * np.pi)
+    assert abs(wrong - known) > 1
+
+
+def test_the_error_is_that_of_repeated_estimates() -> None:
+    """Sixteen estimates from as many halves of draws; a χ² with 15 degrees of freedom."""
+    posterior = linear_posterior(("d", "alpha", "offset"), "white")
+    plan = replace(PLAN, ensembles=32, walkers=8, ess=4000)
+    every, density = sampled(posterior, plan)
+    known = closed_form(posterior)
+    scores = []
+    for i in range(0, 32, 2):
+        found = evidence(
+            posterior, every[:, i : i + 2], density[:, i : i + 2], np.random.default_rng(i)
+        )
+        scores.append((found.log_evidence - known) / found.error)
+    # Outside of these with a probability of one in 10,000 where the errors are right.
+    assert 2.6 < np.sum(np.square(scores)) < 44.3
+
+
+def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
+    """Two normal priors of which a constraint leaves x < y and x + y > 0."""
+    posterior = linear_posterior(("d", "alpha"), "white")
+    d, alpha = (p for p in posterior.prior.free)
+    wide = Distribution("normal", {"mean": 0.5, "sd": 0.3})
+    other = Distribution("normal", {"mean": 0.4, "sd": 0.2})
+    prior = JointPrior(
+        [replace(d, prior=wide), replace(alpha, prior=other)],
+        posterior.only.actuator.hysteresis.holds,
+    )
+    mass, error = log_prior_mass(prior, np.random.default_rng(3))
+
+    def density(y: float, x: float) -> float:
+        return float(wide.frozen.pdf(x) * other.frozen.pdf(y))
+
+    known, _ = integrate.dblquad(density, 0, 3, 0, lambda x: x)
+    assert abs(mass - np.log(known)) < 5 * error + 1e-9
+    assert 0 < error < 0.01
+
+
+def test_priors_without_constraints_have_all_their_mass() -> None:
+    posterior = linear_posterior(("offset",), "white")
+    assert log_prior_mass(posterior.prior, np.random.default_rng(1)) == (0.0, 0.0)
+    assert TRUTH["alpha"] < TRUTH["d"]
+
+
+def test_the_bridge_between_two_normals_is_exact() -> None:
+    """Of p = 7 N(1, 1), q = N(0, 1.5²): log r = log 7 within five errors, and a small one."""
+    source = np.random.default_rng(4)
+    p, q = stats.norm(1, 1), stats.norm(0, 1.5)
+    x, y = p.rvs((500, 4, 8), source), q.rvs(10_000, source)
+    found, effective = bridge(
+        np.log(7) + p.logpdf(x) - q.logpdf(x), np.log(7) + p.logpdf(y) - q.logpdf(y)
+    )
+    assert abs(found.log_integral - np.log(7)) < 5 * found.error
+    assert found.error < 0.02
+    assert effective > 8000
+
+
+def test_too_few_draws_are_not_told() -> None:
+    posterior = linear_posterior(("d", "offset"), "white")
+    once = np.broadcast_to(prior_moments(posterior)[0], (3, 4, 2, 2))
+    found = evidence(posterior, once, np.zeros((3, 4, 2)), np.random.default_rng(1))
+    assert np.isnan(found.log_evidence)
+    assert np.isinf(found.error)
+
+
+def reference(name: str) -> Any:
+    return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def test_nested_sampling_agrees() -> None:
+    """Of dynesty, on the virtual stand's record, within 0.1 nats.
+
+    Its prior is not divided by the mass that the constraints leave.
+    """
+    problem = resolve(load(FOLDER / "virtual.toml"), FOLDER)
+    plan = replace(problem.plan, ess=1000.0)
+    found = evidence(problem.posterior, *sampled(problem.posterior, plan), generator(1, "evidence"))
+    known = np.mean(reference("virtual")["log_evidence"])
+    assert abs(found.log_evidence + found.log_prior_mass - known) < 0.1
+    assert found.error < 0.05

@@ -1,0 +1,197 @@
+"""What a control engineer gets: coefficients, a discrete system of scipy, and C that agrees."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import StateSpace, cont2discrete, dlsim, tf2ss
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.discrete import frequency_response, linear_part
+from bwbayes.control.exported import Exported, exported
+from bwbayes.control.sampled import sections_of
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from tests.control import cases
+from tests.programs import needs
+
+every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
+every_hold = pytest.mark.parametrize("hold", cases.HOLDS)
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+
+# Bytes for a state, whatever the model.
+STATE = 4096
+
+
+def of(name: str, hold: Hold, limits: Span = cases.SPAN) -> Exported:
+    actuator = cases.actuator(name, hold)
+    return exported(name, actuator, cases.theta(actuator, 1, name)[0], limits)
+
+
+def simulated(system: Any, drive: FloatArray) -> FloatArray:
+    """Return what scipy makes of a drive (samples, inputs), um."""
+    return np.asarray(dlsim(system, drive)[1])
+
+
+class Compiled:
+    """The C file as functions of arrays."""
+
+    def __init__(self, made: Exported, folder: Path) -> None:
+        (folder / "actuator.c").write_text(made.c_code(), encoding="ascii")
+        files = "actuator.c", "-o", "actuator.so", "-lm"
+        command = [needs("cc"), *STRICT, "-shared", "-fPIC", *files]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert (0, "") == (done.returncode, done.stderr)
+        self._library = ctypes.CDLL(str(folder / "actuator.so"))
+        for name in ("forward", "inverse"):
+            if hasattr(self._library, f"actuator_{name}"):
+                getattr(self._library, f"actuator_{name}").restype = ctypes.c_double
+
+    def run(self, function: str, begin: float, values: FloatArray) -> FloatArray:
+        """Return what a function makes of values (samples,), one call each."""
+        state = ctypes.create_string_buffer(STATE)
+        call: Any = getattr(self._library, f"actuator_{function}")
+        self._library.actuator_begin(state, ctypes.c_double(begin))
+        return np.array([call(state, ctypes.c_double(value)) for value in values.tolist()])
+
+
+@every_actuator
+@every_hold
+def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> None:
+    """Sample by sample, forward to 1e-12 of the range, and its inverse leads back."""
+    made, voltage = of(name, hold), cases.drive()
+    compiled = Compiled(made, tmp_path)
+    actuator = cases.actuator(name, hold)
+    theta = cases.theta(actuator, 1, name)
+    expected = actuator.displacement(theta, voltage, from_rest=True)[0]
+    displacement = compiled.run("forward", voltage[0], voltage)
+    np.testing.assert_allclose(displacement, expected, rtol=0, atol=1e-12 * np.ptp(expected))
+    late = int(hold == "zero")
+    command = compiled.run("inverse", voltage[0], displacement[late:])
+    again = compiled.run("forward", voltage[0], command)
+    reached = displacement[: again.size]
+    np.testing.assert_allclose(again, reached, rtol=0, atol=1e-11 * np.ptp(expected))
+    np.testing.assert_allclose(command, voltage[: command.size], rtol=0, atol=1e-8)
+
+
+def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
+    compiled = Compiled(of("bouc-wen, second-order", "zero", Span(-40.0, 50.0)), tmp_path)
+    reference = np.repeat([1e3, -1e3, np.inf, 5.0], 40)
+    command = compiled.run("inverse", 0.0, reference)
+    assert [50.0, -40.0, 50.0] == command[39:120:40].tolist()
+    assert 5.0 == pytest.approx(compiled.run("forward", 0.0, command)[-1], abs=1e-12)
+
+
+def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None:
+    actuator = Actuator("none")
+    theta = cases.theta(actuator)[0]
+    theta[actuator.parameters.index("d")] = 0.4
+    made = exported("turns */ back", actuator, theta, cases.SPAN)
+    code = made.c_code()
+    assert "There is no inverse:\n * inverse: the model_s slope may be as low as" in code
+    assert "actuator_inverse" not in code
+    assert "turns _ back" in code or "turns __ back" in code
+    voltage = cases.drive(300)
+    displacement = Compiled(made, tmp_path).run("forward", voltage[0], voltage)
+    expected = actuator.displacement(theta, voltage, from_rest=True)[0]
+    np.testing.assert_allclose(displacement, expected, rtol=0, atol=1e-12 * np.ptp(expected))
+
+
+@every_actuator
+@every_hold
+def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
+    """scipy.signal simulates from the drive what the actuator does."""
+    actuator = cases.actuator(name, hold)
+    theta, voltage = cases.theta(actuator, 1, name), cases.drive(800)
+    column = actuator.columns(theta)
+    w = actuator.hysteretic(theta, voltage, from_rest=True)
+    if actuator.gain is not None:
+        w = w + actuator.gain.displacement(column, voltage)
+    inputs = [w[0]]
+    if actuator.creep is not None and actuator.creep.growing:
+        inputs.append(actuator.creep.drive(column, w, voltage)[0])
+    drives = np.stack(inputs, axis=1)
+    system = linear_part(actuator, theta[0])
+    assert isinstance(system, StateSpace)
+    moved = simulated(system, drives - drives[0])[:, 0]
+    expected = actuator.displacement(theta, voltage, from_rest=True)[0]
+    np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("hold", "method"), [("first", "foh"), ("zero", "zoh")])
+@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
+def test_the_linear_part_is_scipys_own_discretisation(
+    dynamics: str, hold: Hold, method: Any
+) -> None:
+    """Compared by the response to an impulse; a lag's poles are slow enough for matrix exps."""
+    actuator = Actuator(dynamics, hold, 1e-3)
+    theta = cases.theta(actuator)
+    changes = {"mass": 1.0, "damping": 100.0}
+    for name, value in changes.items():
+        if name in actuator.parameters:
+            theta[0, actuator.parameters.index(name)] = value
+    column = actuator.columns(theta)
+    if dynamics == "lag":
+        continuous = [1.0], [column["lag"][0], 1.0]
+    else:
+        k = column["stiffness"][0]
+        continuous = [1.0], [column["mass"][0] / k, column["damping"][0] / k, 1.0]
+    system: Any = tf2ss(*continuous)
+    discrete = cont2discrete(system, 1e-3, method)
+    impulse = np.zeros(200)
+    impulse[3] = 1.0
+    expected = simulated(discrete, impulse)
+    got = simulated(linear_part(actuator, theta[0]), impulse)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+
+
+@every_actuator
+def test_the_frequency_response_is_that_of_the_system(name: str) -> None:
+    actuator = cases.actuator(name, "zero")
+    theta = cases.theta(actuator, 2, name)
+    turns = np.linspace(0.01, 3.1, 50)
+    response = frequency_response(sections_of(actuator, actuator.columns(theta)), turns)
+    for row, values in zip(response, theta, strict=True):
+        system = linear_part(actuator, values)
+        z = np.exp(1j * turns)
+        eye = np.eye(len(system.A))
+        each = [system.C @ np.linalg.solve(one * eye - system.A, system.B) + system.D for one in z]
+        # Together, as if nothing grew with the voltage.
+        np.testing.assert_allclose(row, np.sum(each, axis=(1, 2)), rtol=1e-10)
+
+
+@every_actuator
+def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
+    made = of(name, "first")
+    numbers = json.loads(json.dumps(made.numbers(), allow_nan=False))
+    actuator = cases.actuator(name)
+    theta = cases.theta(actuator, 1, name)[0]
+    assert list(actuator.parameters) == list(numbers["parameters"])
+    for declared, value in zip(actuator.declarations, theta, strict=True):
+        known = numbers["parameters"][declared.name]
+        assert (value, declared.unit) == (known["mean"], known["unit"])
+    assert 1e-3 == numbers["interval_s"]
+    assert all(one["unit"] in ("um/V", "1/V", "V") for one in numbers["hysteresis"].values())
+    system = made.linear
+    for matrix in "ABCD":
+        np.testing.assert_array_equal(numbers["state_space"][matrix], getattr(system, matrix))
+
+
+@pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)])
+def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match="give two voltages, the lower one first"):
+        of("bouc-wen", "first", Span(*limits))
+
+
+def test_a_theta_of_another_length_is_refused() -> None:
+    with pytest.raises(InputError, match="give one value each of d, alpha"):
+        linear_part(Actuator("lag"), [1.0, 2.0])

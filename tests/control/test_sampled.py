@@ -1,0 +1,131 @@
+"""A model a sample at a time: the simulation's displacement, and a voltage that leads back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.sampled import SampledModel, require_inverse
+from bwbayes.control.steps import step_of
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.registry import HYSTERESIS, made
+from tests.control import cases
+
+every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
+every_hold = pytest.mark.parametrize("hold", cases.HOLDS)
+
+
+def stepped(model: SampledModel, voltage: FloatArray) -> FloatArray:
+    """Return the displacement (models, samples) of all models along one voltage."""
+    state = model.begin(np.full(model.models, voltage[0]))
+    rows = []
+    for one in voltage:
+        displacement, state = model.forward(state, np.full(model.models, one))
+        rows.append(displacement)
+    return np.stack(rows, axis=1)
+
+
+@every_actuator
+@every_hold
+def test_steps_are_the_simulation(name: str, hold: Hold) -> None:
+    actuator = cases.actuator(name, hold)
+    theta, voltage = cases.theta(actuator, 3, name), cases.drive(600)
+    model = SampledModel.of(actuator, theta)
+    expected = actuator.displacement(theta, voltage, from_rest=True)
+    expected -= theta[:, [actuator.parameters.index("offset")]]
+    np.testing.assert_allclose(stepped(model, voltage), expected, rtol=0, atol=1e-12 * 140)
+
+
+@every_actuator
+@every_hold
+def test_the_inverse_leads_back(name: str, hold: Hold) -> None:
+    """The displacement is met to 1e-11 of the range, and the voltage is the one that made it."""
+    actuator = cases.actuator(name, hold)
+    theta, voltage = cases.theta(actuator, 3, name), cases.drive(200)
+    model = SampledModel.of(actuator, theta)
+    require_inverse(model, cases.SPAN)
+    reference = stepped(model, voltage)
+    back, forth = model.begin(np.full(3, voltage[0])), model.begin(np.full(3, voltage[0]))
+    late = int(hold == "zero")
+    for t in range(voltage.size - late):
+        command, back = model.inverse(back, reference[:, t + late], cases.SPAN)
+        np.testing.assert_allclose(command, voltage[t], rtol=0, atol=1e-8)
+        displacement, forth = model.forward(forth, command)
+        np.testing.assert_allclose(displacement, reference[:, t], rtol=0, atol=1e-11 * 140)
+
+
+def test_what_is_out_of_reach_gets_the_limit_and_comes_back() -> None:
+    actuator = cases.actuator("bouc-wen, second-order", "zero")
+    model = SampledModel.of(actuator, cases.theta(actuator))
+    state = model.begin(np.zeros(1))
+    limits = Span(-40.0, 50.0)
+    ends = []
+    for reference in (1e3, -1e3, 1e3, 5.0):
+        for _ in range(40):
+            voltage, state = model.inverse(state, np.array([reference]), limits)
+        ends.append(float(voltage[0]))
+    assert [50.0, -40.0, 50.0] == ends[:3]
+    assert -40 < ends[3] < 50
+    assert 5.0 == pytest.approx(model.forward(state, voltage)[0][0], abs=1e-12)
+
+
+@every_actuator
+def test_slopes_lie_within_their_bounds(name: str) -> None:
+    actuator = cases.actuator(name)
+    theta = cases.theta(actuator, 3, name)
+    model = SampledModel.of(actuator, theta)
+    least, largest = model.slopes(cases.SPAN)
+    voltage = cases.drive()
+    path = np.concatenate(
+        [voltage, np.linspace(voltage[-1], 100, 300), np.linspace(100, -100, 300)]
+    )
+    w = actuator.hysteretic(theta, path, from_rest=True)
+    if actuator.gain is not None:
+        w = w + actuator.gain.displacement(actuator.columns(theta), path)
+    moves = np.diff(path) != 0
+    slopes = np.diff(w)[:, moves] / np.diff(path)[moves]
+    assert (slopes >= least[:, np.newaxis] - 1e-9).all()
+    assert (slopes <= largest[:, np.newaxis] + 1e-9).all()
+    # Not far from them, or they would say nothing.
+    assert (slopes.min(axis=1) - least < 0.12 * largest).all()
+    assert (largest - slopes.max(axis=1) < 0.12 * largest).all()
+
+
+@pytest.mark.parametrize("name", ["duhem", "prandtl-ishlinskii", "preisach", "jiles-atherton"])
+def test_operators_without_a_step_are_refused(name: str) -> None:
+    operator = made("hysteresis", name, HYSTERESIS, {})
+    column = {one.name: np.ones(1) for one in operator.parameters}
+    with pytest.raises(
+        InputError, match=r"no step of bounded time .* bouc-wen with n = 1, backlash"
+    ):
+        step_of(operator, column)
+
+
+def test_another_exponent_is_refused() -> None:
+    column = {one.name: np.ones(2) for one in BoucWen().parameters} | {"exponent": np.array([1, 2])}
+    with pytest.raises(InputError, match="bouc-wen with another exponent than 1 has no step"):
+        step_of(BoucWen(), column)
+
+
+def test_a_model_that_turns_back_has_no_inverse() -> None:
+    actuator = Actuator("none")
+    theta = cases.theta(actuator)
+    theta[0, actuator.parameters.index("d")] = 0.4
+    with pytest.raises(InputError, match="more than one voltage"):
+        require_inverse(SampledModel.of(actuator, theta), cases.SPAN)
+
+
+def test_dynamics_whose_inverse_runs_away_have_none() -> None:
+    """A resonance that is sampled fast, with a drive that goes straight between samples."""
+    actuator = Actuator("second-order", "first", 1e-3)
+    theta = cases.theta(actuator)
+    for one, value in {"mass": 1.0, "damping": 100.0}.items():
+        theta[0, actuator.parameters.index(one)] = value
+    model = SampledModel.of(actuator, theta)
+    with pytest.raises(InputError, match="swing on and on"):
+        require_inverse(model, cases.SPAN)
