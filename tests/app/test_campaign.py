@@ -241,7 +241,7 @@ def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     page = (whole / "campaign.html").read_text(encoding="utf-8")
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 1 == page.count("data:image/png;base64,")
-    for text in ("broken.csv:2", "1 refused", 'data-name="alpha"', "Taken for normal"):
+    for text in ("broken.csv:2", "1 refused", '<th scope="row">alpha</th>', "Taken for normal"):
         assert text in page
     row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
     assert "<b>x" not in module.render("x", CampaignResult((row,), None, "few"), {})

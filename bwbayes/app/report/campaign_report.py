@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from bwbayes.app.figures.style import unit_text
-from bwbayes.app.report.report import digits, picture, template
+from bwbayes.app.report.page import Table, picture, template
+from bwbayes.app.report.words import digits
 from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.arrays import FloatArray
 from bwbayes.population.population import Spread
@@ -23,6 +23,8 @@ CAPTIONS = {
         "Line and band: the population's middle, and where 95 % of specimens not measured yet lie.",
     ),
 }
+
+NEW = "A specimen not measured yet, 95 %"
 
 
 def render(name: str, campaign: CampaignResult, pictures: Mapping[str, bytes]) -> str:
@@ -39,35 +41,47 @@ def render(name: str, campaign: CampaignResult, pictures: Mapping[str, bytes]) -
         outliers=[
             (record, ", ".join(parameters)) for record, parameters in campaign.outliers.items()
         ],
-        units=[(key, unit_text(unit)) for key, unit in units.items()],
-        rows=[_row(row, list(units)) for row in campaign.rows],
-        short=[row for row in campaign.rows if row.reason],
+        records=_records(campaign.rows, units),
+        short=Table(
+            "short",
+            "Records to look at",
+            ("Record", "Status", "Why"),
+            [(row.name, row.status, row.reason) for row in campaign.rows if row.reason],
+        ),
         untold=campaign.untold,
-        population=[] if told is None else [_spread(one) for one in told.parameters.values()],
+        population=Table(
+            "population",
+            "Population",
+            ("Parameter", "Unit", "Middle", "Spread", NEW, "Pareto k", "Taken for normal"),
+            [] if told is None else [_spread(one) for one in told.parameters.values()],
+        ),
         pictures=[picture(png, key, *CAPTIONS[key]) for key, png in pictures.items()],
     )
 
 
-def _row(row: Row, names: list[str]) -> dict[str, Any]:
+def _records(rows: Sequence[Row], units: Mapping[str, str]) -> Table:
+    """Return the interval of each parameter of every record."""
+    titles = [f"{name} ({unit_text(unit)})".replace(" ()", "") for name, unit in units.items()]
     texts = []
-    for name in names:
-        one = row.parameters.get(name)
-        texts.append(_interval(one["lower_95"], one["upper_95"]) if one else "")
-    return {"name": row.name, "status": row.status, "texts": texts}
+    for row in rows:
+        known = [row.parameters.get(name) for name in units]
+        intervals = [_interval(one["lower_95"], one["upper_95"]) if one else "" for one in known]
+        texts.append((row.name, row.status, *intervals))
+    return Table("records", "Records", ("Record", "Status", *titles), texts)
 
 
-def _spread(one: Spread) -> dict[str, Any]:
+def _spread(one: Spread) -> tuple[str, ...]:
     low, high = np.quantile(one.new, [0.025, 0.975])
     taken = sum(among.normal for among in one.specimens.values())
-    return {
-        "name": one.name,
-        "unit": unit_text(one.unit),
-        "mean": _estimate(one.mean),
-        "spread": _estimate(one.spread, percent=one.logarithmic),
-        "new": _interval(float(low), float(high)),
-        "shapes": f"{one.pareto_k:.2f}",
-        "normal": f"{taken} of {len(one.specimens)}",
-    }
+    return (
+        one.name,
+        unit_text(one.unit),
+        _estimate(one.mean),
+        _estimate(one.spread, percent=one.logarithmic),
+        _interval(float(low), float(high)),
+        f"{one.pareto_k:.2f}",
+        f"{taken} of {len(one.specimens)}",
+    )
 
 
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
