@@ -325,6 +325,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
             f"use at least {least}"
         )
+    samples = sum(one.readings.samples for one in posterior.datasets)
     return SamplingPlan(
         ess=given.ess,
         ensembles=given.ensembles,
@@ -332,7 +333,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
-        together=best_together(given.ensembles, walkers, posterior.readings.samples),
+        together=best_together(given.ensembles, walkers, samples),
     )
 
 
