@@ -19,6 +19,7 @@ from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.compare import compare
+from bwbayes.app.commands.compensate import compensate
 from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -53,6 +54,7 @@ for command in (
     simulate,
     calibrate,
     campaign,
+    compensate,
     export,
     track,
     compare,

@@ -22,6 +22,7 @@ from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
@@ -45,7 +46,7 @@ from bwbayes.app.screen import (
 from bwbayes.control.exported import Exported
 from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
-from bwbayes.errors import NotConvergedError
+from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -126,7 +127,7 @@ class Fit:
         Its attribute ``converged`` is 1 or 0.
         """
         density = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, density, self.problem.record)
+        return posterior_tree(self.result, density, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -170,22 +171,26 @@ class Fit:
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted, and where there is no reading.
+        nan where nothing was predicted, and where there is no reading. Those of several records
+        are those of their bands: ``fit.bands["step_10"].residuals``.
 
         Raises
         ------
         NotConvergedError
             The sampling has not converged.
+        InputError
+            Several records were fitted.
         """
         import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
 
+        if len(self.problem.records) > 1:
+            raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
         record = self.problem.record
         values = np.full(record.samples, np.nan)
-        for name, bands in self.bands.items():
-            other = self.problem.validations.get(name)
-            if other is None or other.window is not None:
-                first = round((float(bands.time[0]) - record.start) / record.interval)
-                values[first : first + bands.time.size] = bands.residuals
+        for name in self.problem.windows("record"):
+            bands = self.bands[name]
+            first = round((float(bands.time[0]) - record.start) / record.interval)
+            values[first : first + bands.time.size] = bands.residuals
         time = ("time", record.time, {"units": "s"})
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
@@ -256,6 +261,15 @@ class Fit:
         :func:`bwbayes.app.fit.compared.compared`.
         """
         return compared((self, *others), **options)
+
+    def compensate(self, reference: Any, **options: Any) -> Compensated:
+        """Return the voltage for a displacement that is asked for, and what is promised of it.
+
+        All is as of :func:`bwbayes.app.jobs.compensate.compensate_draws`.
+        """
+        made = compensate_draws(self.problem, self._converged().flat_draws, reference, **options)
+        warn(made.remarks, 3)
+        return made
 
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
