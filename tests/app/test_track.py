@@ -59,6 +59,7 @@ def test_numbers_table_and_picture_agree(
     # The same draws and noise in Python, and on the command line again.
     again = fit.track(frequencies=(2.0, 5.0), draws=5)
     assert numbers["table"] == again.numbers()["table"]
+    assert 4 == len(fit.plot.tracking(again).axes)
     with pytest.raises(InputError, match=r"track\.json: exists; choose another folder, or give"):
         track_run(tmp_path / "run", None, Setup(draws=5))
 
