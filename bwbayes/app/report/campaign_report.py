@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bwbayes.app.figures.style import unit_text
-from bwbayes.app.report.report import digits, picture, template
+from bwbayes.app.report.page import picture, template
+from bwbayes.app.report.words import digits
 from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.arrays import FloatArray
 from bwbayes.population.population import Spread

@@ -6,7 +6,7 @@ One HTML file that needs nothing else, as the report of a run.
 from __future__ import annotations
 
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.comparison.choice import Comparison
 from bwbayes.comparison.table import COLUMNS, DIFFERENCE_COLUMNS, differences, rows
 
