@@ -14,10 +14,12 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import innovations, loops, steps
+from bwbayes.results import innovations, learned, loops, replicated, steps
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.learned import Learned
 from bwbayes.results.loops import Loops
+from bwbayes.results.replicated import Replicated
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
@@ -58,6 +60,10 @@ class Result:
     steps
         The responses to the steps among the records that were predicted, by name; empty unless
         converged.
+    learned
+        What the record taught: prior against posterior; None unless converged.
+    replicated
+        The record among replicated ones; None unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -78,6 +84,8 @@ class Result:
     innovations: Innovations | None = None
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
+    learned: Learned | None = None
+    replicated: Replicated | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -101,8 +109,8 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
-    None unless the sampling has converged.
+    ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
+    ``identifiability`` and ``replicated`` are None unless the sampling has converged.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -123,6 +131,8 @@ def summary(result: Result) -> dict[str, object]:
         "innovations": None,
         "loops": None,
         "step_responses": None,
+        "identifiability": None,
+        "replicated": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -134,6 +144,10 @@ def summary(result: Result) -> dict[str, object]:
             known["innovations"] = innovations.numbers(result.innovations)
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
+        if result.learned is not None:
+            known["identifiability"] = learned.numbers(result.learned)
+        if result.replicated is not None:
+            known["replicated"] = replicated.numbers(result.replicated)
         known["step_responses"] = steps.numbers(result.steps)
     return known
 

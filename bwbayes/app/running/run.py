@@ -38,10 +38,12 @@ from bwbayes.inference import conflict, pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import identifiability, innovations
+from bwbayes.results.learned import learned
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import thinned
 from bwbayes.results.refit import without_start
+from bwbayes.results.replicated import replicated
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
@@ -323,6 +325,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         innovations=found,
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, problem.others),
+        learned=learned(posterior.prior, sampled, result.log_density, source),
+        replicated=replicated(posterior, chosen, source),
         remarks=(*result.remarks, *innovations.remarks(found)),
     )
 
