@@ -2,12 +2,13 @@
 
 Each candidate is a voltage that the amplifier can make. At some posterior draws the model is made
 linear in its parameters: the Fisher information of the readings that the candidate would bring,
-with the noise of that draw and an offset of the new record's own, adds to what is known already. What
-would be left of a standard deviation, averaged over the draws, is the promise; how far the draws
-scatter is its Monte Carlo error.
+with the noise of that draw and an offset of the new record's own, adds to what is known already.
+What would be left of a standard deviation, averaged over the draws, is the promise; how far the
+draws scatter is its Monte Carlo error.
 
-It trusts the model and its noise, which takes every period of a steady sine for news. Where the
-model is wrong in a way that returns with each period, less is learned than is promised.
+What the model is wrong about returns whenever the voltage takes the same way again, so a stretch
+that is driven several times counts once: a hundred periods of one sine show one loop, not a
+hundred. A fit, which trusts the noise model, may look surer than was promised of a steady drive.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from scipy import linalg
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
+from bwbayes.results.identifiability import stretches_once
 
 __all__ = ["Amplifier", "Promise", "promises", "ranked"]
 
@@ -131,7 +133,8 @@ def promises(
 
         Σ' = (Σ⁻¹ + Jᵀ C⁻¹ J)⁻¹,
 
-    the new record's offset integrated out. A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its
+    the new record's offset integrated out, and each sample weighted by one over how often its
+    stretch is driven. A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its
     gradient; along a drive the mean over its samples counts.
 
     Parameters
@@ -229,7 +232,7 @@ class _Asker:
         return cls(posterior, known[chosen], columns, tuple(own), covariance, steps, offset_sd)
 
     def _theta(self, place: FloatArray) -> FloatArray:
-        """Return θ (2 coordinates, parameters) a step to either side of a place (free,), from rest."""
+        """Return θ (2 coordinates, parameters), steps to either side of a place (free,)."""
         count = len(self.columns)
         moved = np.repeat(place[np.newaxis], 2 * count, axis=0)
         rows = np.arange(count)
@@ -265,12 +268,13 @@ class _Asker:
         """Return the Fisher information (coordinates, coordinates) of a candidate, at each draw."""
         one, prior = self.posterior.only, self.posterior.prior
         noise = one.table.noise(prior.theta(prior.constrain(self.places)[0]))
+        once, _ = stretches_once(voltage, np.arange(voltage.size))
         every = []
         for place, own in zip(self.places, noise, strict=True):
             slopes = self._displacement(place, voltage)
             series = np.concatenate([slopes, np.ones((1, voltage.size))])
             (white,), _ = one.noise.whiten(own[np.newaxis], series[np.newaxis])
-            products = white @ white.T
+            products = (white * once) @ white.T
             if self.offset_sd:
                 told, level = products[:-1, -1], products[-1, -1] + self.offset_sd**-2
                 every.append(products[:-1, :-1] - np.outer(told, told) / level)

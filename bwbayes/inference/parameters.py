@@ -1,6 +1,6 @@
 """Parameters: what they are called, what is known of them, and where they may lie.
 
-Each parameter is either fixed or has a prior. The priors are independent but for the physical
+Each parameter is either fixed or has a prior. The priors are independent except for the physical
 constraints that the model's parts declare, which cut the joint prior: for Bouc-Wen 0 < α < d,
 |γ| ≤ β, an initial state inside the hysteresis ceiling. :class:`JointPrior` draws from the cut
 prior and gives its log density, up to the one constant that the cut leaves. It also maps parameters
@@ -173,7 +173,7 @@ class JointPrior:
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
         if not np.all(self._possible(fixed)):
-            raise InputError(f"priors: what is fixed must have {self._stated()}")
+            raise InputError(f"priors: fixed values must have {self._stated()}")
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
@@ -220,7 +220,7 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                raise InputError(f"priors: hardly a draw has {self._stated()}")
+                raise InputError(f"priors: hardly any draw has {self._stated()}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:

@@ -167,7 +167,7 @@ class Posterior:
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (models,) at coordinates (models, free): likelihood and prior.
 
-        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
+        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is not evidence
         for a model: there the density is −∞ too.
         """
         free, result = self.prior.constrain(coordinates)

@@ -88,7 +88,7 @@ class Experiment:
     Raises
     ------
     InputError
-        No training voltage goes forth and back, so that there is no loop to measure.
+        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     posterior: Posterior
@@ -101,7 +101,7 @@ class Experiment:
     def __post_init__(self) -> None:
         if not any(_crossings(path).both for path in self._paths.values()):
             raise InputError(
-                "record: its training voltage does not go forth and back, so there is no loop to "
+                "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
             )
 
@@ -133,7 +133,7 @@ class Experiment:
 
     @cached_property
     def looped(self) -> str:
-        """The record whose loop is measured: the first that goes forth and back."""
+        """The record whose loop is measured: the first that goes back and forth."""
         return next(name for name, path in self._paths.items() if _crossings(path).both)
 
     @property
@@ -147,7 +147,7 @@ class Experiment:
         The opening (um) is the model's displacement where the voltage falls through zero, or
         through the middle of a drive beside it, less that where it rises through it, interpolated
         between samples, each the mean over all passages; the range (um) is its largest less its
-        smallest displacement. Of several records, in the first that goes forth and back.
+        smallest displacement. Of several records, in the first that goes back and forth.
         """
         displacement = posterior.simulate(theta, record=self.looped)
         path = self._paths[self.looped]
@@ -229,8 +229,8 @@ class Replicate:
 
     def entry(self) -> Entry:
         """Return what is stored of it."""
-        found = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
         return Entry(
             number=self.number,
             converged=self.converged,
@@ -238,7 +238,7 @@ class Replicate:
             steps=self.steps,
             spacing=self.spacing,
             truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
             covered=dict(self.covered),
         )
 
@@ -384,8 +384,8 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    wanted = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    apart = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
     left = chained[::-spacing].reshape(-1, free)
     return spacing, thinned(left, generator, RANKED)
 

@@ -54,7 +54,7 @@ class Result:
     verdicts
         Whether the bands hold, by their name, for those with a measurement.
     innovations
-        What each fitted reading brings anew, at the most probable draw; None unless converged.
+        The innovation of each fitted reading, at the most probable draw; None unless converged.
     loops
         The loops of the actuator, measured; None unless converged.
     steps

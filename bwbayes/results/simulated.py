@@ -122,7 +122,7 @@ def _target(kind: Kind, made: Simulated) -> FloatArray:
 
 def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
     """Tell which of the values (samples,) that there are lie inside the end of a band."""
-    there = np.isfinite(values)
+    known = np.isfinite(values)
     low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
-    inside: FloatArray = ((low <= values) & (values <= high))[there].astype(np.float64)
+    inside: FloatArray = ((low <= values) & (values <= high))[known].astype(np.float64)
     return inside

@@ -7,6 +7,7 @@ import json
 import re
 import warnings
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,7 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
         assert [row["name"] for row in csv.DictReader(file)] == ["bouc-wen", "linear"]
     page = (folder / "comparison.html").read_text(encoding="utf-8")
     for line in (*made.lines, *made.against):
-        assert line in page
+        assert escape(line) in page
     evidence = said["models"]["bouc-wen"]["log_evidence"]
     assert f"{evidence:.2f}" in page
 

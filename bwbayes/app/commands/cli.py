@@ -19,6 +19,7 @@ from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.compare import compare
+from bwbayes.app.commands.design import design
 from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -54,6 +55,7 @@ for command in (
     campaign,
     export,
     compare,
+    design,
     config,
     models,
 ):
@@ -87,7 +89,7 @@ def main() -> None:
     except BrokenExecutor as error:
         # Python's own says nothing of use.
         said = "" if isinstance(error, BrokenProcessPool) else str(error)
-        said = said or "a worker process was ended; mind the memory, and resume"
+        said = said or "a worker process was killed; free some memory, and resume"
         click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:

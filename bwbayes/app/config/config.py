@@ -58,7 +58,7 @@ class Config(Table):
     seed: Annotated[
         int,
         Field(ge=0, le=LARGEST_SEED),
-        described("Where all random numbers come from.", example="7"),
+        described("Seed of all random numbers.", example="7"),
     ] = 1
     record: Annotated[RecordConfig, described("The training record; file or signal is required.")]
     stand: Annotated[StandConfig, described("The virtual test stand, for signals.")] = StandConfig()

@@ -96,7 +96,7 @@ def _validation(name: str, given: Any, records: dict[str, Record], where: str) -
         if not isinstance(given["record"], Record | str | Path):
             known = ", ".join(ValidationConfig.model_fields)
             raise InputError(
-                f"{where}: validation.{name}.record: is no record; give a Record, a file or a "
+                f"{where}: validation.{name}.record: is not a record; give a Record, a file or a "
                 f"window; other keys are {known}"
             )
         table["file"] = _file(given["record"], name, records, where)
@@ -113,7 +113,7 @@ def _file(given: Any, name: str, records: dict[str, Record], where: str) -> str:
     if isinstance(given, str | Path):
         return str(Path(given).absolute())
     raise InputError(
-        f"{where}: {name}: {type(given).__name__} is no record; make one with "
+        f"{where}: {name}: {type(given).__name__} is not a record; make one with "
         "Record.from_arrays(voltage, displacement, interval=...) or Record.from_pandas(frame)"
     )
 

@@ -38,7 +38,7 @@ def fit(
     record
         The training record, or its file.
     folder
-        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is there after
+        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
     overwrite
         Replace a run that is in the folder already.
@@ -121,7 +121,7 @@ def resume_run(
     Raises
     ------
     InputError
-        No such run, or its files do not fit together.
+        No such run, or its files do not belong together.
 
     Warns
     -----

@@ -28,7 +28,7 @@ from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.run import (
@@ -345,7 +345,7 @@ class Fit:
 
 
 class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
+    """A temporary folder that is removed when nobody needs it any more."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
@@ -362,7 +362,7 @@ def carried_on(
     engine: Engine | None = None,
     how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
         console_of(progress),
@@ -374,7 +374,7 @@ def carried_on(
         how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
 

@@ -64,7 +64,7 @@ class Plots:
         return _drawn(draw_coverage, result.bands, result.scores)
 
     def innovations(self) -> Figure:
-        """Draw whether what each reading brings anew is white, normal and of one size."""
+        """Draw whether innovations, what each reading adds, are white, normal, of one size."""
         return _drawn(draw_innovations, self.converged().innovations)
 
     def corner(self) -> Figure:

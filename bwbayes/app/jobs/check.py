@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,7 +17,8 @@ from bwbayes.app.figures import save
 from bwbayes.app.figures.record import draw_record
 from bwbayes.app.figures.style import unit_text
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.report import picture, symbol, template
+from bwbayes.app.report.page import Table, picture, template
+from bwbayes.app.report.words import symbol
 from bwbayes.app.screen import show_priors
 from bwbayes.data import Record
 from bwbayes.data.inspection import Finding
@@ -46,7 +46,7 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     config
         The config; its files are relative to `folder`.
     out
-        The page's folder, made if need be; a page that stands there is replaced.
+        The page's folder, made if need be; an existing page is replaced.
     console
         Shows the record, what is wrong with it, priors and point fit.
 
@@ -100,9 +100,10 @@ def write_page(
         name=problem.config.name or record.origin,
         findings=findings,
         remarks=remarks,
-        facts=_facts(record),
+        about="; ".join(fact for _, fact in _facts(record)),
+        known=_facts(record),
         pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
-        parameters=list(_rows(problem, fitted)),
+        parameters=_table(problem, fitted),
     )
     path = out / "check.html"
     path.write_text(page, encoding="utf-8")
@@ -120,15 +121,16 @@ def _facts(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def _rows(problem: Problem, fitted: Mapping[str, float]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": parameter.name,
-            "description": parameter.description,
-            "symbol": symbol(parameter),
-            "unit": unit_text(parameter.unit),
-            "prior": str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}",
-            "point": f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "",
-        }
+def _table(problem: Problem, fitted: Mapping[str, float]) -> Table:
+    rows = [
+        (
+            parameter.description,
+            symbol(parameter).html,
+            str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}",
+            f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "",
+            unit_text(parameter.unit),
+        )
         for parameter in problem.parameters
     ]
+    titles = ("Parameter", "Symbol", "Prior or value", "Point fit", "Unit")
+    return Table("priors", "Parameters", titles, rows)

@@ -143,7 +143,7 @@ def _require_in_proportion(name: str, values: Collection[float]) -> None:
 def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
     arguments = {key: value for key, value in prior.items() if key != "distribution"}
     try:
-        # The distribution itself refuses arguments that are no numbers.
+        # The distribution itself refuses arguments that are not numbers.
         return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"parameters.{name}.prior: {error}") from None

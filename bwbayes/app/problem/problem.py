@@ -23,15 +23,7 @@ from bwbayes.data import Record, Split, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.record import require_readable
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Carrier,
-    Decay,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    signal,
-)
+from bwbayes.data.waveforms import Carrier, Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -43,7 +35,7 @@ from bwbayes.inference.table import Table
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.sampler import SamplingPlan, best_together
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -193,7 +185,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
 
 
 def _findings(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
-    """Return what is wrong with a record, but for places that no window looks at."""
+    """Return what is wrong with a record in the places that some window uses."""
     # Borders that differ by less than half a sample are the same.
     times = [
         record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
@@ -340,6 +332,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=given.block,
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
+        together=best_together(given.ensembles, walkers, posterior.only.readings.samples),
     )
 
 

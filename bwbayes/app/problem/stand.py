@@ -44,7 +44,7 @@ def stand_of(config: Config, training: Record) -> VirtualTestStand:
 
 
 def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
-    """Return the true values but for what means something else in a fitted actuator.
+    """Return the true values, except those that mean something else in a fitted actuator.
 
     Parts that differ may have parameters of the same name.
     """

@@ -58,10 +58,10 @@ class RunFolder:
         Raises
         ------
         InputError
-            It exists and ``overwrite`` is not given, or it is no run's, or it cannot be written.
+            It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
         if path.name == "..":
-            raise InputError(f"{path}: is no name of a folder; choose one with --out")
+            raise InputError(f"{path}: is not a valid folder name; choose one with --out")
         if path.exists():
             if not overwrite:
                 raise InputError(
@@ -161,7 +161,7 @@ class CalibrationFolder(RunFolder):
 
     @property
     def replicates(self) -> Path:
-        """What they are replicates of, how many are wanted, and then a line for each."""
+        """What they are replicates of, how many were requested, and then a line for each."""
         return self.path / self.MARK
 
     @property

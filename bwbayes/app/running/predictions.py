@@ -84,7 +84,7 @@ class Prediction(Bands):
         return pd.DataFrame(dict(self.columns()))
 
     def plot(self) -> Figure:
-        """Draw the bands along time: voltage, displacement, and what is left without the mean."""
+        """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         return draw_alone(self)
 
     def numbers(self) -> dict[str, object]:
@@ -192,15 +192,15 @@ def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    found: Innovations,
+    series: Innovations,
     moved: Moved | None,
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name."""
-    start = innovations.odd_start(found)
+    start = innovations.odd_start(series)
     verdicts = {}
     for one in bands:
         # Of several training windows the first one holds the start.
-        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
+        at_start = one.training and one.time[0] <= series.time[0] <= one.time[-1]
         far = beyond_training(problem.posterior, one.voltage, one.interval)
         verdict = (
             assess(one, background, start=start, moved=moved, beyond=far)
@@ -213,6 +213,6 @@ def judged(
 
 
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    """Return the generator that scores bands: it depends on the readings, not on a name."""
     assert bands.measured is not None
     return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")

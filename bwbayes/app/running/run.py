@@ -110,7 +110,7 @@ def carry_on(
     engine: Engine | None = None,
     how: str | Executor | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
+    """Finish a run and write its files, as :func:`go_on` does; return the result."""
     return go_on(
         folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
     ).result
@@ -127,7 +127,7 @@ def go_on(
     files: bool = True,
     how: str | Executor | None = None,
 ) -> Run:
-    """Do what is left of a run.
+    """Finish a run.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def go_on(
     """
     begun = time.monotonic()
     with folder.locked(), one_thread():
-        if any(wanted is not None for wanted in (ess, steps, engine)):
+        if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
         with (
@@ -162,7 +162,7 @@ def go_on(
             executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
-            # It is written last, as the sign that all is there; now something is to come.
+            # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
@@ -218,7 +218,7 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
 
 
 def _chain(
-    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
 ) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
@@ -226,7 +226,7 @@ def _chain(
         chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
-            if wanted is None:
+            if requested is None:
                 chain.close()
                 raise InputError(
                     f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
@@ -261,9 +261,9 @@ def _retarget(
     folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
 ) -> None:
     config = load(folder.config)
-    wanted = {"ess": ess, "steps": steps, "engine": engine}
+    changes = {"ess": ess, "steps": steps, "engine": engine}
     sampling = config.sampling.model_copy(
-        update={name: value for name, value in wanted.items() if value is not None}
+        update={name: value for name, value in changes.items() if value is not None}
     )
     text = dump(config.model_copy(update={"sampling": sampling}))
     parse(text, "resume")  # refuses what a config cannot say
@@ -302,7 +302,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
-    found = innovations.innovations(posterior, best, problem.record.start)
+    series = innovations.innovations(posterior, best, problem.record.start)
     # By a second point fit, without the record's start.
     source = generator(problem.config.seed, "without start")
     moved = without_start(
@@ -312,7 +312,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         problem.record.start,
         seen=any(one.kind == "switch-on transient" for one in problem.findings),
     )
-    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
     return replace(
         result,
         bands=bands,
@@ -322,12 +322,12 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
             if one.name in verdicts
         },
         verdicts=verdicts,
-        innovations=found,
+        innovations=series,
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, problem.others),
         learned=learned(posterior.prior, sampled, result.log_density, source),
         replicated=replicated(posterior, chosen, source),
-        remarks=(*result.remarks, *innovations.remarks(found)),
+        remarks=(*result.remarks, *innovations.remarks(series)),
     )
 
 
@@ -383,7 +383,7 @@ def numbers_of(
 
 
 def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    """Write all files of a run; the summary last, as the sign that all is done."""
     numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.record)
