@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 
 import arviz_base
 import numpy as np
-from arviz_stats import psense
+from arviz_stats import psense  # type: ignore[attr-defined]  # not in an __all__
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
@@ -177,7 +177,7 @@ def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -
     """
     prior, posterior = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (before, after))
     variances, directions = linalg.eigh(posterior, prior)
-    said = []
+    said: list[Combination] = []
     for i in range(len(variances) - 1, -1, -1):
         left = float(np.sqrt(max(variances[i], 0.0)))
         if left < LEFT or len(said) == COMBINATIONS:

@@ -32,7 +32,7 @@ def steady(amplitude: float = 100.0, periods: float = 4.0) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def known() -> tuple[Posterior, FloatArray]:
-    """Return the posterior of half a period of a steady sine, which tells little of the loop's shape."""
+    """Return the posterior of half a period, which tells little of the loop's shape."""
     fixed = {"initial": 0.0, "sensor_sd": 0.3, "discrepancy_sd": 0.8, "discrepancy_time": 0.2}
     posterior = short_posterior(samples=SAMPLES, fixed=fixed)
     posterior = posterior.altered(training=(slice(0, 60),))

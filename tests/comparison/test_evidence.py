@@ -9,21 +9,25 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy import integrate, stats
 
-from bwbayes.app.config.config import load
+from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
+from bwbayes.data import Record, write_record
 from bwbayes.inference import pointfit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, log_densities, sample
+from tests.found import keep
 from tests.inference.test_solvable import (
     TRUTH,
     WINDOWS,
@@ -32,7 +36,8 @@ from tests.inference.test_solvable import (
     linear_posterior,
     prior_moments,
 )
-from tests.reference.plain import FOLDER
+from tests.reference.make import digest
+from tests.reference.plain import FOLDER, MEASURED, load_case
 
 PLAN = SamplingPlan(ess=1000, walkers=24, block=25)
 
@@ -143,6 +148,27 @@ def test_too_few_draws_are_not_told() -> None:
 
 def reference(name: str) -> Any:
     return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MEASURED.is_file(), reason="the measured record is not here")
+def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
+    """Within 0.1 nats of the mean of four runs of dynesty, aimed at the evidence."""
+    path = FOLDER / "measured.toml"
+    config, case = load(path), load_case(path)
+    known = json.loads((FOLDER / "measured_evidence.json").read_text(encoding="utf-8"))
+    assert known["digest"] == digest(case)
+    start = config.record.start
+    assert start is not None
+    write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")
+    source = RecordConfig(file="t.h5", train=config.record.train)
+    problem = resolve(config.model_copy(update={"record": source}), tmp_path)
+    found = evidence(
+        problem.posterior, *sampled(problem.posterior, problem.plan), generator(1, "evidence")
+    )
+    away = found.log_evidence + found.log_prior_mass - np.mean(known["log_evidence"])
+    keep("log evidence of the measured record", {"less dynesty's": round(float(away), 3)})
+    assert abs(away) < 0.1
 
 
 def test_nested_sampling_agrees() -> None:

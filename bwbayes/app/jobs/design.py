@@ -232,5 +232,6 @@ def _drive(wanted: str, problem: Problem) -> FloatArray:
     if not np.isclose(record.interval, problem.record.interval, rtol=1e-6):
         times = np.arange(0.0, record.duration, problem.record.interval)
         since = record.interval * np.arange(record.samples)
-        return np.interp(times, since, record.voltage)
+        along: FloatArray = np.interp(times, since, record.voltage)
+        return along
     return record.voltage
