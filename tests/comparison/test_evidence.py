@@ -27,7 +27,6 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, log_densities, sample
-from tests.found import keep
 from tests.inference.test_solvable import (
     TRUTH,
     WINDOWS,
@@ -36,6 +35,7 @@ from tests.inference.test_solvable import (
     linear_posterior,
     prior_moments,
 )
+from tests.measured import keep
 from tests.reference.make import digest
 from tests.reference.plain import FOLDER, MEASURED, load_case
 

@@ -136,7 +136,11 @@ def promised(
 ) -> list[Promise]:
     """Return what signals (samples,) promise, the best first."""
     source = generator(problem.config.seed, "design")
-    return ranked(promises(problem.posterior, flat, signals, target, amplifier, source))
+    # Of several records, what all of them taught of the actuator, seen from the first.
+    first = next(iter(problem.records))
+    posterior = problem.posterior.alone(first)
+    its = problem.posterior.its(flat, first)
+    return ranked(promises(posterior, its, signals, target, amplifier, source))
 
 
 def amplifier_of(

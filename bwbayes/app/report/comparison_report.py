@@ -15,7 +15,6 @@ __all__ = ["render"]
 
 def render(comparison: Comparison, problem: Problem) -> str:
     """Return the page of a comparison; ``problem`` is that of any of its runs."""
-    record = problem.record
     less = list(differences(comparison))
     return template("comparison.html.j2").render(
         recommended=comparison.recommended,
@@ -31,8 +30,11 @@ def render(comparison: Comparison, problem: Problem) -> str:
         else None,
         facts=[
             *((one.name, one.model) for one in comparison.candidates),
-            ("record", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
-            ("readings fitted", str(problem.posterior.only.readings.rows.size)),
+            *(
+                (name, f"{one.origin}: {one.samples} samples every {one.interval:g} s")
+                for name, one in problem.records.items()
+            ),
+            ("readings fitted", str(comparison.candidates[0].readings)),
             ("held out", ", ".join(problem.validations) or "nothing"),
         ],
     )

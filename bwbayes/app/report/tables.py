@@ -138,23 +138,25 @@ def taught(result: Result) -> Table | None:
     return Table("taught", "What the record taught", titles, rows)
 
 
-def replicated(result: Result) -> Table | None:
-    """Return the record's numbers among those of replicated records."""
-    if result.replicated is None:
-        return None
-    rows = [
-        (
-            STATISTICS[name][0],
-            f"{one.observed:.4g}",
-            f"{one.lower:.4g} to {one.upper:.4g}",
-            STATISTICS[name][1] if STATISTICS[name][1] == "-" else unit_text(STATISTICS[name][1]),
-            f"{one.p:.3f}",
-            "odd" if one.odd else "",
-        )
-        for name, one in result.replicated.statistics.items()
-    ]
+def replicated(result: Result) -> list[Table]:
+    """Return the numbers of each fitted record among those of replicated records."""
     titles = ("Number", "Observed", "95 % of replicated", "Unit", "p", "Odd")
-    return Table("replicated", "Posterior predictive checks", titles, rows)
+    tables = []
+    for name, checked in result.replicated.items():
+        rows = [
+            (
+                STATISTICS[which][0],
+                f"{one.observed:.4g}",
+                f"{one.lower:.4g} to {one.upper:.4g}",
+                unit_text(STATISTICS[which][1]),
+                f"{one.p:.3f}",
+                "odd" if one.odd else "",
+            )
+            for which, one in checked.statistics.items()
+        ]
+        of = f" of {name}" if len(result.replicated) > 1 else ""
+        tables.append(Table(f"replicated-{name}", f"Posterior predictive checks{of}", titles, rows))
+    return tables
 
 
 def validation(result: Result, summary: Summary) -> Table:
