@@ -121,7 +121,7 @@ def learned(
     return Learned(parameters, combinations, tuple(_remarks(parameters, combinations)))
 
 
-def numbers(found: Learned) -> dict[str, object]:
+def numbers(taught: Learned) -> dict[str, object]:
     """Return it as ``identifiability`` in summary.json."""
     return {
         "parameters": {
@@ -131,10 +131,10 @@ def numbers(found: Learned) -> dict[str, object]:
                 "likelihood_sensitivity": one.likelihood,
                 "prior_decides": one.prior_decides,
             }
-            for name, one in found.parameters.items()
+            for name, one in taught.parameters.items()
         },
-        "combinations": [asdict(one) for one in found.combinations],
-        "remarks": list(found.remarks),
+        "combinations": [asdict(one) for one in taught.combinations],
+        "remarks": list(taught.remarks),
     }
 
 
@@ -162,11 +162,11 @@ def _sensitivities(
             "log_likelihood": {"joint": log_likelihood[np.newaxis]},
         }
     )
-    found = []
+    taught = []
     for group in ("prior", "likelihood"):
         said = psense(tree, group=group)
-        found.append({name: float(said[name]) for name in prior.free_names})
-    return found[0], found[1]
+        taught.append({name: float(said[name]) for name in prior.free_names})
+    return taught[0], taught[1]
 
 
 def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -> list[Combination]:

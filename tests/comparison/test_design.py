@@ -56,7 +56,7 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     exact = closed_form(posterior)
     draws = np.random.default_rng(1).multivariate_normal(exact.mean, exact.covariance, 40_000)
     voltage = decaying_sine(150)
-    (found,) = promised((posterior, draws), {"sine": voltage}, "d")
+    (promise,) = promised((posterior, draws), {"sine": voltage}, "d")
     # dx/dd is the lagged voltage, seen by two slopes.
     theta = posterior.prior.theta(exact.mean + np.array([[0.0, 0.0], [1e-3, 0.0]]))
     base, moved = posterior.likelihood.actuator.displacement(
@@ -68,8 +68,8 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     dense = covariance(fixed, voltage.size) + sd[1] ** 2
     information = slope @ np.linalg.solve(dense, slope)
     left = 1 / np.sqrt(1 + exact.covariance[0, 0] * information)
-    assert found.left == pytest.approx(left, rel=0.02)
-    assert found.error < 1e-4
+    assert promise.left == pytest.approx(left, rel=0.02)
+    assert promise.error < 1e-4
 
 
 def test_a_decaying_sine_is_told_from_a_steady_one(known: tuple[Posterior, FloatArray]) -> None:
@@ -116,13 +116,13 @@ def test_the_promise_is_kept_when_the_record_is_measured(
 ) -> None:
     """Mean over twelve truths, within a quarter; a twin of a tenth of the readings is not."""
     voltage = decaying_sine(SAMPLES)
-    (found,) = promised(known, {"decaying": voltage})
+    (promise,) = promised(known, {"decaying": voltage})
     got = np.array([kept(known, voltage, seed) for seed in range(12)])
     assert np.sum(np.isfinite(got)) > 6
-    ratio = np.nanmean(got) / found.left
+    ratio = np.nanmean(got) / promise.left
     assert 0.75 < ratio < 1.33, ratio
     (less,) = promised(known, {"decaying": voltage[: SAMPLES // 10]})
-    assert less.left > 1.5 * found.left
+    assert less.left > 1.5 * promise.left
 
 
 def test_what_the_amplifier_cannot_make_is_refused_and_comes_last(

@@ -35,9 +35,9 @@ def posterior() -> Posterior:
 
 def test_the_contraction_is_that_of_the_variances(posterior: Posterior) -> None:
     """Within 0.07: four errors of 4,000 draws of either."""
-    found = of(posterior, exact(posterior))
+    made = of(posterior, exact(posterior))
     ratio = closed_form(posterior).sd / prior_moments(posterior)[1]
-    got = [found.parameters[name].contraction for name in posterior.names]
+    got = [made.parameters[name].contraction for name in posterior.names]
     np.testing.assert_allclose(got, 1 - ratio**2, atol=0.07)
     # The twin: draws that are half as wide look as if the record had taught more.
     narrow = of(posterior, exact(posterior, 0.5))
@@ -47,14 +47,14 @@ def test_the_contraction_is_that_of_the_variances(posterior: Posterior) -> None:
 
 def test_the_worst_combination_is_the_closed_forms(posterior: Posterior) -> None:
     """Of the whitened posterior covariance the largest eigenvalue, and how it moves."""
-    found = of(posterior, exact(posterior))
+    made = of(posterior, exact(posterior))
     known, (_, sd) = closed_form(posterior), prior_moments(posterior)
     whitened = known.covariance / np.outer(sd, sd)
     values, vectors = np.linalg.eigh(whitened)
-    (worst, *_) = found.combinations
+    (worst, *_) = made.combinations
     assert worst.left == pytest.approx(np.sqrt(values[-1]), abs=0.04)
     assert worst.text.split()[0] == posterior.names[int(np.argmax(np.abs(vectors[:, -1])))]
-    assert found.remarks[-1].startswith(f"determined worst: {worst.text}")
+    assert made.remarks[-1].startswith(f"determined worst: {worst.text}")
 
 
 def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Posterior) -> None:
@@ -70,14 +70,14 @@ def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Pos
     theta = posterior.prior.theta(fixed)
     density = posterior.log_likelihood(theta)
     density += posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
-    found = learned(
+    made = learned(
         posterior.prior, draws, density.reshape(draws.shape[:-1]), np.random.default_rng(2)
     )
-    offset = found.parameters["offset"]
+    offset = made.parameters["offset"]
     assert abs(offset.contraction) < 0.1
     assert offset.prior_decides
-    assert found.remarks[0].startswith("offset: the prior decides")
-    assert not found.parameters["d"].prior_decides
+    assert made.remarks[0].startswith("offset: the prior decides")
+    assert not made.parameters["d"].prior_decides
 
 
 def test_the_numbers_are_json(posterior: Posterior) -> None:

@@ -35,9 +35,9 @@ def test_good_records_are_not_odd() -> None:
     """Of eight statistics of ten records three or more are odd with a probability of 0.01."""
     odd = 0
     for seed in range(10):
-        found = looked_at(short_posterior(samples=SAMPLES, seed=seed))
-        assert list(found.statistics) == list(STATISTICS)
-        odd += sum(one.odd for one in found.statistics.values())
+        made = looked_at(short_posterior(samples=SAMPLES, seed=seed))
+        assert list(made.statistics) == list(STATISTICS)
+        odd += sum(one.odd for one in made.statistics.values())
     assert odd < 4
 
 
@@ -61,17 +61,17 @@ def test_what_the_model_does_not_do_is_odd(kind: str, statistic: str) -> None:
         "shifted": np.full(SAMPLES, 8 * size),
         "wild": 6 * size * np.random.default_rng(2).normal(size=SAMPLES),
     }[kind]
-    found = looked_at(changed(short_posterior(samples=SAMPLES), added))
-    assert found.statistics[statistic].odd
+    made = looked_at(changed(short_posterior(samples=SAMPLES), added))
+    assert made.statistics[statistic].odd
 
 
 def test_readings_that_are_missing_are_missing_in_all() -> None:
     posterior = short_posterior(samples=SAMPLES)
     displacement = posterior.only.displacement.copy()
     displacement[100:180] = np.nan
-    found = looked_at(posterior.altered(displacement=displacement))
-    assert all(np.isfinite(one.observed) for one in found.statistics.values())
-    assert not found.statistics["residual_sd_um"].odd
+    made = looked_at(posterior.altered(displacement=displacement))
+    assert all(np.isfinite(one.observed) for one in made.statistics.values())
+    assert not made.statistics["residual_sd_um"].odd
 
 
 def test_the_numbers_are_json() -> None:

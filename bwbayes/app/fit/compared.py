@@ -23,7 +23,7 @@ from bwbayes.comparison.table import table
 from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Compared", "compared"]
+__all__ = ["Compared", "Finished", "compared"]
 
 
 class Finished(Protocol):

@@ -24,7 +24,7 @@ from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Amplifier, Promise, promises, ranked
 from bwbayes.data import Record, write_record
 from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal, signal_names
@@ -33,7 +33,15 @@ from bwbayes.model.drive import time_between_turns
 from bwbayes.results.outputs import write_summary
 from bwbayes.sampling.sampler import draws
 
-__all__ = ["PRESET", "amplifier_of", "candidates_of", "design", "preset", "promised"]
+__all__ = [
+    "PRESET",
+    "amplifier_of",
+    "candidates_of",
+    "design",
+    "design_draws",
+    "preset",
+    "promised",
+]
 
 PRESET = "standard"
 
@@ -125,6 +133,46 @@ def design(
     console.print(table)
     console.print(f"wrote {out / 'best.csv'}: {made[0].name}", highlight=False, soft_wrap=True)
     return made
+
+
+def design_draws(
+    problem: Problem,
+    flat: FloatArray,
+    target: str | ArrayLike,
+    *,
+    candidates: Mapping[str, ArrayLike] | None = None,
+    voltages: tuple[float, float] | None = None,
+    rate: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
+) -> list[Promise]:
+    """Rank candidates by what they would teach; the best first.
+
+    Parameters
+    ----------
+    problem, flat
+        What was fitted, and its draws (draws, free).
+    target
+        A parameter's name, or a drive (samples,), V, whose parameter band is to be narrow.
+    candidates
+        Voltages (samples,) by name, V, at the fitted record's interval, from rest; by default the
+        preset.
+    voltages, rate, current, capacitance
+        What the amplifier can do: V, V/s, A, F.
+
+    Raises
+    ------
+    InputError
+        A target that is not a free parameter of the actuator, or limits that leave nothing.
+    """
+    limits = {"rate": rate, "current": current, "capacitance": capacitance}
+    amplifier = amplifier_of(problem, voltages, limits)
+    if candidates is None:
+        signals = candidates_of(PRESET, problem, amplifier)
+    else:
+        signals = {n: np.asarray(v, dtype=np.float64) for n, v in candidates.items()}
+    asked = target if isinstance(target, str) else np.asarray(target, dtype=np.float64)
+    return promised(problem, flat, signals, asked, amplifier)
 
 
 def promised(
@@ -227,12 +275,12 @@ def _from_file(path: Path) -> dict[str, Waveform]:
     return made
 
 
-def _drive(wanted: str, problem: Problem) -> FloatArray:
+def _drive(name: str, problem: Problem) -> FloatArray:
     """Return the voltage of a signal's name or of a record's file, at the fitted interval."""
     rate = 1 / problem.record.interval
-    if wanted in signal_names():
-        return signal(wanted).sample(rate)[1]
-    record = read_recognised(Path(wanted))
+    if name in signal_names():
+        return signal(name).sample(rate)[1]
+    record = read_recognised(Path(name))
     if not np.isclose(record.interval, problem.record.interval, rtol=1e-6):
         times = np.arange(0.0, record.duration, problem.record.interval)
         since = record.interval * np.arange(record.samples)
