@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
-from bwbayes.app.fit.compared import Compared, compared
+from bwbayes.app.fit.advice import Advice
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.compensate import Compensated, compensate_draws
@@ -65,7 +65,7 @@ HELD = {True: "yes", False: "NO", None: "unknown"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(Advice):
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
     Parameters
@@ -253,14 +253,6 @@ class Fit:
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
         return made
-
-    def compare(self, *others: Fit, **options: Any) -> Compared:
-        """Compare this fit with others of the same readings, to tell which model to take.
-
-        ``options`` (future, workers) and errors are as of
-        :func:`bwbayes.app.fit.compared.compared`.
-        """
-        return compared((self, *others), **options)
 
     def compensate(self, reference: Any, **options: Any) -> Compensated:
         """Return the voltage for a displacement that is asked for, and what is promised of it.
