@@ -31,7 +31,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.sampling.sampler import first_chain, sample
-from tests.found import keep
+from tests.measured import keep
 
 NINE = (
     "bouc-wen",

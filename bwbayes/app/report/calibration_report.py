@@ -128,12 +128,19 @@ def _percent(pair: Sequence[float]) -> str:
 
 
 def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
-    record, model, plan = problem.record, problem.config.model, problem.plan
+    model, plan = problem.config.model, problem.plan
     held_out = [v.window for v in problem.validations.values() if v.window is not None]
     judged = sum(window.stop - window.start for window in held_out)
-    fitted = sum(window.stop - window.start for window in problem.posterior.only.training)
+    windows = [window for one in problem.posterior.datasets for window in one.training]
+    fitted = sum(window.stop - window.start for window in windows)
     return [
-        ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
+        *(
+            (
+                "voltage" if len(problem.records) == 1 else f"voltage, {name}",
+                f"{record.origin}: {record.samples} samples every {record.interval:g} s",
+            )
+            for name, record in problem.records.items()
+        ),
         ("fitted, held out", f"{fitted} samples, {judged} samples"),
         ("model", in_words(model)),
         ("noise", model.noise),

@@ -35,6 +35,13 @@ CAPTIONS = {
         "points, where the 95 % bands of the parameters can be seen.",
         "Displacement against voltage of major loop, minor loop and initial curve, with bands",
     ),
+    "agreement": Caption(
+        "Do the records agree?",
+        "What each record's readings are off the joint fit, and off a fit of that record alone. "
+        "The chi-square compares where both fits have the shared parameters with how far apart "
+        "chance may put them.",
+        "Residuals of each record in the joint fit and in a fit of its own, against time",
+    ),
     "steps": Caption(
         "Step responses",
         "Displacement after a voltage step from zero, over the logarithm of time; on the right its "

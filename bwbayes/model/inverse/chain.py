@@ -201,7 +201,7 @@ class _One:
 
         def drive_of(what: FloatArray) -> FloatArray:
             if self.state is None:
-                return what[0] + undone(dynamics, what - what[0])
+                return np.asarray(what[0] + undone(dynamics, what - what[0]))
             rest = self.state.rest[0][0]
             return np.asarray(rest + undone(dynamics, what - rest, states[0]))
 
@@ -274,7 +274,7 @@ class _One:
         edge = path.high if s > 0 else path.low
         # After a limit was met the drive may not be where it was asked to be.
         goal = here + s * np.maximum(s * (target - here), 0.0)
-        if not goal[-1] != here or s * (edge - start) <= 0:
+        if goal[-1] == here or s * (edge - start) <= 0:
             return np.full(target.shape, start)
         if self.actuator.gain is None:
             operator = self.actuator.hysteresis

@@ -16,7 +16,10 @@ the displacement begins at rest for as long.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
@@ -54,14 +57,14 @@ def undone(
     outside = zeros[np.abs(zeros) > 1]
     if not outside.size:
         return np.asarray(lfilter(denominator, numerator, forced))
-    drive = _looking_ahead(numerator[0], zeros, denominator, forced)
+    drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, forced)
     if state is None:
         drive[0] = 0.0
     return drive
 
 
 def _looking_ahead(
-    first: float, zeros: FloatArray, denominator: FloatArray, forced: FloatArray
+    first: float, zeros: NDArray[Any], denominator: FloatArray, forced: FloatArray
 ) -> FloatArray:
     """Undo zeros inside of the unit circle forwards, and those outside of it backwards."""
     drive = lfilter(denominator, [first], forced).astype(np.complex128)

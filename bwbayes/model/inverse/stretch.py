@@ -167,7 +167,8 @@ def travel(steepness: float, missing: float, rate: float, rise: FloatArray) -> F
     if abs(rate) * rise.max(initial=0.0) < STRAIGHT * (steepness - missing) or part == 0:
         v = rise / (steepness - missing)
     elif part > 0:
-        v = (goal + lambertw(-part * np.exp(-goal)).real) / rate
+        turned = lambertw(-part * np.exp(-goal))  # type: ignore[call-overload]  # takes arrays too
+        v = (goal + turned.real) / rate
     else:
         v = (goal + wrightomega(np.log(-part) - goal)) / rate
     for _ in range(POLISHED):

@@ -102,7 +102,7 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
     integrated = name in ("jiles-atherton", "domain-wall")
     of = posterior(name, parts=parts)
     actuator = of.likelihood.actuator
-    theta = of.table.actuator(drawn(of, 1 if integrated else 4))
+    theta = of.only.table.actuator(drawn(of, 1 if integrated else 4))
     if parts:
         creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
         actuator = replace(actuator, gain=PolynomialGain(reference=SPAN), creep=creep)
@@ -205,7 +205,7 @@ def test_the_mirrored_displacement_needs_the_mirrored_voltage(
     """Along any turns, from the demagnetised state; and simulated, the displacement is returned."""
     of = posterior(name)
     actuator = replace(of.likelihood.actuator, dynamics="none")
-    table = dict(of.table.columns(drawn(of, 4)))
+    table = dict(of.only.table.columns(drawn(of, 4)))
     theta = np.array([[table[n][row] for n in actuator.parameters]])
     column = {n: theta[:, i] for i, n in enumerate(actuator.parameters)}
     column["offset"][:] = 0.0
