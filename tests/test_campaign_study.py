@@ -21,7 +21,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.campaign import carry_on, config_text, start
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens
-from tests.found import keep
+from tests.measured import keep
 
 SPECIMENS = int(os.environ.get("SPECIMENS", "200"))
 KILLS = int(os.environ.get("KILLS", "20"))

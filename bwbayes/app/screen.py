@@ -167,8 +167,8 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     if calibration.bands:
         table = Table("band", "of", *(f"{level} %" for level in LEVELS))
         for other, kind in product(calibration.predicted, KINDS):
-            found = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
-            covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in found)
+            coverages = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
+            covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in coverages)
             table.add_row(kind, escape(other) or "held-out samples", *covered)
         console.print(table)
     for text, power in calibration.power.items():

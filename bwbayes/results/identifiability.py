@@ -105,7 +105,7 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
-    found = []
+    lines = []
     for i in np.flatnonzero(parts > LEFT_OPEN):
         combination = _combination(directions[:, i], names)
         text = f"the record does not determine {combination}: {parts[i]:.0%} of the prior's sd left"
@@ -114,8 +114,8 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
             text += f", next {following} with {parts[i + 1]:.0%}"
         members = [name for name in names if name in combination.split()]
         decider = _decider(posterior.prior, draws, members)
-        found.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
-    return found
+        lines.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
+    return lines
 
 
 def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
@@ -166,19 +166,19 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
         if np.std(place) > ANYWHERE:
             assert parameter.declared is not None
             return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
-    found = sway(prior, draws, names)
-    if found.part > WIDE:
-        return f"the prior decides there: the posterior has {found.part:.0%} of its sd"
-    if not found.told:
-        return "whether the prior decides there cannot be told from these draws"
-    if found.decides:
+    swayed = sway(prior, draws, names)
+    if swayed.part > WIDE:
+        return f"the prior decides there: the posterior has {swayed.part:.0%} of its sd"
+    if not swayed.told:
+        return "these draws cannot tell whether the prior decides there"
+    if swayed.decides:
         return (
-            f"the prior decides there: one twice as wide moves {found.name} by {found.moved:.1f} "
-            f"of its sd and makes an interval {found.widened:.1f} times as wide"
+            f"the prior decides there: one twice as wide moves {swayed.name} by {swayed.moved:.1f} "
+            f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
         f"the prior does not decide there (one twice as wide moves nothing by more than "
-        f"{found.moved:.1f} of its sd) but the noise model, which may be too sure"
+        f"{swayed.moved:.1f} of its sd) but the noise model, which may be too sure"
     )
 
 
@@ -195,7 +195,7 @@ def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> st
     columns = first.table.columns(alone.prior.theta(its))
     opening = first.actuator.hysteresis.opening(columns, half)
     if opening is not None and float(np.median(opening)) < SMALL:
-        return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
     if len(swings) < 2:
         return "drive the actuator up and down several times, with decreasing amplitude"
     if min(swings) > (1 - ALIKE) * max(swings):

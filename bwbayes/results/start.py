@@ -67,7 +67,7 @@ class Start:
     hold: Hold | None = None
 
     def window(self, record: Record) -> slice | None:
-        """Return the samples of the lead-in, or None if nothing is to be learnt from one.
+        """Return the samples of the lead-in, or None if nothing can be learned from one.
 
         Raises
         ------

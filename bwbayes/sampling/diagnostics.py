@@ -96,33 +96,33 @@ class Check:
         First what more draws need not cure. Of effective draws, and of autocorrelation times, a
         ``part`` is enough. Every comparison is written so that nan fails it.
         """
-        found = self.disagreements()
+        reasons = self.disagreements()
         fewest = np.min([self.ess_bulk, self.ess_tail])
         if not fewest >= part * ess:
-            found.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
+            reasons.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
         times = self.steps / np.max(self.autocorrelation)
         if not times >= part * LENGTH:
             least = f"{part * LENGTH:g}"
-            found.append(
+            reasons.append(
                 f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
             )
-        return found
+        return reasons
 
     def disagreements(self) -> list[str]:
         """Say what is wrong with the draws that there are; empty if nothing is."""
-        found = []
+        reasons = []
         if not (self.rhat < LARGEST_RHAT).all():
             rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
-            found.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
+            reasons.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
             rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
-            found.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
+            reasons.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
         if self.stuck:
-            found.append(f"{self.stuck} walkers are stuck")
+            reasons.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
             shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
-            found.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
-        return found
+            reasons.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
+        return reasons
 
 
 def _told(value: float, limit: float, digits: int = 0) -> str:

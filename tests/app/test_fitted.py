@@ -331,7 +331,7 @@ def _no_run(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"train": (5, 90)}, "window 5 to 90 s: reaches outside the record"),
         ({"dynamics": "leg"}, "dynamics: 'leg' is unknown; did you mean lag?"),
         ({"validation": {"a": {"windw": (0, 1)}}}, "fit: validation.a.windw: unknown key; did you"),
-        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is no record"),
+        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is not a record"),
         ({"validation": {"a": "none.csv"}}, "none.csv: does not exist; check the path"),
     ],
 )
@@ -344,7 +344,7 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
 
 @pytest.mark.usefixtures("_no_run")
 def test_what_is_no_record_is_one_line(record: Record) -> None:
-    with pytest.raises(bw.InputError, match=r"ndarray is no record; make one with Record.from_arr"):
+    with pytest.raises(bw.InputError, match=r"ndarray is not a record; make one with Record"):
         bw.fit(record.voltage)  # type: ignore[arg-type]
     with pytest.raises(bw.InputError, match="fit: record: has no displacement"):
         bw.fit(replace(record, displacement=None, truth=None))

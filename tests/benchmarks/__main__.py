@@ -13,7 +13,7 @@ from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
-from tests.found import keep
+from tests.measured import keep
 
 # Name, sign and number of each target; what was found is in `_found`.
 TARGETS: tuple[tuple[str, str, float], ...] = (

@@ -15,8 +15,8 @@ from bwbayes.population.next_specimen import next_specimen
 from bwbayes.population.normal import Hyperprior, spreads
 from bwbayes.population.population import Spread, population
 from bwbayes.population.specimen import Specimen, likelihoods, shared, specimen_of
-from tests.found import keep
 from tests.inference.problems import short_posterior
+from tests.measured import keep
 from tests.population.populations import NAME, covered, drawn, normal_specimen
 
 QUICK, SLOW = 40, 100

@@ -17,7 +17,7 @@ __all__ = ["predict"]
 @click.command()
 @click.argument("folder", type=FILE)
 @click.option("--record", type=FILE, help="A record to predict; measured or a voltage alone.")
-@click.option("--signal", "wanted", help="A signal to predict instead, by its name.")
+@click.option("--signal", "waveform", help="A signal to predict instead, by its name.")
 @click.option("--from-rest", is_flag=True, help="The record starts from a demagnetised actuator.")
 @click.option(
     "--lead-in", type=float, default=1.0, show_default=True, help="Estimates the offset, s."
@@ -34,7 +34,7 @@ __all__ = ["predict"]
 def predict(
     folder: Path,
     record: Path | None,
-    wanted: str | None,
+    waveform: str | None,
     from_rest: bool,
     lead_in: float,
     lead_in_from: float | None,
@@ -53,9 +53,13 @@ def predict(
     from bwbayes.app.jobs.predict import predict as write
     from bwbayes.results.prediction import Start
 
-    if (record is None) == (wanted is None):
+    if (record is None) == (waveform is None):
         raise InputError("predict: give either --record or --signal")
     if not 0 < lead_in < math.inf:
-        raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
+        raise InputError(
+            f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
+        )
     begin = Start(from_rest, not same_offset, lead_in, lead_in_from)
-    return write(folder, record, wanted, begin, out, Console(), window=window, overwrite=overwrite)
+    return write(
+        folder, record, waveform, begin, out, Console(), window=window, overwrite=overwrite
+    )

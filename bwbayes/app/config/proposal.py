@@ -248,7 +248,7 @@ def _start(record: Record) -> list[str]:
     moving = float(np.ptp(few)) > MOVES * extent
     how = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
     if away:
-        return [f"# from_rest = false  # it starts {how}: its history is unknown, and found"]
+        return [f"# from_rest = false  # it starts {how}: its history is unknown, and estimated"]
     return [
         f"# from_rest = true  # it starts {how}; say so if the actuator was demagnetised and "
         "nothing moved"
@@ -312,5 +312,5 @@ def _windows(windows: list[tuple[float, float]]) -> str:
 
 
 def _quoted(text: str) -> str:
-    # A JSON string is a TOML string too, but for DEL, which no name of a column has.
+    # A JSON string is a TOML string too, except for DEL, which no column's name has.
     return json.dumps(text, ensure_ascii=False)

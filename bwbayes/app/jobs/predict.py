@@ -47,7 +47,7 @@ def predict(
     Raises
     ------
     InputError
-        No such run, a record that cannot be used, or a file that is there already.
+        No such run, a record that cannot be used, or a file that exists already.
     """
     folder = RunFolder.open(path)
     name = record.stem if record is not None else str(waveform)

@@ -13,7 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.data.io.checks import Table, VoltageIs, checked, require_voltage_is
+from bwbayes.arrays import FloatArray
+from bwbayes.data.io.checks import (
+    Table,
+    VoltageIs,
+    checked,
+    checked_reference,
+    require_voltage_is,
+)
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.hdf5 import read_hdf5, write_hdf5
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
@@ -21,7 +28,7 @@ from bwbayes.data.io.text import header_names, read_csv, write_csv
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
-__all__ = ["SUFFIXES", "column_names", "read_record", "write_record"]
+__all__ = ["SUFFIXES", "column_names", "read_record", "read_reference", "write_record"]
 
 _TEXT = (".csv", ".txt")
 _READERS: dict[str, Callable[[Path, Naming], Table]] = {
@@ -82,6 +89,20 @@ def read_record(
     return record
 
 
+def read_reference(path: str | Path) -> tuple[FloatArray, float]:
+    """Read what a displacement is to be: its samples, um, and their interval, s.
+
+    The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes;
+    a voltage in it does not count.
+
+    Raises
+    ------
+    InputError
+        For every problem, in one line, as of :func:`read_record`.
+    """
+    return checked_reference(_read_table(Path(path), Naming()))
+
+
 def column_names(path: str | Path) -> list[str]:
     """Return the names of all columns or arrays that a record's file has.
 
@@ -99,8 +120,8 @@ def column_names(path: str | Path) -> list[str]:
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
     """Write a record so that reading it gives the same numbers.
 
-    A file that stands there is replaced at once or not at all. The truth goes beside a text file,
-    and one that stands there from an earlier record is removed.
+    An existing file is replaced at once or not at all. The truth goes beside a text file, and
+    that of an earlier record is removed.
 
     Raises
     ------
@@ -115,7 +136,7 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
         _write_whole(path, lambda part: write_hdf5(record, part))
     else:
         truth_path = _truth_path(path)
-        truth_path.unlink(missing_ok=True)  # first, lest it ever stand beside another record
+        truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
         _write_whole(path, lambda part: write_csv(record, part))
         if record.truth is not None:
             truth = replace(record, displacement=record.truth)
