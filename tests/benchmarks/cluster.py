@@ -25,7 +25,7 @@ from bwbayes.app.jobs import calibrate
 from bwbayes.app.running.cluster import Cluster
 from bwbayes.app.running.workers import executor
 from bwbayes.results.replicates import as_done
-from tests.found import keep
+from tests.measured import keep
 from tests.inference.problems import short_posterior
 
 __all__ = ["main", "on_paper", "overhead", "scaling"]
