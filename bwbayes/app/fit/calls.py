@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.proposal import naming_of
 from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
@@ -36,7 +37,7 @@ def fit(
     Parameters
     ----------
     record
-        The training record, or its file.
+        The training record, or its file, whose columns are recognised unless ``columns`` says them.
     folder
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
@@ -67,6 +68,9 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
+    if isinstance(record, str | Path) and "columns" not in keys:
+        naming = naming_of(Path(record), keys.get("units"))
+        keys |= {key: table for key, table in vars(naming).items() if table}
     config, records = config_of(record, keys)
     problem = resolve(config, Path(), records)
     warn(problem.remarks, 3)
