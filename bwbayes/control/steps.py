@@ -1,7 +1,7 @@
 """Hysteresis a sample at a time, each model with a voltage of its own, as a controller needs it.
 
 A simulation gives all models one voltage that is known beforehand. In a closed loop each has its
-own, and the next one depends on what the last one did. Here an operator says what its displacement
+own, and the next one hangs on what the last one did. Here an operator says what its displacement
 would be if the voltage went straight from where it stands to somewhere else, and how steep it is
 there. That takes a bounded time, whatever was before; operators whose memory grows with the
 voltage's past have no such step, and are refused.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.stats import norm
@@ -91,12 +90,10 @@ def _require_few(outliers: int, everything: int) -> None:
 
 def _without(posterior: Posterior, rows: Mapping[str, IntArray]) -> Posterior:
     """Return the posterior without some readings of its records."""
-    datasets = []
-    for one in posterior.datasets:
-        displacement = one.displacement.copy()
-        displacement[rows[one.name]] = np.nan
-        datasets.append(replace(one, displacement=displacement))
-    return replace(posterior, datasets=tuple(datasets))
+    displacements = {one.name: one.displacement.copy() for one in posterior.datasets}
+    for name, displacement in displacements.items():
+        displacement[rows[name]] = np.nan
+    return posterior.with_readings(displacements)
 
 
 def _is_good(posterior: Posterior, aside: IntArray, row: int, place: FloatArray) -> bool:

@@ -177,7 +177,7 @@ class Actuator:
         if path.ndim != 1 or path.size == 0:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
         column = self.columns(models)
-        self._check_domain(column)
+        self.check(column)
         sections = self.sections(column)
         if state is None:
             memory = self.begin(column, path, from_rest=from_rest)
@@ -233,8 +233,8 @@ class Actuator:
     def _span(self, voltage: FloatArray) -> Span:
         return self.span or Span(float(np.min(voltage)), float(np.max(voltage)))
 
-    def _check_domain(self, column: Mapping[str, FloatArray]) -> None:
-        """Refuse what the recursion or a sum does not see."""
+    def check(self, column: Mapping[str, FloatArray]) -> None:
+        """Raise an InputError where a model is outside of the domain of a part."""
         self.hysteresis.check(column)
         self.filter.check(column)
         if self.gain is not None:

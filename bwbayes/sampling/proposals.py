@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.stats import skew
@@ -32,11 +32,15 @@ SHRINKAGE = 0.1
 LEAST_SHARE = 1e-3
 
 
+@runtime_checkable
 class Proposal(Protocol):
     """An independence proposal, as ``emcee.moves.MHMove`` takes it."""
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (count,) at coordinates (count, free), up to a constant."""
+        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
+
+    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
+        """Draw coordinates (count, free) with emcee's generator."""
 
     def __call__(
         self, coordinates: FloatArray, random: np.random.RandomState
@@ -84,16 +88,16 @@ class StudentProposal:
         )
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (count,) at coordinates (count, free), up to one constant for every fit."""
+        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
         power = 0.5 * (self.freedom + self.centre.size)
         tails = power * np.log1p(self.squares(coordinates) / self.freedom)
         density: FloatArray = -tails - self.log_volume
         return density
 
     def squares(self, coordinates: FloatArray) -> FloatArray:
-        """Squared distances |L⁻¹(x − μ)|² (count,) of coordinates (count, free) from the centre."""
+        """Squared distances |L⁻¹(x − μ)|² (..., count) of coordinates (..., count, free) from μ."""
         white = (coordinates - self.centre) @ self._whitening
-        distances: FloatArray = np.einsum("ij,ij->i", white, white)
+        distances: FloatArray = np.einsum("...j,...j->...", white, white)
         return distances
 
     @cached_property
@@ -161,9 +165,9 @@ class StudentMixture:
         return mixture
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (count,) at coordinates (count, free), up to a constant."""
+        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
         parts = [component.log_density(coordinates) for component in self.components]
-        logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
+        logs = np.stack([log + part for log, part in zip(np.log(self.weights), parts, strict=True)])
         density: FloatArray = np.logaddexp.reduce(logs)
         return density
 

@@ -40,7 +40,7 @@ from bwbayes.sampling.diagnostics import (
     nested_rhat,
     pareto_k,
 )
-from bwbayes.sampling.ensemble import Block, advance, start
+from bwbayes.sampling.ensemble import Block, advance_together, start
 from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -48,6 +48,7 @@ __all__ = [
     "Outcome",
     "SamplingPlan",
     "Watcher",
+    "best_together",
     "draws",
     "first_chain",
     "log_densities",
@@ -73,6 +74,9 @@ LEAST_STRETCH = 1.2
 # so that they are reached at the second.
 APART = 1.2
 FIRST_PART = 0.5
+
+# Walkers times samples below which a step is mostly Python's work.
+LIGHT = 1 << 16
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -100,6 +104,9 @@ class SamplingPlan:
         The budget: steps of each ensemble that count, and before.
     least_pilot_steps
         Steps of the pilot in any case.
+    together
+        Ensembles that are moved with one call of the density. A property of what is sampled, not
+        of who computes it: on the compiled engine the last bits of densities may depend on it.
     """
 
     ess: float = 2000.0
@@ -109,6 +116,7 @@ class SamplingPlan:
     most_steps: int = 20_000
     least_pilot_steps: int = 100
     most_pilot_steps: int = 3_000
+    together: int = 1
 
     def __post_init__(self) -> None:
         if self.ensembles < 4:
@@ -125,6 +133,15 @@ class Outcome:
     stop_reason: str
     check: Check
     remarks: tuple[str, ...] = ()
+
+
+def best_together(ensembles: int, walkers: int, samples: int) -> int:
+    """Return how many ensembles to move with one call, on a record of so many samples.
+
+    All where a step is light: threads would wait for each other's Python. Else each by itself, so
+    that threads can share the work.
+    """
+    return ensembles if walkers * samples <= LIGHT else 1
 
 
 def first_chain(
@@ -329,16 +346,17 @@ def _extend(
     watcher: Watcher,
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
-    proposal = chain.proposal_in_use(phase)
-    # Moves of its own for each: some of emcee's write to themselves.
-    futures = [
-        executor.submit(advance, posterior, sampling_moves(proposal), end, plan.block)
-        for end in chain.ends
-    ]
+    proposal, ends = chain.proposal_in_use(phase), chain.ends
+    futures = []
+    for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
+        # Moves of its own for each: some of emcee's write to themselves.
+        moves = [sampling_moves(proposal) for _ in group]
+        futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
     blocks: list[Block] = []
     for future in futures:
-        blocks.append(future.result())
-        watcher(phase, None)
+        for block in future.result():
+            blocks.append(block)
+            watcher(phase, None)
     chain.append(phase, blocks)
 
 

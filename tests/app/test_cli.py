@@ -29,6 +29,7 @@ COMMANDS = (
     "report",
     "calibrate",
     "export",
+    "track",
     "config",
     "models",
 )

@@ -60,9 +60,9 @@ def closed_form(posterior: Posterior) -> float:
     level = posterior.simulate(base, rows)[0]
     design = (posterior.simulate(moved, rows) - level).T
     known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
-    noise = covariance(known, posterior.voltage.size)[np.ix_(rows, rows)]
+    noise = covariance(known, posterior.only.voltage.size)[np.ix_(rows, rows)]
     whole = noise + (design * sd**2) @ design.T
-    return float(stats.multivariate_normal(level, whole).logpdf(posterior.displacement[rows]))
+    return float(stats.multivariate_normal(level, whole).logpdf(posterior.only.displacement[rows]))
 
 
 @every_case
@@ -102,7 +102,7 @@ def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
     other = Distribution("normal", {"mean": 0.4, "sd": 0.2})
     prior = JointPrior(
         [replace(d, prior=wide), replace(alpha, prior=other)],
-        posterior.actuator.hysteresis.holds,
+        posterior.only.actuator.hysteresis.holds,
     )
     mass, error = log_prior_mass(prior, np.random.default_rng(3))
 

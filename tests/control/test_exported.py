@@ -47,7 +47,8 @@ class Compiled:
 
     def __init__(self, made: Exported, folder: Path) -> None:
         (folder / "actuator.c").write_text(made.c_code(), encoding="ascii")
-        command = ["cc", *STRICT, "-shared", "-fPIC", "actuator.c", "-o", "actuator.so", "-lm"]
+        files = "actuator.c", "-o", "actuator.so", "-lm"
+        command = [needs("cc"), *STRICT, "-shared", "-fPIC", *files]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         assert (0, "") == (done.returncode, done.stderr)
         self._library = ctypes.CDLL(str(folder / "actuator.so"))
@@ -67,7 +68,6 @@ class Compiled:
 @every_hold
 def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> None:
     """Sample by sample, forward to 1e-12 of the range, and its inverse leads back."""
-    needs("cc")
     made, voltage = of(name, hold), cases.drive()
     compiled = Compiled(made, tmp_path)
     actuator = cases.actuator(name, hold)
@@ -84,7 +84,6 @@ def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> 
 
 
 def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
-    needs("cc")
     compiled = Compiled(of("bouc-wen, second-order", "zero", Span(-40.0, 50.0)), tmp_path)
     reference = np.repeat([1e3, -1e3, np.inf, 5.0], 40)
     command = compiled.run("inverse", 0.0, reference)
@@ -93,7 +92,6 @@ def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
 
 
 def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None:
-    needs("cc")
     actuator = Actuator("none")
     theta = cases.theta(actuator)[0]
     theta[actuator.parameters.index("d")] = 0.4

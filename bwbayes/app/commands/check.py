@@ -26,7 +26,6 @@ def check(config: Path, record: Path | None, out: Path | None) -> int:
 
     chosen = config_or_proposal(config, Console(quiet=True), refuse=False)
     if record is not None:
-        source = chosen.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        chosen = chosen.model_copy(update={"record": source})
+        chosen = chosen.with_record(record)
     look(chosen, config.parent, out or Path("results") / f"{config.stem}-check", Console())
     return 0

@@ -19,6 +19,7 @@ from bwbayes.app.commands.calibrate import calibrate
 from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.compare import compare
+from bwbayes.app.commands.compensate import compensate
 from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -27,6 +28,7 @@ from bwbayes.app.commands.report import report
 from bwbayes.app.commands.run import resume, run
 from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
 from bwbayes.app.commands.simulate import simulate
+from bwbayes.app.commands.track import track
 from bwbayes.errors import InputError
 
 __all__ = ["main"]
@@ -52,7 +54,9 @@ for command in (
     simulate,
     calibrate,
     campaign,
+    compensate,
     export,
+    track,
     compare,
     config,
     models,

@@ -82,7 +82,7 @@ def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> 
         )
     _show(made, console)
     held = "held_out" in made.config.validation
-    train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.record.train or ())
+    train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.records["record"].train or ())
     rest = "the rest is held out" if held else "nothing is held out"
     console.print(
         f"fitting {train}; {rest}; `bwbayes init {path}` writes this as a config",

@@ -45,8 +45,7 @@ def run(
 
     chosen = config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
-        source = chosen.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        chosen = chosen.model_copy(update={"record": source})
+        chosen = chosen.with_record(record)
     if seed is not None:
         chosen = chosen.model_copy(update={"seed": seed})
     if chosen.name is None:

@@ -126,7 +126,7 @@ class _Source(Table):
 
 
 class RecordConfig(_Source):
-    """The training record: its source, the readings to use, and the windows to fit.
+    """A training record: its source, the readings to use, and the windows to fit.
 
     ``start``, ``exclude`` and ``decimate`` leave out readings, never the voltage: the simulation
     runs from the file's first sample.
@@ -277,6 +277,14 @@ class ValidationConfig(_Source):
             "The part of the training record that is held out, or of another record to judge.",
             unit="s",
             example="[12.0, 16.0]",
+        ),
+    ] = None
+    of: Annotated[
+        str | None,
+        described(
+            "Of several training records, the one that the window is of, or whose own parameters "
+            "another record takes where nothing tells its own; by default the first.",
+            example='"record"',
         ),
     ] = None
     from_rest: Annotated[

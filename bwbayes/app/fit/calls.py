@@ -7,12 +7,14 @@ what either has written, and :func:`resume_run` goes on with it.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.config.proposal import naming_of
-from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.fit.fitted import Fit, carried_on, to_know
+from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
@@ -23,7 +25,7 @@ __all__ = ["fit", "open_run", "resume_run"]
 
 
 def fit(
-    record: Record | str | Path,
+    record: Record | str | Path | Sequence[Any] | Mapping[str, Any],
     *,
     folder: str | Path | None = None,
     overwrite: bool = False,
@@ -38,6 +40,9 @@ def fit(
     ----------
     record
         The training record, or its file, whose columns are recognised unless ``columns`` says them.
+        Several records of one actuator are fitted jointly: a list of them, or a dict by name, in
+        which a record may be a dict of the keys of [record.NAME], with ``record`` the record
+        itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
     folder
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.

@@ -17,7 +17,8 @@ from bwbayes.app.config.keywords import config_of
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.fit.calls import open_run
-from bwbayes.app.fit.fitted import Fit, Scratch, console_of, warn
+from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.campaign import carry_on, config_text, start
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder

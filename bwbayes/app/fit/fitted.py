@@ -9,11 +9,6 @@ does. What the command line prints as a remark is a warning here
 from __future__ import annotations
 
 import shutil
-import sys
-import tempfile
-import warnings
-import weakref
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import StringIO
@@ -24,10 +19,14 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.compared import Compared, compared
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.run import (
@@ -45,8 +44,9 @@ from bwbayes.app.screen import (
     show_result,
 )
 from bwbayes.control.exported import Exported
+from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
-from bwbayes.errors import InputWarning, NotConvergedError
+from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -58,7 +58,7 @@ from bwbayes.sampling.storage import ChainFile
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Fit", "Scratch", "carried_on", "console_of", "to_know", "warn"]
+__all__ = ["Fit", "carried_on", "to_know"]
 
 # Whether bands hold, in a word.
 HELD = {True: "yes", False: "NO", None: "unknown"}
@@ -127,7 +127,7 @@ class Fit:
         Its attribute ``converged`` is 1 or 0.
         """
         density = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, density, self.problem.record)
+        return posterior_tree(self.result, density, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -171,22 +171,26 @@ class Fit:
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted, and where there is no reading.
+        nan where nothing was predicted, and where there is no reading. Those of several records
+        are those of their bands: ``fit.bands["step_10"].residuals``.
 
         Raises
         ------
         NotConvergedError
             The sampling has not converged.
+        InputError
+            Several records were fitted.
         """
         import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
 
+        if len(self.problem.records) > 1:
+            raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
         record = self.problem.record
         values = np.full(record.samples, np.nan)
-        for name, bands in self.bands.items():
-            other = self.problem.validations.get(name)
-            if other is None or other.window is not None:
-                first = round((float(bands.time[0]) - record.start) / record.interval)
-                values[first : first + bands.time.size] = bands.residuals
+        for name in self.problem.windows("record"):
+            bands = self.bands[name]
+            first = round((float(bands.time[0]) - record.start) / record.interval)
+            values[first : first + bands.time.size] = bands.residuals
         time = ("time", record.time, {"units": "s"})
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
@@ -250,15 +254,38 @@ class Fit:
             warn([made.verdict.line], 3)
         return made
 
+    def compare(self, *others: Fit, **options: Any) -> Compared:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        ``options`` (future, workers) and errors are as of
+        :func:`bwbayes.app.fit.compared.compared`.
+        """
+        return compared((self, *others), **options)
+
+    def compensate(self, reference: Any, **options: Any) -> Compensated:
+        """Return the voltage for a displacement that is asked for, and what is promised of it.
+
+        All is as of :func:`bwbayes.app.jobs.compensate.compensate_draws`.
+        """
+        made = compensate_draws(self.problem, self._converged().flat_draws, reference, **options)
+        warn(made.remarks, 3)
+        return made
+
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-        ``options`` (limits, rate, hold, overwrite) and errors are as of
-        :func:`bwbayes.app.jobs.export.export_draws`. What is returned has the ``linear`` part as a
-        discrete ``scipy.signal`` system.
+        Options and errors are those of :func:`bwbayes.app.jobs.export.export_draws`. What is
+        returned has the ``linear`` part as a discrete ``scipy.signal`` system.
         """
         draws = self._converged().flat_draws
         return export_draws(self.problem, draws, Path(folder), **options)[0]
+
+    def track(self, **options: Any) -> Tracking:
+        """Say how well a closed loop would follow, with and without the model.
+
+        Options are the fields of :class:`bwbayes.app.jobs.track.Setup`.
+        """
+        return track_draws(self.problem, self._converged().flat_draws, Setup(**options))
 
     def resume(
         self,
@@ -335,14 +362,6 @@ class Fit:
         )
 
 
-class Scratch:
-    """A temporary folder that is removed when nobody needs it any more."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
-        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
-
-
 def carried_on(
     folder: RunFolder,
     scratch: Scratch | None,
@@ -370,22 +389,9 @@ def carried_on(
     return made
 
 
-def console_of(progress: bool) -> Console:
-    """Return where progress goes: the terminal's own lines, and in a notebook plain ones."""
-    if Console(quiet=True).is_jupyter:
-        return Console(file=sys.stdout, force_jupyter=False, quiet=not progress)
-    return Console(stderr=True, quiet=not progress)
-
-
 def to_know(made: Fit) -> list[str]:
     """Return what the command line would print of a finished run."""
     lines = [*made.remarks, *(verdict.line for verdict in made.result.failed)]
     if not made.converged:
         lines.append(f"not converged: {made.outcome.stop_reason}; no interval is given")
     return lines
-
-
-def warn(lines: Iterable[str], level: int) -> None:
-    """Warn of each line; the caller of the function that calls this is level 3."""
-    for line in lines:
-        warnings.warn(line, InputWarning, stacklevel=level)

@@ -87,11 +87,12 @@ def experiment(problem: Problem) -> Experiment:
     problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
     windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
     others = {
-        name: OtherRecord(v.record, v.start, v.judged)
+        name: OtherRecord(v.record, v.start, v.judged, v.of)
         for name, v in problem.validations.items()
         if v.record is not None
     }
-    return Experiment(problem.posterior, problem.plan, windows, others)
+    belongs = {name: problem.validations[name].of for name in windows}
+    return Experiment(problem.posterior, problem.plan, windows, others, belongs=belongs)
 
 
 def carry_on(
@@ -144,7 +145,7 @@ def carry_on(
 
 def _identity(problem: Problem) -> str:
     """Return a digest of everything that replicates depend on."""
-    return sha256((dump(problem.config) + problem.record.sha256).encode()).hexdigest()
+    return sha256((dump(problem.config) + problem.sha256).encode()).hexdigest()
 
 
 def _make(
@@ -249,7 +250,7 @@ def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration
     """
     numbers = summary(calibration) | {
         "seed": problem.config.seed,
-        "data_sha256": problem.record.sha256,
+        "data_sha256": problem.sha256,
         "versions": versions(problem.posterior.engine),
     }
     figures = draw_calibration(calibration, problem.parameters)

@@ -45,7 +45,7 @@ from bwbayes.results.verdict import Background, assess
 from bwbayes.sampling.sampler import Outcome, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "write"]
+__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "require_same", "write"]
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,9 @@ def compare_models(
     for name, problem in problems.items():
         folder = _folder(out / slug(name), problem, overwrite)
         console.print(f"{name} ...", highlight=False)
-        run = go_on(folder, console, workers=workers)
-        runs.append(Fitted(name, run.problem, run.chain, run.outcome))
+        if not folder.summary.is_file():
+            go_on(folder, console, workers=workers)
+        runs.append(Fitted(name, *finished(folder)))
         require_same(runs[0], runs[-1])
     made = compare(runs, console, workers=workers, with_future=with_future)
     write(made, runs, out)
@@ -173,7 +174,7 @@ def require_same(one: Fitted, other: Fitted) -> None:
             f"{pair}: fitted to different records, or in different units; compare fits of one "
             "record, with the same readings left out"
         )
-    if ours.posterior.training != theirs.posterior.training:
+    if ours.posterior.only.training != theirs.posterior.only.training:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
     held = [_held_out(problem) for problem in (ours, theirs)]
     if held[0] != held[1]:
@@ -224,8 +225,8 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         run.outcome.converged,
         run.outcome.stop_reason,
         posterior.prior.dimensions,
-        posterior.readings.rows.size,
-        not isinstance(posterior.actuator.hysteresis, NoHysteresis),
+        posterior.only.readings.rows.size,
+        not isinstance(posterior.only.actuator.hysteresis, NoHysteresis),
     )
     if not run.outcome.converged:
         return plain

@@ -29,7 +29,7 @@ def render(comparison: Comparison, problem: Problem) -> str:
         models=[(one.name, one.model) for one in comparison.candidates],
         facts=[
             ("record", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
-            ("readings fitted", str(problem.posterior.readings.rows.size)),
+            ("readings fitted", str(problem.posterior.only.readings.rows.size)),
             ("held out", ", ".join(held_out) or "nothing"),
         ],
     )

@@ -74,10 +74,8 @@ class RunFolder:
         try:
             shutil.rmtree(draft, ignore_errors=True)
             (draft / "records").mkdir(parents=True)
-            write_record(problem.record, draft / "records/record.h5")
-            for name, validation in problem.validations.items():
-                if validation.record is not None:
-                    write_record(validation.record, draft / f"records/{name}.h5")
+            for name, record in {**problem.records, **problem.others}.items():
+                write_record(record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
             if cls.MARK:
                 (draft / cls.MARK).write_bytes(mark)
@@ -113,7 +111,7 @@ class RunFolder:
 
     def _has_records(self) -> bool:
         """Tell a folder that was made from one that holds a config alone."""
-        return (self.path / "records/record.h5").is_file()
+        return any((self.path / "records").glob("*.h5"))
 
     def _is_of_its_kind(self) -> bool:
         """Tell a run's folder from a calibration's."""

@@ -8,7 +8,7 @@ on the data alone: the same record under another name gets the same bands.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from html import escape
 from io import StringIO
@@ -131,6 +131,7 @@ def predict_another(
     start: Start,
     name: str,
     window: tuple[float, float] | None = None,
+    of: str | None = None,
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
@@ -148,6 +149,9 @@ def predict_another(
         Name of the bands.
     window
         Start and stop in s of the part that is predicted and judged; by default all of it.
+    of
+        The training record whose own parameters it takes where nothing tells its own; by default
+        the first.
 
     Raises
     ------
@@ -158,32 +162,30 @@ def predict_another(
     remarks = tuple(beyond_training(posterior, record.voltage, record.interval))
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"predict {record.sha256}")
-    bands = predict_record(posterior, chosen, record, start, source, name, window)
+    of = next(iter(problem.records)) if of is None else of
+    alone, its = posterior.alone(of), posterior.its(chosen, of)
+    bands = predict_record(alone, its, record, start, source, name, window)
     verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
     scores = None if verdict is None else score(bands, scoring(seed, bands))
     return Prediction.of(bands, scores, verdict, remarks)
 
 
 def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
-    """Predict the training windows and everything held out."""
+    """Predict the training windows of all records and everything held out."""
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(result.flat_draws, generator(seed, "draws"))
-    training = posterior.only.training
-    windows = {
-        "training" if len(training) == 1 else f"training-{i + 1}": window
-        for i, window in enumerate(training)
-    }
-    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    # By content: the same record under another name gets the same bands.
-    source = generator(seed, f"predict {problem.record.sha256}")
-    bands = predict_windows(posterior, chosen, problem.record, windows, source)
+    bands: list[Bands] = []
+    for name, alone, its in posterior.each(chosen):
+        record, windows = problem.records[name], problem.windows(name)
+        # By content: the same record under another name gets the same bands.
+        source = generator(seed, f"predict {record.sha256}")
+        bands += predict_windows(alone, its, record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:
             source = generator(seed, f"predict {other.record.sha256}")
+            alone, its = posterior.alone(other.of), posterior.its(chosen, other.of)
             bands.append(
-                predict_record(
-                    posterior, chosen, other.record, other.start, source, name, other.judged
-                )
+                predict_record(alone, its, other.record, other.start, source, name, other.judged)
             )
     return tuple(bands)
 
@@ -192,21 +194,23 @@ def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    series: Innovations,
-    moved: Moved | None,
+    series: Mapping[str, Innovations],
+    moved: Mapping[str, Moved | None],
 ) -> dict[str, Verdict]:
-    """Judge all bands that have readings, by name."""
-    start = innovations.odd_start(series)
+    """Judge all bands that have readings, by name.
+
+    ``series`` and ``moved`` are by the name of the training record.
+    """
+    records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for one in bands:
-        # Of several training windows the first one holds the start.
-        at_start = one.training and one.time[0] <= series.time[0] <= one.time[-1]
         far = beyond_training(problem.posterior, one.voltage, one.interval)
-        verdict = (
-            assess(one, background, start=start, moved=moved, beyond=far)
-            if at_start
-            else assess(one, background, beyond=far)
-        )
+        record = records.get(one.name) if one.training else None
+        start, away = None, None
+        # Of several training windows the first one holds the start.
+        if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
+            start, away = innovations.odd_start(series[record]), moved[record]
+        verdict = assess(one, background, start=start, moved=away, beyond=far)
         if verdict is not None:
             verdicts[one.name] = verdict
     return verdicts

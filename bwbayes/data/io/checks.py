@@ -34,6 +34,7 @@ __all__ = [
     "Table",
     "VoltageIs",
     "checked",
+    "checked_reference",
     "named_columns",
     "require_voltage_is",
 ]
@@ -203,6 +204,23 @@ def checked(
         origin=origin,
         truth=values.get("truth"),
     )
+
+
+def checked_reference(table: Table) -> tuple[FloatArray, float]:
+    """Return a displacement that is asked for, (samples,), um, and its sampling interval, s.
+
+    Raises
+    ------
+    InputError
+        For the first problem, in one line.
+    """
+    _check_lengths(table, ("time", "displacement"))
+    _, interval, _ = _time_grid(table, held=False)
+    values = _converted(table, "displacement")
+    if np.isnan(values).any():
+        sample = int(np.argmax(np.isnan(values)))
+        raise table.error("not a number; give one at every sample", "displacement", sample)
+    return values, interval
 
 
 def _check_lengths(table: Table, needed: Iterable[str]) -> None:

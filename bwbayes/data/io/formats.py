@@ -13,7 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.data.io.checks import Table, VoltageIs, checked, require_voltage_is
+from bwbayes.arrays import FloatArray
+from bwbayes.data.io.checks import (
+    Table,
+    VoltageIs,
+    checked,
+    checked_reference,
+    require_voltage_is,
+)
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.hdf5 import read_hdf5, write_hdf5
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
@@ -21,7 +28,7 @@ from bwbayes.data.io.text import header_names, read_csv, write_csv
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
-__all__ = ["SUFFIXES", "column_names", "read_record", "write_record"]
+__all__ = ["SUFFIXES", "column_names", "read_record", "read_reference", "write_record"]
 
 _TEXT = (".csv", ".txt")
 _READERS: dict[str, Callable[[Path, Naming], Table]] = {
@@ -80,6 +87,20 @@ def read_record(
     if path.suffix.lower() in _TEXT and truth_path.exists():
         return _with_truth(record, truth_path)
     return record
+
+
+def read_reference(path: str | Path) -> tuple[FloatArray, float]:
+    """Read what a displacement is to be: its samples, um, and their interval, s.
+
+    The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes;
+    a voltage in it does not count.
+
+    Raises
+    ------
+    InputError
+        For every problem, in one line, as of :func:`read_record`.
+    """
+    return checked_reference(_read_table(Path(path), Naming()))
 
 
 def column_names(path: str | Path) -> list[str]:

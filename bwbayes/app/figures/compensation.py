@@ -1,0 +1,118 @@
+"""A command that compensates, in pictures: what is reached, its error, the loop before, after."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures.style import (
+    BAND_COLOURS,
+    COLOURS,
+    MEAN_COLOUR,
+    STYLE,
+    envelope,
+    plain,
+    zigzag,
+)
+from bwbayes.arrays import FloatArray
+from bwbayes.control.compensation import Compensation, Played
+
+__all__ = ["draw_compensation", "draw_compensations"]
+
+LINEAR_COLOUR, ASKED_COLOUR = COLOURS[3], "#222222"
+
+
+def draw_compensations(made: Compensation) -> dict[str, Figure]:
+    """Draw all figures of a compensation, by name: ``tracking``, ``error``, ``loops``."""
+    with mpl.rc_context(STYLE):
+        return {
+            "tracking": _tracking(made),
+            "error": _error(made),
+            "loops": _loops(made),
+        }
+
+
+def draw_compensation(made: Compensation) -> Figure:
+    """Draw what is asked for and what is predicted, and the error with its bands."""
+    with mpl.rc_context(STYLE):
+        return _tracking(made)
+
+
+def _tracking(made: Compensation) -> Figure:
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    top, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(1, 2, 2))
+    time = made.reference.time
+    top.plot(*zigzag(time, made.linear.voltage), color=LINEAR_COLOUR, label="uncompensated")
+    top.plot(*zigzag(time, made.voltage), color=MEAN_COLOUR, label="compensated")
+    top.set_ylabel("voltage (V)")
+    top.set_title(plain(f"command for {made.reference.name}"))
+    _ribbon(middle, made, made.compensated, 0.0)
+    middle.plot(*zigzag(time, made.linear.bands.mean), color=LINEAR_COLOUR, label="uncompensated")
+    middle.plot(*zigzag(time, made.compensated.bands.mean), color=MEAN_COLOUR, label="compensated")
+    middle.plot(*zigzag(time, made.asked), "--", color=ASKED_COLOUR, label="reference")
+    middle.set_ylabel("displacement (µm)")
+    _errors(below, made)
+    below.set_xlabel("time (s)")
+    for panel in (top, middle, below):
+        panel.legend(loc="upper right", ncols=4, fontsize=8)
+    return figure
+
+
+def _error(made: Compensation) -> Figure:
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    along, spread = figure.subplots(1, 2, width_ratios=(2, 1))
+    _errors(along, made, without=False)
+    along.set_xlabel("time (s)")
+    along.legend(loc="upper right", fontsize=8)
+    for played, colour, name in (
+        (made.linear, LINEAR_COLOUR, "uncompensated"),
+        (made.compensated, MEAN_COLOUR, "compensated"),
+    ):
+        spread.hist(played.rms, bins=40, density=True, color=colour, alpha=0.6, label=name)
+    spread.set_xlabel("rms of the error (µm)")
+    spread.set_ylabel("density")
+    spread.set_xscale("log")
+    spread.legend(fontsize=8)
+    return figure
+
+
+def _loops(made: Compensation) -> Figure:
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    before, after = figure.subplots(1, 2, sharex=True, sharey=True)
+    for panel, played, title in (
+        (before, made.linear, "without compensation"),
+        (after, made.compensated, "with compensation"),
+    ):
+        low, high = float(made.asked.min()), float(made.asked.max())
+        panel.plot([low, high], [low, high], "--", color=ASKED_COLOUR, label="as asked for")
+        panel.plot(made.asked, played.bands.mean, color=MEAN_COLOUR, label="predicted")
+        panel.set_title(title)
+        panel.set_xlabel("reference (µm)")
+        panel.legend(fontsize=8)
+    before.set_ylabel("displacement (µm)")
+    return figure
+
+
+def _errors(panel: Axes, made: Compensation, *, without: bool = True) -> None:
+    time = made.reference.time
+    _ribbon(panel, made, made.compensated, made.asked)
+    if without:
+        error = made.linear.bands.mean - made.asked
+        panel.plot(*zigzag(time, error), color=LINEAR_COLOUR, label="uncompensated")
+    error = made.compensated.bands.mean - made.asked
+    panel.plot(*zigzag(time, error), color=MEAN_COLOUR, label="compensated")
+    if made.limit is not None:
+        for side in (-made.limit, made.limit):
+            panel.axhline(side, color=ASKED_COLOUR, lw=0.8, ls=":")
+    panel.set_ylabel("error (µm)")
+
+
+def _ribbon(panel: Axes, made: Compensation, played: Played, about: float | FloatArray) -> None:
+    """Draw the 95 % bands of displacement and parameters about something."""
+    for kind in ("displacement", "parameter"):
+        lower = played.bands.lower[kind, 95] - about
+        upper = played.bands.upper[kind, 95] - about
+        drawn = envelope(made.reference.time, lower, upper)
+        name = {"displacement": "95 % displacement", "parameter": "95 % parameters alone"}[kind]
+        panel.fill_between(*drawn, fc=BAND_COLOURS[kind], lw=0, label=name)

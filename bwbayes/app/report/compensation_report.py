@@ -1,0 +1,87 @@
+"""The page of a compensation: what is promised, beside what a linear command would do; pictures.
+
+One HTML file that needs nothing else, as the report of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from bwbayes.app.report.report import picture, template
+from bwbayes.results.bands import LEVELS
+
+if TYPE_CHECKING:
+    from bwbayes.control.compensation import Compensation
+
+__all__ = ["render"]
+
+CAPTIONS = {
+    "tracking": (
+        "Reference and prediction",
+        "The command, the displacement that it will give with its 95 % bands, and the error; "
+        "beside it what a linear command would do.",
+    ),
+    "error": (
+        "Error",
+        "Left: the tracking error with its 95 % bands; dotted, the limit. Right: what its rms may "
+        "be, with the discrepancy, over the draws.",
+    ),
+    "loops": (
+        "Before and after",
+        "What is predicted against what is asked for: without compensation the loop is open.",
+    ),
+}
+
+
+def render(made: Compensation, pictures: Mapping[str, bytes]) -> str:
+    """Return the page; ``pictures`` are PNG files by the name of their figure."""
+    summary = made.summary
+    both = ("compensated", "uncompensated")
+    rows = [("Voltage", "V", [_span(summary[one]["voltage_V"]) for one in both])]
+    for key, title in (("rms_um", "Rms of the error"), ("largest_um", "Largest error")):
+        values = [summary[one][key] for one in both]
+        rows.append((f"{title}, mean", "µm", [f"{one['mean']:.3g}" for one in values]))
+        rows += [
+            (f"{title}, {level} % interval", "µm", [_span(one[str(level)]) for one in values])
+            for level in LEVELS
+        ]
+    if made.limit is not None:
+        texts = [f"{summary[one]['probability_below_limit']:.3f}" for one in both]
+        rows.append((f"Probability that the error stays below {made.limit:g} µm", "", texts))
+    return template("compensation.html.j2").render(
+        name=made.reference.name,
+        summary=summary,
+        rows=rows,
+        facts=_facts(made, summary),
+        remarks=made.remarks,
+        pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
+    )
+
+
+def _facts(made: Compensation, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    other = summary["other_command"]
+    chosen = {"mean": "inverse of the mean model", "expected": "least expected squared error"}
+    rest = {"mean": "expected", "expected": "mean"}[made.command]
+    between = {"zero": "held", "first": "straight lines"}[made.hold]
+    return [
+        (
+            "Reference",
+            f"{summary['from_um']:.4g} to {summary['to_um']:.4g} µm, "
+            f"{summary['samples']} samples every {summary['interval_s']:g} s",
+        ),
+        ("Command", chosen[made.command]),
+        (
+            "The other command",
+            f"{chosen[rest]}: differs by up to {other['largest_difference_V']:.3g} V, and leaves "
+            f"{other['expected_rms_um']:.4g} µm (rms expected over the draws, without the "
+            f"discrepancy) where this one leaves "
+            f"{summary['compensated']['expected_rms_um']:.4g} µm",
+        ),
+        ("Voltage between samples", between),
+        ("Start", "demagnetised at zero volts" if made.from_rest else "unknown"),
+    ]
+
+
+def _span(edges: list[float]) -> str:
+    return f"{edges[0]:.4g} to {edges[1]:.4g}"

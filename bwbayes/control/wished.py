@@ -1,0 +1,158 @@
+"""What a displacement is to be over time: from a file, or one of the usual shapes.
+
+The shapes begin at rest at zero, go smoothly to their middle, and have their corners rounded:
+no actuator with a lag follows a jump, nor a speed that jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import sawtooth
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.errors import InputError, suggestion
+
+__all__ = ["SHAPES", "Reference", "shaped"]
+
+# A reference with fewer samples than this says nothing.
+SHORTEST = 10
+
+# Part of a period that a shape rests before it begins, and by which its corners are rounded (sd).
+REST, ROUNDED = 0.25, 0.01
+
+# The part of a raster's period in which its line is written; the rest is the way back.
+WRITTEN = 0.9
+
+MOST_SAMPLES = 10**7
+
+
+def _staircase(turns: FloatArray, levels: int) -> FloatArray:
+    return np.round(levels * sawtooth(2 * np.pi * (turns + 0.25), 0.5)) / levels
+
+
+SHAPES: Mapping[str, Callable[[FloatArray, int], FloatArray]] = {
+    "sine": lambda turns, _: np.sin(2 * np.pi * turns),
+    "triangle": lambda turns, _: sawtooth(2 * np.pi * (turns + 0.25), 0.5),
+    "staircase": _staircase,
+    "raster": lambda turns, _: sawtooth(2 * np.pi * (turns + WRITTEN / 2), WRITTEN),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What a displacement is to be, (samples,), um, at a sampling interval, s.
+
+    Parameters
+    ----------
+    displacement, interval
+        As above.
+    name
+        What it is called.
+    smoothed
+        Sd of the Gaussian that smooths it, s; zero leaves it as it is.
+
+    Raises
+    ------
+    InputError
+        Fewer than ten samples, one that is not finite, a constant, or times that are none.
+    """
+
+    displacement: ArrayLike
+    interval: float
+    name: str = "reference"
+    smoothed: float = 0.0
+    given: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        values = np.array(self.displacement, dtype=np.float64)
+        if values.ndim != 1 or values.size < SHORTEST:
+            raise InputError(
+                f"{self.name}: shape {values.shape}; give one row of {SHORTEST} samples or more"
+            )
+        if not np.isfinite(values).all():
+            sample = int(np.argmin(np.isfinite(values)))
+            raise InputError(f"{self.name}: sample {sample} is not a finite number; give all")
+        if not np.ptp(values) > 0:
+            raise InputError(f"{self.name}: is {values[0]:g} um all along; give one that moves")
+        if not 0 < self.interval < math.inf or not 0 <= self.smoothed < math.inf:
+            raise InputError(
+                f"{self.name}: interval {self.interval:g} s, smoothed over {self.smoothed:g} s; "
+                "give a positive interval, and a smoothing that is not negative"
+            )
+        smooth: FloatArray = values
+        if self.smoothed > 0:
+            sd = self.smoothed / self.interval
+            smooth = np.asarray(gaussian_filter1d(values, sd, mode="nearest"))
+        object.__setattr__(self, "given", values)
+        object.__setattr__(self, "displacement", smooth)
+
+    @property
+    def time(self) -> FloatArray:
+        """Times of the samples, (samples,), s."""
+        return np.asarray(self.interval * np.arange(np.size(self.displacement), dtype=np.float64))
+
+    @property
+    def moved(self) -> float:
+        """How far the smoothing moves it at most, um."""
+        return float(np.max(np.abs(np.asarray(self.displacement) - self.given)))
+
+
+def shaped(
+    shape: str,
+    interval: float,
+    amplitude: float,
+    frequency: float,
+    *,
+    middle: float = 0.0,
+    periods: float = 3.0,
+    levels: int = 5,
+    smoothed: float | None = None,
+) -> Reference:
+    """Return one of the usual shapes.
+
+    Parameters
+    ----------
+    shape
+        ``"sine"``; ``"triangle"``; ``"staircase"``, as many ``levels`` from the middle to either
+        end; ``"raster"``, lines that are written slowly, with quick ways back.
+    interval, amplitude, frequency, middle, periods
+        Sampling interval, s; um; Hz; um; how many periods, or lines.
+    smoothed
+        Sd of the smoothing, s; by default a hundredth of a period.
+
+    Raises
+    ------
+    InputError
+        An unknown shape, or a number that makes no sense.
+    """
+    if shape not in SHAPES:
+        raise InputError(f"reference: {shape!r} is unknown; {suggestion(shape, SHAPES)}")
+    numbers = {"interval": interval, "amplitude": amplitude, "frequency": frequency}
+    numbers |= {"periods": periods, "levels": levels}
+    for name, value in numbers.items():
+        if not 0 < value < math.inf:
+            raise InputError(f"{shape}: {name} {value:g}; must be positive")
+    if not math.isfinite(middle):
+        raise InputError(f"{shape}: middle {middle:g} um; must be finite")
+    if not 2 * frequency * interval < 1:
+        raise InputError(
+            f"{shape}: {frequency:g} Hz cannot be sampled every {interval:g} s; make it slower"
+        )
+    if periods / (frequency * interval) > MOST_SAMPLES:
+        raise InputError(f"{shape}: more than {MOST_SAMPLES} samples; make it shorter")
+    samples = round(periods / (frequency * interval)) + 1
+    swung: FloatArray = amplitude * SHAPES[shape](
+        frequency * interval * np.arange(samples, dtype=np.float64), levels
+    )
+    rest = np.zeros(max(round(REST / (frequency * interval)), 1))
+    if middle:
+        risen = round(1 / (frequency * interval))
+        way = (1 - np.cos(np.pi * np.arange(risen) / risen)) / 2
+        rest = np.concatenate([rest, middle * way, np.full(rest.size, middle)])
+    sd = ROUNDED / frequency if smoothed is None else smoothed
+    return Reference(np.concatenate([rest, middle + swung]), interval, shape, sd)

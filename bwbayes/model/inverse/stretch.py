@@ -1,0 +1,177 @@
+"""Where along one monotone stretch a displacement is reached: for any operator, and in closed form.
+
+Along a stretch the voltage goes one way, and so does the displacement. So each sample asks for one
+root of one rising curve. :func:`reached` finds all of them together for any curve that can be
+walked along; :func:`travel` is the closed form for a slope that settles exponentially, which n = 1
+Bouc-Wen and Prandtl-Ishlinskii with exponential thresholds share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.special import lambertw, wrightomega
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["reached", "travel"]
+
+# Places at which a curve is looked at first.
+GRID = 33
+
+# Doublings of the first reach, and rounds of the root search; each ends by far earlier.
+DOUBLINGS, ROUNDS = 60, 100
+
+EPSILON = float(np.finfo(np.float64).eps)
+
+# Below this rate times travel a curve counts as straight for the first guess.
+STRAIGHT = 1e-6
+
+# Newton's steps after the closed form: they take away what cancels in it.
+POLISHED = 2
+
+
+def reached(
+    along: Callable[[FloatArray], FloatArray],
+    target: FloatArray,
+    start: float,
+    edge: float,
+    first: float,
+) -> FloatArray:
+    """Return the voltages (samples,) at which a curve goes through its targets.
+
+    Parameters
+    ----------
+    along
+        The curve: displacements (points,), um, along voltages (points,) that go one way from the
+        start, V.
+    target
+        (samples,), um, all on one side of where the curve starts, in the order of the path.
+    start, edge
+        Voltages at which the curve starts and beyond which it is not followed, V. Where a target
+        lies beyond what the edge gives, the edge is returned.
+    first
+        A first guess of how far the path goes, V, above zero.
+
+    Notes
+    -----
+    All samples lie on one path, so that one walk along it serves them all. The root search is that
+    of T. R. Chandrupatla, Advances in Engineering Software 28, 145-149 (1997): inverse quadratic
+    steps, and bisection where they are not safe.
+    """
+    s = 1.0 if edge >= start else -1.0
+    here = float(along(np.array([start]))[0])
+    goal = np.maximum.accumulate(np.maximum(s * (target - here), 0.0))
+    far, room = _far_enough(
+        along, start, edge, s, min(first, abs(edge - start)), here + s * goal[-1]
+    )
+    if room == 0.0:
+        return np.full(target.shape, far)
+    points = start + s * room * np.linspace(0.0, 1.0, GRID)
+    points[-1] = far
+    heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
+    heights = np.maximum.accumulate(heights)
+    above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
+    result = _searched(
+        lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
+        (points[above - 1], points[above]),
+        (heights[above - 1] - goal, heights[above] - goal),
+    )
+    return np.where(goal <= 0, start, np.where(goal >= heights[-1], far, result))
+
+
+def _far_enough(
+    along: Callable[[FloatArray], FloatArray],
+    start: float,
+    edge: float,
+    s: float,
+    reach: float,
+    goal: float,
+) -> tuple[float, float]:
+    """Return a voltage beyond which the path need not be followed, and how far that is, V."""
+    most = abs(edge - start)
+    for _ in range(DOUBLINGS):
+        if reach >= most:
+            return edge, most
+        far = start + s * reach
+        if s * (float(along(np.array([far]))[0]) - goal) >= 0:
+            return far, reach
+        reach = 2 * reach
+    return edge, most
+
+
+def _in_order(
+    along: Callable[[FloatArray], FloatArray], voltage: FloatArray, s: float
+) -> FloatArray:
+    """Return the curve at voltages (samples,) in any order, walked along as a path."""
+    order = np.argsort(s * voltage, kind="stable")
+    values = np.empty_like(voltage)
+    values[order] = along(voltage[order])
+    return values
+
+
+def _searched(
+    function: Callable[[FloatArray], FloatArray],
+    ends: tuple[FloatArray, FloatArray],
+    values: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Return the roots (samples,) of a function between ends where it has opposite signs."""
+    (b, a), (fb, fa) = (one.copy() for one in ends), (one.copy() for one in values)
+    c, fc = a.copy(), fa.copy()
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        part = np.clip(np.nan_to_num(fa / (fa - fb), nan=0.5), 0.0, 1.0)
+        for _ in range(ROUNDS):
+            x = a + part * (b - a)
+            fx = function(x)
+            same = np.sign(fx) == np.sign(fa)
+            c, fc = np.where(same, a, b), np.where(same, fa, fb)
+            b, fb = np.where(same, b, a), np.where(same, fb, fa)
+            a, fa = x, fx
+            best = np.where(np.abs(fa) < np.abs(fb), a, b)
+            least = np.minimum(np.abs(fa), np.abs(fb))
+            narrow = 2 * EPSILON * np.abs(best) / np.abs(b - a)
+            if ((least == 0) | (narrow >= 0.5) | (a == b)).all():
+                return best
+            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+            safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
+            step = fa / (fb - fa) * fc / (fb - fc)
+            step += (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+            part = np.where(safe & np.isfinite(step), step, 0.5)
+            narrow = np.minimum(np.nan_to_num(narrow, nan=0.5), 0.5)
+            part = np.clip(part, narrow, 1 - narrow)
+    return best
+
+
+def travel(steepness: float, missing: float, rate: float, rise: FloatArray) -> FloatArray:
+    """Return the v ≥ 0 (samples,), V, at which d v − m (1 − exp(−c v)) / c is the rise.
+
+    Parameters
+    ----------
+    steepness
+        d, the slope far along the stretch, um/V.
+    missing
+        m < d, by how much less the slope is at its start, um/V.
+    rate
+        c, 1/V, of any sign, not zero.
+    rise
+        (samples,), um, not negative.
+
+    Notes
+    -----
+    With y = c v, A = m/d and B = A + c rise / d it is y + A exp(−y) = B, so y = B + W(−A exp(−B))
+    with Lambert's W; for A < 0, where its argument could overflow, by Wright's ω
+    (:func:`scipy.special.wrightomega`). Newton's steps take away what cancels where c v is small.
+    """
+    part, goal = missing / steepness, (missing + rate * rise) / steepness
+    if abs(rate) * rise.max(initial=0.0) < STRAIGHT * (steepness - missing) or part == 0:
+        v = rise / (steepness - missing)
+    elif part > 0:
+        turned = lambertw(-part * np.exp(-goal))  # type: ignore[call-overload]  # takes arrays too
+        v = (goal + turned.real) / rate
+    else:
+        v = (goal + wrightomega(np.log(-part) - goal)) / rate
+    for _ in range(POLISHED):
+        gone = np.expm1(-rate * v)
+        v = v - (steepness * v + missing * gone / rate - rise) / (steepness - missing * (1 + gone))
+    return np.maximum(v, 0.0)

@@ -1,0 +1,308 @@
+"""The voltage for a displacement, whatever the actuator is made of, gives that displacement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inverse.chain import inverse
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS, made
+from tests.inference.problems import decaying_sine
+from tests.model.operators.test_every_operator import drawn, every_operator, posterior
+
+SPAN = Span(-100.0, 100.0)
+
+# Of the range: what simulating the inverse may miss the reference by.
+CLOSE = 1e-9
+
+TABLE_1 = {
+    "d": 0.7,
+    "alpha": 0.3575,
+    "beta": 0.0272,
+    "gamma": 0.0172,
+    "exponent": 1.0,
+    "initial": 0.0,
+    "mass": 0.00134,
+    "damping": 1580.0,
+    "stiffness": 4.1e5,
+    "lag": 3.85e-3,
+    "quadratic": 3.0,
+    "cubic": -1.5,
+    "creep_1": 0.02,
+    "creep_2": 0.03,
+    "creep_growth": 0.5,
+    "offset": 1.3,
+}
+
+
+def theta_of(actuator: Actuator, **others: float) -> FloatArray:
+    known = {**TABLE_1, **others}
+    return np.array([[known[name] for name in actuator.parameters]])
+
+
+def smooth(samples: int = 400, size: float = 30.0) -> FloatArray:
+    """Displacements that begin at rest and go to and fro with falling amplitudes, um."""
+    t = np.linspace(0.0, 1.0, samples - 30)
+    rise = np.sin(np.pi * np.minimum(t / 0.2, 1.0) / 2) ** 2
+    moved = size * rise * (1 - 0.8 * t) * np.sin(2 * np.pi * 3 * t)
+    return np.concatenate([np.zeros(30), moved])
+
+
+def assert_returned(
+    actuator: Actuator,
+    theta: FloatArray,
+    reference: FloatArray,
+    *,
+    from_rest: bool = False,
+    first: int = 0,
+    close: float = CLOSE,
+) -> FloatArray:
+    """Every model's voltage makes the reference again, each simulated alone."""
+    voltage = inverse(actuator, theta, reference, from_rest=from_rest)
+    for row, model in enumerate(theta):
+        asked = np.atleast_2d(reference)[min(row, np.atleast_2d(reference).shape[0] - 1)]
+        given = actuator.displacement(model, voltage[row], from_rest=from_rest)[0]
+        assert np.max(np.abs(given - asked)[first:]) < close * np.ptp(asked)
+    return voltage
+
+
+def calm(actuator: Actuator, theta: FloatArray) -> None:
+    """Make draws' gains small, and hysteresis no more than half of the slope."""
+    column = {name: theta[:, i] for i, name in enumerate(actuator.parameters)}
+    column["quadratic"] *= 0.2
+    column["cubic"] *= 0.2
+    if {"d", "alpha", "beta"} <= column.keys():
+        column["alpha"][:] = np.minimum(column["alpha"], 0.4 * column["d"])
+        for name in ("gamma", "d2", "d3", "alpha1", "alpha2"):
+            if name in column:
+                column[name][:] = 0.0
+
+
+@every_operator
+@pytest.mark.parametrize("from_rest", [True, False])
+@pytest.mark.parametrize("parts", [True, False])
+def test_the_inverse_of_every_operator_gives_the_displacement_again(
+    name: str, from_rest: bool, parts: bool
+) -> None:
+    """Draws of the default priors; with a gain and creep beside it, which must not turn it back."""
+    integrated = name in ("jiles-atherton", "domain-wall")
+    of = posterior(name, parts=parts)
+    actuator = of.likelihood.actuator
+    theta = of.only.table.actuator(drawn(of, 1 if integrated else 4))
+    if parts:
+        creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
+        actuator = replace(actuator, gain=PolynomialGain(reference=SPAN), creep=creep)
+        names = of.likelihood.actuator.parameters
+        theta = theta[:, [i for i, n in enumerate(names) if n in actuator.parameters]]
+        calm(actuator, theta)
+    voltage = decaying_sine(120 if integrated else 300)
+    reference = actuator.displacement(theta, voltage, from_rest=from_rest)
+    assert_returned(actuator, theta, reference, from_rest=from_rest)
+
+
+@pytest.mark.parametrize("hold", ["first", "zero"])
+@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
+@pytest.mark.parametrize("parts", [True, False])
+def test_dynamics_gain_and_creep_are_undone(hold: Hold, dynamics: str, parts: bool) -> None:
+    """With a held voltage as with straight lines, for a reference that begins at rest."""
+    gain = PolynomialGain(reference=SPAN) if parts else None
+    creep = Creep((0.1, 1.0), growing=True, reference=SPAN) if parts else None
+    actuator = Actuator(dynamics, hold, 1e-3, gain=gain, creep=creep, span=SPAN)
+    assert_returned(actuator, theta_of(actuator), smooth())
+
+
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_a_spring_that_swings_slowly_is_undone(hold: Hold) -> None:
+    """10 Hz, hardly damped, at 1 kHz: in straight lines the causal inverse would run away."""
+    actuator = Actuator("second-order", hold, 1e-3, span=SPAN)
+    theta = theta_of(actuator, mass=100.0, damping=300.0)
+    voltage = assert_returned(actuator, theta, smooth(2000))
+    assert np.max(np.abs(voltage)) < 120.0
+
+
+def test_a_displacement_that_begins_in_motion_is_missed_at_its_beginning_alone() -> None:
+    """The two-sided inverse of a spring that is sampled fast, and the held drive's one sample."""
+    reference = smooth()[60:] + 1.0
+    actuator = Actuator("lag", "zero", 1e-3, span=SPAN)
+    theta = theta_of(actuator)
+    voltage = assert_returned(actuator, theta, reference, first=2)
+    missed = actuator.displacement(theta, voltage[0])[0] - reference
+    assert abs(missed[1]) > 1e-3
+
+
+def test_without_dynamics_the_inverse_is_a_search_for_each_sample() -> None:
+    """A slow twin: Brent's method for one sample after the other, with the state carried on."""
+    actuator = Actuator("none", "first", 1e-3, gain=PolynomialGain(reference=SPAN), span=SPAN)
+    theta = theta_of(actuator)
+    reference = smooth(120)
+    state, expected = None, []
+    for asked in reference:
+
+        def off(u: float, asked: float = asked, before: object = state) -> float:
+            moved = actuator.advance(theta, [u], before, from_rest=True)  # type: ignore[arg-type]
+            return float(moved[0][0, 0]) - asked
+
+        expected.append(brentq(off, -200, 200, xtol=1e-13, rtol=1e-15))
+        _, state = actuator.advance(theta, [expected[-1]], state, from_rest=True)
+    found_voltage = inverse(actuator, theta, reference, from_rest=True)[0]
+    np.testing.assert_allclose(found_voltage, expected, atol=1e-8)
+
+
+def test_a_piece_goes_on_from_the_state_of_the_one_before() -> None:
+    """Two pieces of a reference, the second from the state that the first one leaves."""
+    creep = Creep((0.1, 1.0))
+    actuator = Actuator("lag", "first", 1e-3, creep=creep, span=SPAN)
+    theta, reference = theta_of(actuator), smooth()
+    whole = inverse(actuator, theta, reference, from_rest=True)[0]
+    _, state = actuator.advance(theta, whole[:200], from_rest=True)
+    rest = inverse(actuator, theta, reference[200:], state)[0]
+    np.testing.assert_allclose(rest, whole[200:], atol=1e-8)
+
+
+def test_models_of_a_batch_are_inverted_alone() -> None:
+    """A batch gives each model what it gets alone, from a state of all of them too."""
+    actuator = Actuator(
+        "lag", "first", 1e-3, made("hysteresis", "plays", HYSTERESIS, {}), span=SPAN
+    )
+    known = {f"weight_{i}": 0.04 for i in range(1, 11)}
+    theta = np.array(
+        [
+            [{**TABLE_1, **known, "threshold": 80.0, "d": d}[name] for name in actuator.parameters]
+            for d in (0.3, 0.4, 0.5)
+        ]
+    )
+    _, state = actuator.advance(theta, decaying_sine(100), from_rest=True)
+    together = inverse(actuator, theta, smooth(), state)
+    for row in range(3):
+        _, alone = actuator.advance(theta[row], decaying_sine(100), from_rest=True)
+        one = inverse(actuator, theta[row], smooth(), alone)[0]
+        np.testing.assert_allclose(together[row], one, atol=1e-9)
+
+
+SYMMETRIC = ("bouc-wen", "backlash-like", "plays", "preisach", "prandtl-ishlinskii", "maxwell-slip")
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+@settings(max_examples=10, deadline=None)
+@given(turns=st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=6), row=st.integers(0, 3))
+def test_the_mirrored_displacement_needs_the_mirrored_voltage(
+    name: str, turns: list[float], row: int
+) -> None:
+    """Along any turns, from the demagnetised state; and simulated, the displacement is returned."""
+    of = posterior(name)
+    actuator = replace(of.likelihood.actuator, dynamics="none")
+    table = dict(of.only.table.columns(drawn(of, 4)))
+    theta = np.array([[table[n][row] for n in actuator.parameters]])
+    column = {n: theta[:, i] for i, n in enumerate(actuator.parameters)}
+    column["offset"][:] = 0.0
+    if name in ("bouc-wen", "backlash-like"):
+        column["initial"][:] = 0.0
+        column["alpha"][:] = np.minimum(column["alpha"], 0.4 * column["d"])
+    path = [np.linspace(a, b, 7)[1:] for a, b in pairwise([0.0, *turns])]
+    reference = 40.0 * np.concatenate(path)
+    if np.ptp(reference) < 1e-6:
+        return
+    voltage = assert_returned(actuator, theta, reference, from_rest=True)
+    mirrored = inverse(actuator, theta, -reference, from_rest=True)
+    np.testing.assert_allclose(mirrored, -voltage, atol=1e-7 * np.max(np.abs(voltage)))
+
+
+def limited() -> tuple[Actuator, FloatArray]:
+    actuator = Actuator("none", "first", 1e-3, span=SPAN)
+    return actuator, theta_of(actuator, offset=0.0)
+
+
+@pytest.mark.parametrize(
+    ("limits", "line"),
+    [
+        (Limits(-30.0, 30.0), r"beyond the amplifier's -30 to 30 V"),
+        (Limits(slew=500.0), r"faster than the amplifier's 500 V/s"),
+        (Limits(current=1e-3, capacitance=1e-6), r"faster than the amplifier's 1000 V/s"),
+    ],
+)
+def test_what_the_amplifier_cannot_do_is_refused_with_place_and_time(
+    limits: Limits, line: str
+) -> None:
+    actuator, theta = limited()
+    with pytest.raises(InputError, match=line) as refused:
+        inverse(actuator, theta, smooth(), from_rest=True, limits=limits)
+    assert "reference: " in str(refused.value)
+    assert " s " in str(refused.value)
+
+
+def test_the_nearest_command_keeps_to_the_limits_and_is_right_elsewhere() -> None:
+    """Clipped where the voltage would go too far; where it need not, the reference is met again."""
+    actuator, theta = limited()
+    reference = smooth()
+    clipped = inverse(
+        actuator, theta, reference, from_rest=True, limits=Limits(-35.0, 35.0), nearest=True
+    )[0]
+    assert np.max(clipped) == 35.0
+    inside = np.abs(clipped) < 35.0
+    given = actuator.displacement(theta, clipped, from_rest=True)[0]
+    np.testing.assert_allclose(given[inside], reference[inside], atol=1e-9)
+    beyond = np.sign(clipped[~inside]) * (reference - given)[~inside]
+    assert (beyond >= -1e-9).all()
+
+
+def test_the_nearest_command_is_as_fast_as_the_limits_allow() -> None:
+    actuator, theta = limited()
+    limits = Limits(slew=800.0)
+    reference = smooth()
+    slow = inverse(actuator, theta, reference, from_rest=True, limits=limits, nearest=True)[0]
+    steps = np.abs(np.diff(slow))
+    assert np.max(steps) <= 0.8 * (1 + 1e-12)
+    given = actuator.displacement(theta, slow, from_rest=True)[0]
+    behind = np.abs(given - reference) > 1e-6
+    # Where it is behind, it goes as fast as it may.
+    np.testing.assert_allclose(steps[behind[1:]], 0.8, rtol=1e-9)
+    assert 0.05 < np.mean(behind) < 0.95
+
+
+@pytest.mark.parametrize(
+    ("reference", "line"),
+    [
+        ([], "has shape"),
+        ([1.0, np.nan, 2.0], "not a finite number in sample 1"),
+        ([[1.0], [2.0]], "one for each model"),
+    ],
+)
+def test_references_that_are_none_are_refused(reference: list[object], line: str) -> None:
+    actuator, theta = limited()
+    with pytest.raises(InputError, match=line):
+        inverse(actuator, theta, reference)  # type: ignore[arg-type]
+
+
+def test_a_displacement_beyond_saturation_is_refused_with_its_time() -> None:
+    """Pinned walls have a largest displacement."""
+    operator = made("hysteresis", "domain-wall", HYSTERESIS, {})
+    actuator = Actuator("none", "first", 1e-3, operator, span=SPAN)
+    known = {"d": 0.7, "saturation": 40.0, "coupling": 0.2, "pinning": 20.0, "reversible": 0.3}
+    theta = np.array([[{**TABLE_1, **known}[name] for name in actuator.parameters]])
+    with pytest.raises(InputError, match=r"no voltage gives 60 um at 0.002 s"):
+        inverse(actuator, theta, [0.0, 10.0, 60.0], from_rest=True)
+    nearest = inverse(actuator, theta, [0.0, 10.0, 60.0], from_rest=True, nearest=True)
+    assert np.isfinite(nearest).all()
+
+
+def test_limits_that_leave_nothing_are_refused() -> None:
+    with pytest.raises(InputError, match="no voltage from 1 to 1 V"):
+        Limits(1.0, 1.0)
+    with pytest.raises(InputError, match="together"):
+        Limits(current=1.0)
+    with pytest.raises(InputError, match="slew 0; must be positive"):
+        Limits(slew=0.0)
