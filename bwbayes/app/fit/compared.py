@@ -11,19 +11,35 @@ from dataclasses import dataclass
 from html import escape
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rich.console import Console
 
 from bwbayes.app.jobs.compare import Fitted, compare, require_same, write
+from bwbayes.app.problem.problem import Problem
 from bwbayes.app.screen import show_comparison
 from bwbayes.comparison.choice import Comparison
 from bwbayes.comparison.table import table
+from bwbayes.sampling.sampler import Outcome
+from bwbayes.sampling.storage import ChainFile
 
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
+__all__ = ["Compared", "Finished", "compared"]
 
-__all__ = ["Compared", "compared"]
+
+class Finished(Protocol):
+    """What a comparison needs of a fit."""
+
+    @property
+    def problem(self) -> Problem:
+        """What was fitted."""
+
+    @property
+    def chain(self) -> ChainFile:
+        """The draws."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the sampling ended."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +93,9 @@ class Compared:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
-def compared(fits: Sequence[Fit], *, future: bool = True, workers: int | None = None) -> Compared:
+def compared(
+    fits: Sequence[Finished], *, future: bool = True, workers: int | None = None
+) -> Compared:
     """Compare fits, named as their configs are, or by number where that is not enough.
 
     Parameters

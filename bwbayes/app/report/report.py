@@ -72,6 +72,9 @@ def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, by
         moves=tables.moves(result),
         pareto_k=None if check.pareto_k is None else f"{check.pareto_k:.2f}",
         priors=tables.priors(result),
+        taught=tables.taught(result),
+        learned=result.learned.remarks if result.learned is not None else (),
+        replicated=tables.replicated(result),
         constraints=[
             parameter.declared.stated_bounds
             for parameter in result.parameters
