@@ -82,7 +82,9 @@ def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
             assert number == summary["records"][name]["parameters"]["d"][key]
 
 
-def test_a_records_run_is_what_the_run_command_makes(given: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_records_run_is_what_the_run_command_makes(
+    given: Path, whole: Path, tmp_path: Path
+) -> None:
     text = (given / "small.toml").read_text().replace("[record]", '[record]\nfile = "s000.csv"')
     (tmp_path / "alone.toml").write_text(text)
     shutil.copyfile(given / "records/s000.csv", tmp_path / "s000.csv")
@@ -156,7 +158,9 @@ def test_added_changed_and_repaired_records_are_fitted_alone(
     assert ["broken", "new", "s000", "s001", "s002"] == [row.name for row in second.rows]
     kept = [path.parent.name for path in before if path.stat().st_mtime_ns == before[path]]
     assert ["s000", "s002", "s003"] == sorted(kept)
-    means = [{r.name: r.parameters["d"]["mean"] for r in c.rows if r.parameters} for c in (first, second)]
+    means = [
+        {r.name: r.parameters["d"]["mean"] for r in c.rows if r.parameters} for c in (first, second)
+    ]
     assert means[0]["s001"] != means[1]["s001"]
     assert means[1]["s000"] == means[1]["broken"]
 
@@ -174,9 +178,7 @@ def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_pa
     assert "budget of 40 steps used up" in row.reason
     assert "specimen" not in str(list(folder.run("s000").iterdir()))
     arguments = re.findall(r"`bwbayes (resume .*)`", row.reason)[0].split()
-    subprocess.run(
-        small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True
-    )
+    subprocess.run(small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True)
     again = ended(folder)
     assert ("done", 0) == (again.rows[0].status, again.exit_status)
 
@@ -210,7 +212,7 @@ def test_files_that_share_a_name_are_refused_and_others_fitted(tmp_path: Path) -
     specimens(records, 1)
     for name in ("twice.csv", "twice.h5"):
         bw.write_record(record(5), records / name)
-    folder = start(records, CONFIG + '\n', tmp_path, tmp_path / "batch", pictures=False)
+    folder = start(records, CONFIG + "\n", tmp_path, tmp_path / "batch", pictures=False)
     by_file = {row.file: row.status for row in ended(folder).rows}
     assert {"s000.csv": "done", "twice.csv": "refused", "twice.h5": "refused"} == by_file
 
