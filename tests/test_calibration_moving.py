@@ -44,7 +44,7 @@ from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.calibration import Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
-from tests.found import keep
+from tests.measured import keep
 from tests.together import LEVEL, Plant, shifted, together_test
 
 SEED = 1

@@ -31,7 +31,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.io.formats import write_record
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.results.replicates import Experiment, Replicate, replicates
-from tests.found import keep
+from tests.measured import keep
 from tests.test_calibration_moving import (
     CONFIG,
     KNOWN,

@@ -35,7 +35,7 @@ from bwbayes.inference import pointfit
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.result import Result
 from bwbayes.sampling.sampler import draws, first_chain, sample
-from tests.found import keep
+from tests.measured import keep
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"
 LIMIT = 5.0

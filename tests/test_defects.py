@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.defects import PASSED, ROOT, Defect, listed, plant_all, planted_text, run_tests
-from tests.found import keep
+from tests.measured import keep
 
 PACKAGE = ROOT / "bwbayes"
 

@@ -33,7 +33,7 @@ LAYERS = (
 # Libraries that few modules may know, and these modules (patterns).
 KEEPERS = {
     "h5py": ("bwbayes.sampling.storage", "bwbayes.data.io.hdf5", "bwbayes.data.io.matlab"),
-    "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves"),
+    "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves", "bwbayes.sampling.walking"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_stats": (
@@ -48,6 +48,7 @@ KEEPERS = {
         "bwbayes.app.running.predictions",
     ),
     "corner": ("bwbayes.app.figures*",),
+    "bokeh": ("bwbayes.app.figures.interactive",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
     "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),

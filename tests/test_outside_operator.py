@@ -211,7 +211,7 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
         (f"{HERE}:NoSuchClass", "has no attribute 'NoSuchClass'"),
         (":Loop", "write module:Class"),
         ("broken_module:Loop", "(ZeroDivisionError: division by zero); write module:Class"),
-        (f"{HERE}:NUMBER", "is no class; write module:Class"),
+        (f"{HERE}:NUMBER", "is not a class; write module:Class"),
         (f"{HERE}:Stranger", "makes a Stranger, which is not a bwbayes.model.operator.Operator"),
         ("bwbayes.model.filters:Lag", "makes a Lag, which is not a bwbayes.model.operator"),
         (f"{HERE}:Incomplete", "cannot be made: Can't instantiate abstract class Incomplete"),

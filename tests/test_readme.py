@@ -20,7 +20,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.results.bands import LEVELS
-from tests.found import found
+from tests.measured import measured
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -124,7 +124,7 @@ def test_the_quoted_verification_is_that_of_the_run(summary: Any) -> None:
 
 def covered(discrepancy: str) -> str:
     """Say how much the intervals and bands of each level covered."""
-    parts = found()[f"coverage {discrepancy}"]["covered"]
+    parts = measured()[f"coverage {discrepancy}"]["covered"]
     return ", ".join(
         f"{name} " + "/".join(f"{100 * parts[f'{name} {level}']:.0f}" for level in LEVELS)
         for name in ("parameters", "sensor", "displacement")
@@ -132,7 +132,7 @@ def covered(discrepancy: str) -> str:
 
 
 def coverage() -> str:
-    every = [found()[f"coverage {kind}"]["errors_off"].values() for kind in ("process", "none")]
+    every = [measured()[f"coverage {kind}"]["errors_off"].values() for kind in ("process", "none")]
     worst = max(abs(off) for offs in every for off in offs)
     return (
         f"50/90/95 %: {covered('process')}; without a discrepancy {covered('none')}; none off by "
@@ -141,7 +141,7 @@ def coverage() -> str:
 
 
 def calibration() -> str:
-    one = found()["calibration"]
+    one = measured()["calibration"]
     return (
         f"{one['replicates']} replicates, {one['unconverged']} not converged; {one['tests']} tests "
         f"of ranks and 9 of bands, {one['shortcomings']} failed; sds a fifth too small in one "
@@ -150,17 +150,17 @@ def calibration() -> str:
 
 
 def kills() -> str:
-    one = found()["kills"]
+    one = measured()["kills"]
     return f"{one['kills']} kills over {one['runs']} runs: none"
 
 
 def hostile() -> str:
-    used, refused = (found()["hostile input"][key] for key in ("used", "refused"))
+    used, refused = (measured()["hostile input"][key] for key in ("used", "refused"))
     return f"{used + refused:,} cases: {used:,} used, {refused:,} refused, nothing else"
 
 
 def steady() -> str:
-    one = found()["steady sine"]
+    one = measured()["steady sine"]
     covered = one["covered 95"].values()
     return (
         f"{one['converged']} of {one['records']}, after {one['most steps']:.0f} steps at most; "
@@ -170,7 +170,7 @@ def steady() -> str:
 
 
 def verdicts() -> str:
-    good, spoilt = found()["good runs hold"], found()["spoilt runs do not hold"].values()
+    good, spoilt = measured()["good runs hold"], measured()["spoilt runs do not hold"].values()
     answers = ("seen", "right", "unsure", "missed")
     runs = {sum(kind.get(answer, 0) for answer in answers) for kind in spoilt}
     missed, unsure = (sum(kind.get(n, 0) for kind in spoilt) for n in ("missed", "unsure"))
@@ -182,7 +182,7 @@ def verdicts() -> str:
 
 
 def moving() -> str:
-    every = [one for name, one in found().items() if name.startswith("moving, ")]
+    every = [one for name, one in measured().items() if name.startswith("moving, ")]
     kinds, records = sum(one["cases"] for one in every), every[0]["records of each case"]
     cells = [cell for one in every for cell in one["coverage and t"].values()]
     parts = [100 * cell["95"][0] for cell in cells]
@@ -195,7 +195,7 @@ def moving() -> str:
 
 
 def nested() -> str:
-    every = [one for name, one in found().items() if name.startswith("every k-th sample")]
+    every = [one for name, one in measured().items() if name.startswith("every k-th sample")]
     counts = [text.split(" of ") for one in every for text in one["within one sd"].values()]
     near, compared = (sum(int(pair[i]) for pair in counts) for i in (0, 1))
     parts = [part["95"] for one in every for part in one["covered"].values()]
@@ -208,7 +208,7 @@ def nested() -> str:
 
 
 def spikes() -> str:
-    one = found()["spikes set aside"]
+    one = measured()["spikes set aside"]
     least, most = one["width over clean, least and most"]
     covered = one["covered 95"].values()
     return (
@@ -219,7 +219,7 @@ def spikes() -> str:
 
 
 def defects() -> str:
-    one = found()["defects"]
+    one = measured()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
 
 
@@ -245,4 +245,4 @@ def test_the_quoted_findings_are_those_of_the_last_full_run(finding: Callable[[]
 def test_the_quoted_speeds_are_those_of_the_last_benchmarks() -> None:
     rows = [line.split("|")[1:-1] for line in block("numbers: speed").strip().splitlines()[2:]]
     quoted = {name.strip(): float(value.replace(",", "")) for name, value in rows}
-    assert quoted == pytest.approx(found()["benchmarks"], rel=0.01)
+    assert quoted == pytest.approx(measured()["benchmarks"], rel=0.01)

@@ -62,10 +62,12 @@ def reference(
     config, case, folder = load(path), load_case(path), FOLDER
     if request.param == "measured":
         folder = tmp_path_factory.mktemp("thinned")
-        assert config.record.start is not None
-        thinned = Record(case.voltage, case.displacement, case.interval, config.record.start)
+        assert config.records["record"].start is not None
+        thinned = Record(
+            case.voltage, case.displacement, case.interval, config.records["record"].start
+        )
         write_record(thinned, folder / "thinned.h5")
-        source = RecordConfig(file="thinned.h5", train=config.record.train)
+        source = RecordConfig(file="thinned.h5", train=config.records["record"].train)
         config = config.model_copy(update={"record": source})
     return Reference(resolve(config, folder), case, found)
 

@@ -16,8 +16,8 @@ from scipy import stats
 
 from bwbayes.data import Record, write_record
 from bwbayes.results.bands import Bands
-from tests.found import keep
 from tests.inference.test_likelihood import dense
+from tests.measured import keep
 from tests.results.runs import Judged, Stand, judge, problem_of, run
 
 RATE = 100.0

@@ -22,7 +22,7 @@ from bwbayes.inference import pointfit
 from bwbayes.model.actuator import Actuator
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
-from tests.found import keep
+from tests.measured import keep
 
 RATE = 250.0
 TRUTH = {

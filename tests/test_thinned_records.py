@@ -36,7 +36,7 @@ from bwbayes.data import Record, write_record
 from bwbayes.inference import defaults
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.prediction import predict_windows
-from tests.found import keep
+from tests.measured import keep
 from tests.results.runs import KEPT, Stand, covered, problem_of, weighted_draws
 
 SEEDS = 20

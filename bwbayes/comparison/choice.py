@@ -1,9 +1,10 @@
 """Which model: differences to the best, a recommendation, and what speaks against it.
 
 Held-out readings decide first, because foretelling them is what a band is for. Where their scores
-lie within two paired standard errors, the log evidence decides if it is sure: by three nats, odds
-of twenty to one. What still cannot be told apart is called so, and the plainest of it stands in
-front. A sampling that has not converged says nothing, and is never recommended.
+lie within two paired standard errors, or differ by little, the log evidence decides if it is sure:
+by three nats, odds of twenty to one. What still cannot be told apart is called so, and the plainest
+of it stands in front. Nothing is recommended whose score is lower by two errors, even if by little,
+or whose sampling has not converged.
 """
 
 from __future__ import annotations
@@ -95,18 +96,24 @@ def choose(candidates: Sequence[Candidate], generator: np.random.Generator) -> C
     )
     measure = _measure(usable)
     if not usable:
-        lines = ("no model has converged, so none is recommended",)
-        return Comparison(tuple(candidates), measure, None, {}, None, (), lines, left_out)
+        none = ("no model has converged, so none is recommended",)
+        return Comparison(tuple(candidates), measure, None, {}, None, (), none, left_out)
     ordered = sorted(usable, key=lambda one: -_value(one, measure))
     best = ordered[0]
     differences = {one.name: _differences(one, best, generator) for one in ordered}
-    alike = [one for one in ordered if not differences[one.name][measure].worse]
+    near = [one for one in ordered if not differences[one.name][measure].worse]
     by_evidence: list[Candidate] = []
-    if measure != "evidence" and len(alike) > 1 and all(_known(one) for one in alike):
-        top = max(alike, key=_log_evidence)
-        by_evidence = [one for one in alike if _less_likely(one, top)]
-        alike = [one for one in alike if one not in by_evidence]
-    chosen = min(alike, key=lambda one: (one.free, -_value(one, measure)))
+    if measure != "evidence" and len(near) > 1 and all(_known(one) for one in near):
+        top = max(near, key=_log_evidence)
+        by_evidence = [one for one in near if _less_likely(one, top)]
+    alike = [one for one in near if one not in by_evidence]
+    eligible = [one for one in alike if not differences[one.name][measure].beyond]
+    if eligible:
+        chosen = min(eligible, key=lambda one: (one.free, -_value(one, measure)))
+    else:
+        # Score and evidence disagree about models that predict nearly the same.
+        chosen = best
+        by_evidence = [one for one in by_evidence if one is not best]
     others = tuple(one.name for one in alike if one is not chosen)
     lines = _in_words(chosen, others, by_evidence, ordered, measure, differences)
     if chosen.hysteresis and any(not one.hysteresis for one in alike):
@@ -168,17 +175,17 @@ def _differences(
     one: Candidate, best: Candidate, generator: np.random.Generator
 ) -> dict[Measure, Difference]:
     """Return what a model has more than the best, by each measure that both have."""
-    found: dict[Measure, Difference] = {}
+    known: dict[Measure, Difference] = {}
     measures: tuple[Measure, ...] = ("held_out", "future")
     for measure in measures:
         ours, theirs = _series(one, measure), _series(best, measure)
         if ours is not None and theirs is not None:
-            found[measure] = paired(ours, theirs, generator)
+            known[measure] = paired(ours, theirs, generator)
     if one.evidence is not None and best.evidence is not None:
         error = 0.0 if one is best else float(np.hypot(one.evidence.error, best.evidence.error))
         value = 0.0 if one is best else _log_evidence(one) - _log_evidence(best)
-        found["evidence"] = Difference(value, error)
-    return found
+        known["evidence"] = Difference(value, error, total=value)
+    return known
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -197,7 +204,9 @@ def _in_words(
     lines = []
     if others:
         names = _listed([chosen.name, *others])
-        lines.append(f"{names} cannot be told apart; the plainest of them is {chosen.name}")
+        plainest = all(chosen.free <= one.free for one in ordered if one.name in others)
+        which = "the plainest of them is" if plainest else "the best score of them has"
+        lines.append(f"{names} cannot be told apart; {which} {chosen.name}")
     elif len(ordered) > 1:
         lines.append(f"{chosen.name} is recommended")
     else:
@@ -214,10 +223,11 @@ def _in_words(
         )
     if by_evidence:
         nearest_one = max(by_evidence, key=_log_evidence)
-        margin = _log_evidence(chosen) - _log_evidence(nearest_one)
+        top = max((one for one in ordered if one.name in (chosen.name, *others)), key=_log_evidence)
+        margin = _log_evidence(top) - _log_evidence(nearest_one)
         lines.append(
             f"the {WORDS[measure]} does not tell {_listed([one.name for one in by_evidence])} "
-            f"apart from it, but the log evidence is lower by {margin:.1f} or more"
+            f"apart, but the log evidence is lower by {margin:.1f} or more"
         )
     return tuple(lines)
 

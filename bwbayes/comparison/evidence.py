@@ -108,12 +108,12 @@ def evidence(
     random = np.random.RandomState(generator.integers(2**32))
     places = proposal.draw(random, PROPOSED)
     at_places = posterior.log_density(places) - _normalised(proposal, places)
-    found, effective = bridge(at_draws, at_places)
+    bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
     return Evidence(
-        found.log_integral + constant - mass,
-        float(np.hypot(found.error, mass_error)),
+        bridged.log_integral + constant - mass,
+        float(np.hypot(bridged.error, mass_error)),
         mass,
         effective,
     )
@@ -139,7 +139,7 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
     Returns
     -------
     tuple[Bridge, float]
-        log r with its error, and the effective draws that the numerator's mean hangs on.
+        log r with its error, and the effective draws behind the numerator's mean.
 
     Notes
     -----
@@ -191,7 +191,7 @@ def _effective(values: FloatArray) -> float:
 
 
 def _normalised(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
-    """Log density of a proposal with its constant, shaped as the coordinates but for the last."""
+    """Log density of a proposal with its constant, shaped as the coordinates less the last axis."""
     first = proposal.components[0]
     free, freedom = first.centre.size, first.freedom
     constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)

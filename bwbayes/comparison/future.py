@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
@@ -57,7 +57,7 @@ class Future:
     """
 
     log_score: FloatArray
-    rows: FloatArray
+    rows: IntArray
     pareto_k: tuple[float, ...]
     fits: int
     converged: bool
@@ -83,14 +83,14 @@ def future(
     executor
         Runs the ensembles.
     """
-    rows = posterior.readings.rows
+    rows = posterior.only.readings.rows
     edges = [round(part * rows.size) for part in STARTS] + [rows.size]
     fits, converged, shapes = 0, True, []
     scores = []
     flat = np.empty((0, 0))
     before: Posterior | None = None
     for first, last in pairwise(edges):
-        part = replace(posterior, training=cut(posterior.training, int(rows[first])))
+        part = posterior.altered(training=cut(posterior.only.training, int(rows[first])))
         weighted = None
         if before is not None:
             weighted, shape = reweighted(before, part, flat, generator)
@@ -161,8 +161,8 @@ def joint_log_score(
         Nats, and Pareto k̂ of the ratios: above 0.7 a few draws carry the sum.
     """
     theta = posterior.prior.theta(thinned(flat, generator, WEIGHTED))
-    every = tuple(sorted((*posterior.training, *windows), key=lambda window: window.start))
-    longer = replace(posterior, training=every)
+    every = tuple(sorted((*posterior.only.training, *windows), key=lambda window: window.start))
+    longer = posterior.altered(training=every)
     gains = longer.log_likelihood(theta) - posterior.log_likelihood(theta)
     top = float(np.max(gains))
     if not np.isfinite(top):

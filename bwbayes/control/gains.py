@@ -87,9 +87,10 @@ class Margins:
     """How far each draw is from instability, (draws,) each.
 
     ``gain`` is the factor by which the loop's gain could grow; ``phase``, in degrees, what it could
-    lag more, at the slope where that is least; ``crossover``, Hz, where the gain is one at the
-    steepest slope; ``circle`` is above zero where the circle criterion holds; ``pole`` is the
-    largest of the closed loop at its steepest slope, below one if it is stable.
+    lag more, at the slope where that is least, below zero where it lags too much already;
+    ``crossover``, Hz, where the gain is one at the steepest slope; ``circle`` is above zero where
+    the circle criterion holds; ``pole`` is the largest of the closed loop at its steepest slope,
+    below one if it is stable.
     """
 
     gain: FloatArray
@@ -181,9 +182,10 @@ def margins(
     loop = controller * frequency_response(draws.sections, turns)
     least, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
     size = np.abs(loop)
-    # Where the loop is real and negative.
+    # Where the loop is real and negative; at the end it is real but for rounding.
     turned = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
     worst = np.max(np.where(turned, np.maximum(size[:, :-1], size[:, 1:]), 0.0), axis=1)
+    worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, size[:, -1], 0.0))
     with np.errstate(divide="ignore"):
         gain = 1 / (largest[:, 0] * worst)
     # Where it has the size one at some slope: the lag is least at one of these frequencies.
@@ -192,6 +194,7 @@ def margins(
     looked = one | ends[0] | ends[1]
     away = np.abs(np.angle(-loop))
     phase = np.degrees(np.min(np.where(looked, away, np.pi), axis=1))
+    phase = np.where(gain < 1, -phase, phase)
     circle = np.min(((1 + largest * loop) * np.conj(1 + least * loop)).real, axis=1)
     above = size * largest >= 1
     last = turns[np.maximum(ANGLES - 1 - np.argmax(above[:, ::-1], axis=1), 0)]

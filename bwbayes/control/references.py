@@ -32,7 +32,8 @@ def _sine(turns: FloatArray) -> FloatArray:
 
 def _decaying(turns: FloatArray) -> FloatArray:
     whole = turns[-1] + (turns[-1] - turns[-2])
-    return np.sin(2 * np.pi * turns) * (1 - turns / whole)
+    decayed: FloatArray = np.sin(2 * np.pi * turns) * (1 - turns / whole)
+    return decayed
 
 
 def _steps(turns: FloatArray) -> FloatArray:
@@ -40,7 +41,8 @@ def _steps(turns: FloatArray) -> FloatArray:
 
 
 def _staircase(turns: FloatArray) -> FloatArray:
-    return np.round(LEVELS * Triangle(1.0, 1.0)(turns)) / LEVELS
+    levels: FloatArray = np.round(LEVELS * Triangle(1.0, 1.0)(turns)) / LEVELS
+    return levels
 
 
 SHAPES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
@@ -74,7 +76,7 @@ def reference(
     """
     periods = max(PERIODS, int(np.ceil(SHORTEST * frequency)))
     samples = max(round(periods / (frequency * interval)), 2)
-    turns = frequency * interval * np.arange(samples + 1)
+    turns = frequency * interval * np.arange(samples + 1, dtype=np.float64)
     kernel = np.hanning(rise + 2)[1:-1]
     swung = np.stack(
         [

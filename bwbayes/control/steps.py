@@ -155,8 +155,8 @@ class PlaysStep(HysteresisStep):
 
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return w, the slope d + Σ w_j of those plays that are moved, and all plays."""
-        there = voltage[:, np.newaxis]
-        plays = np.maximum(there - self.thresholds, np.minimum(there + self.thresholds, memory))
+        target = voltage[:, np.newaxis]
+        plays = np.maximum(target - self.thresholds, np.minimum(target + self.thresholds, memory))
         carried = np.where(plays != memory, self.weights, 0.0)
         w = self.slope * voltage + np.einsum("mj,mj->m", self.weights, plays)
         return Gone(w, self.slope + carried.sum(axis=1), plays)

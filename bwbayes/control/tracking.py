@@ -209,11 +209,11 @@ def track(
     draws = SampledModel.of(actuator, every)
     limits = stand.limits
     require_inverse(mean, limits)
-    gains, kept = design(mean, draws, limits, stand.delay, wishes.robustness)
     frequencies = _frequencies(mean, wishes.frequencies)
     ends = _reach(mean, limits)
     amplitude = _amplitude(wishes.amplitude, ends)
     middle, rise = ends.middle, _rise(mean)
+    gains, kept = design(mean, draws, limits, stand.delay, wishes.robustness)
 
     names = tuple(SHAPES)
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(names), 1)))

@@ -18,7 +18,7 @@ from bwbayes.data.patterns import runs, scatter, spikes, turning_points
 from bwbayes.data.record import Record
 from bwbayes.data.stuck import SHORTEST_AT_END, Stuck, clipped, clipped_drive, held, repeated
 
-__all__ = ["Finding", "inspect"]
+__all__ = ["Finding", "inspect", "isolated_outliers"]
 
 # What the voltage and the displacement of piezo actuators may be, and their quotient.
 VOLTS = (0.05, 2000.0)
@@ -39,7 +39,7 @@ LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
-MOST_SPIKES = 0.02  # of the readings: more are no outliers
+MOST_SPIKES = 0.02  # of the readings: more are not outliers
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     if record.displacement is None:
         return tuple(findings)
     rows = np.flatnonzero(record.has_reading)
-    outliers = _outliers(record)
+    outliers = isolated_outliers(record)
     left_out = np.zeros(record.samples, dtype=np.bool_)
     left_out[outliers] = True
     if rows.size - outliers.size < 3:
@@ -113,7 +113,7 @@ def _readings(record: Record) -> FloatArray:
 
 
 def _extent(values: FloatArray) -> float:
-    """Return the range of values but for the outermost thousandth on either side."""
+    """Return the range of values without the outermost thousandth on either side."""
     low, high = np.quantile(values, (0.001, 0.999))
     return float(high - low)
 
@@ -149,7 +149,7 @@ def _sampling(record: Record) -> Iterator[Finding]:
 
 
 def _amplitude(record: Record) -> Iterator[Finding]:
-    """Find a drive whose swings are all alike, but for the unfinished ones at its ends."""
+    """Find a drive whose swings are all alike, except for the unfinished ones at its ends."""
     turns = turning_points(record.voltage, 0.02 * float(np.ptp(record.voltage)))
     swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
     if swings.size >= 3 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
@@ -161,8 +161,8 @@ def _amplitude(record: Record) -> Iterator[Finding]:
         yield _whole(record, "one amplitude", text, remedy)
 
 
-def _outliers(record: Record) -> IntArray:
-    """Return the samples whose readings are isolated outliers."""
+def isolated_outliers(record: Record) -> IntArray:
+    """Return the samples whose readings are isolated outliers; none if they are too many."""
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     voltage = record.voltage[rows]
     extent = _extent(displacement)
@@ -196,7 +196,7 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
     together = float((voltage - voltage.mean()) @ (displacement - displacement.mean()))
     if loop.gain < 0 and together < 0:
         text = f"the displacement falls by {-loop.gain:.3g} um where the voltage rises by 1 V"
-        remedy = "turn the sign of the displacement's column in the file"
+        remedy = "change the sign of the displacement's column in the file"
         yield _whole(record, "reversed sign", text, remedy)
         leads = not leads if leads is not None else None
     if leads:
@@ -324,7 +324,7 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     over = min(over, record.start + 0.9 * record.duration)
     text = (
         f"the displacement starts {abs(size):.3g} um {'above' if size > 0 else 'below'} where the "
-        f"voltage would have it, and gets there with a time constant of {time:.2g} s"
+        f"voltage would have it, and settles with a time constant of {time:.2g} s"
     )
     yield Finding("switch-on transient", begin, over, text, f"start = {over:.3g} under [record]")
 
@@ -337,6 +337,6 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     told = max(loop.trend_told, 1e-12)
     least = max(TREND_SDS * usual / np.sqrt(told), TREND_PART * extent)
     if told > TREND_TOLD and abs(size) > least:
-        text = f"at equal voltages the displacement goes by {size:+.3g} um over the record"
+        text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         remedy = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
         yield _whole(record, "drift", text, f"{remedy}, or take the trend out of the file")

@@ -66,7 +66,7 @@ class LoopFit:
 
 
 def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
-    """Fit loops to a record, but for the samples that are `left_out`, (samples,)."""
+    """Fit loops to a record without the samples that are `left_out`, (samples,)."""
     assert record.displacement is not None
     kept = record.has_reading if left_out is None else record.has_reading & ~left_out
     rows = _rows(record.voltage, np.flatnonzero(kept))

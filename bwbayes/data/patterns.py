@@ -1,7 +1,7 @@
 """Shapes in a series of numbers: turning points, runs, spikes, trends and decays.
 
 They know nothing of records: :mod:`bwbayes.data.inspection` looks for them in voltages,
-displacements and what is left of a displacement without the voltage's part, and a fit's residual
+displacements and the part of a displacement that the voltage does not explain; a fit's residual
 can be looked at in the same way.
 """
 

@@ -22,7 +22,7 @@ from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import time_between_turns
 
-__all__ = ["default_priors", "ranges_of"]
+__all__ = ["default_priors", "joined", "ranges_of"]
 
 
 def ranges_of(
@@ -47,6 +47,29 @@ def ranges_of(
         bias=float(np.min(volts) + np.max(volts)) / 2,
         interval=interval,
         duration=volts.size * interval,
+    )
+
+
+def joined(every: Sequence[Ranges]) -> Ranges:
+    """Return the ranges of several records of one actuator together.
+
+    Displacements are not held against each other, for sensors are set to zero between records: the
+    widest counts, and its middle. Voltages are. The time between turns is that of the fastest
+    drive: a step never turns.
+    """
+    if len(every) == 1:
+        return every[0]
+    widest = max(every, key=lambda one: one.displacement)
+    low = min(one.bias - one.voltage for one in every)
+    high = max(one.bias + one.voltage for one in every)
+    return Ranges(
+        voltage=(high - low) / 2,
+        displacement=widest.displacement,
+        middle=widest.middle,
+        time=min(one.time for one in every),
+        bias=(high + low) / 2,
+        interval=min(one.interval for one in every),
+        duration=max(one.duration for one in every),
     )
 
 

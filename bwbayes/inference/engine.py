@@ -25,7 +25,7 @@ def choose(choice: EngineChoice = "auto") -> Engine:
     Raises
     ------
     InputError
-        ``choice`` is no engine, or is ``"numba"`` where numba is not installed.
+        ``choice`` is not an engine, or is ``"numba"`` where numba is not installed.
     """
     installed = find_spec("numba") is not None
     match choice:
@@ -36,7 +36,7 @@ def choose(choice: EngineChoice = "auto") -> Engine:
         case "numba":
             if not installed:
                 raise InputError(
-                    "engine: numba is not installed; pip install numba, or take the numpy engine"
+                    "engine: numba is not installed; pip install numba, or choose the numpy engine"
                 )
             return "numba"
     raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")

@@ -139,10 +139,10 @@ class Likelihood:
         scaled = products[:, 1:, 1:] * sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         precision = np.eye(sd.shape[1]) + scaled
         pull = sd * products[:, 1:, 0]
-        covariance = np.linalg.inv(precision)
+        covariance, log_volume = _inverse(precision)
         mean = np.einsum("mij,mj->mi", covariance, pull)
         squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
-        logs = log_determinant + np.linalg.slogdet(precision)[1]
+        logs = log_determinant + log_volume
         density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         return LinearStart(density, squares, sd * mean, covariance)
@@ -275,6 +275,14 @@ class Likelihood:
         if self.offset_sd:
             parts.insert(0, np.ones((len(model), 1, heard)))
         return np.concatenate(parts, axis=1)
+
+
+def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Invert (models, size, size), and give the logarithms of the determinants (models,)."""
+    if matrices.shape[1] == 1:
+        # Which is most records: the library would take longer over it than over all the readings.
+        return 1 / matrices, np.log(matrices[:, 0, 0])
+    return np.linalg.inv(matrices), np.linalg.slogdet(matrices)[1]
 
 
 def _products(series: list[FloatArray], heard: int) -> FloatArray:

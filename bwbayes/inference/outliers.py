@@ -1,10 +1,10 @@
-"""Isolated outliers: readings that say nothing of the displacement, found and set aside.
+"""Isolated outliers: readings that say nothing about the displacement are set aside.
 
 A loose contact or a lost bit spoils a reading now and then. A Gaussian noise model takes a few such
 readings for its sensor, and every band grows. The model here is: each reading is spoiled with a
 small probability, independently of all others, and a spoiled one may be anything. Its likelihood is
 a sum over all sets of spoiled readings. Where spikes are far outside the noise one set has nearly
-all of the weight, so it is found once, at the point fit, and kept: the likelihood of the others
+all of the weight, so it is chosen once, at the point fit, and kept: the likelihood of the others
 costs no more than before. A reading belongs to the set if the readings before and after it, without
 itself, predict it worse than by :data:`LIMIT` standard deviations: a good reading does so once in
 five hundred million.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.stats import norm
@@ -36,7 +35,7 @@ ROUNDS = 6
 # Median of a standard normal's distance from zero.
 MEDIAN = float(norm.ppf(0.75))
 
-# A larger part of the readings than this are no isolated outliers.
+# If they are a larger part of the readings than this, they are not isolated outliers.
 MOST = 0.05
 
 
@@ -91,12 +90,10 @@ def _require_few(outliers: int, everything: int) -> None:
 
 def _without(posterior: Posterior, rows: Mapping[str, IntArray]) -> Posterior:
     """Return the posterior without some readings of its records."""
-    datasets = []
-    for one in posterior.datasets:
-        displacement = one.displacement.copy()
-        displacement[rows[one.name]] = np.nan
-        datasets.append(replace(one, displacement=displacement))
-    return replace(posterior, datasets=tuple(datasets))
+    displacements = {one.name: one.displacement.copy() for one in posterior.datasets}
+    for name, displacement in displacements.items():
+        displacement[rows[name]] = np.nan
+    return posterior.with_readings(displacements)
 
 
 def _is_good(posterior: Posterior, aside: IntArray, row: int, place: FloatArray) -> bool:

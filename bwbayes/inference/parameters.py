@@ -1,6 +1,6 @@
 """Parameters: what they are called, what is known of them, and where they may lie.
 
-Each parameter is either fixed or has a prior. The priors are independent but for the physical
+Each parameter is either fixed or has a prior. The priors are independent except for the physical
 constraints that the model's parts declare, which cut the joint prior: for Bouc-Wen 0 < α < d,
 |γ| ≤ β, an initial state inside the hysteresis ceiling. :class:`JointPrior` draws from the cut
 prior and gives its log density, up to the one constant that the cut leaves. It also maps parameters
@@ -19,6 +19,8 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.plainmap import PlainMap
+from bwbayes.model.closed import Scored
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
 
@@ -119,6 +121,14 @@ class Parameter:
         low, high = self.prior.support
         return max(low, self.lower, self.floor), min(high, self.upper)
 
+    @property
+    def formula(self) -> Scored | None:
+        """The formula that maps normal scores to values, if there is one and nothing cuts it."""
+        assert self.prior is not None
+        bounded = self.declared is not None and self.declared.bounds is not None
+        form, whole = self.prior.form, self.support == self.prior.support
+        return form if isinstance(form, Scored) and whole and not bounded else None
+
     @cached_property
     def mass_between(self) -> tuple[float, float]:
         """The prior's cumulative probability at both ends of the support."""
@@ -157,6 +167,9 @@ class JointPrior:
         self._known = {
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
         }
+        self._free_rows = [self.names.index(name) for name in self.free_names]
+        self._fixed_rows = [self.names.index(name) for name in self._fixed]
+        self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -173,7 +186,7 @@ class JointPrior:
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
         if not np.all(self._possible(fixed)):
-            raise InputError(f"priors: what is fixed must have {self._stated()}")
+            raise InputError(f"priors: fixed values must have {self._stated()}")
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
@@ -187,11 +200,10 @@ class JointPrior:
 
     def theta(self, free: FloatArray) -> FloatArray:
         """Put free parameters (models, free) and fixed ones together: (models, parameters)."""
-        columns = dict(zip(self.free_names, free.T, strict=True))
-        ones = np.ones(free.shape[0])
-        return np.stack(
-            [columns[n] if n in columns else self._fixed[n] * ones for n in self.names], axis=1
-        )
+        theta = np.empty((len(self.names), free.shape[0]))
+        theta[self._free_rows] = free.T
+        theta[self._fixed_rows] = self._fixed_values
+        return theta.T
 
     def log_density(self, free: FloatArray) -> FloatArray:
         """Log density (models,) of free parameters (models, free), up to a constant."""
@@ -220,7 +232,7 @@ class JointPrior:
             kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if kept.shape[0] < 1e-4 * tried - 10:
-                raise InputError(f"priors: hardly a draw has {self._stated()}")
+                raise InputError(f"priors: hardly any draw has {self._stated()}")
         return kept[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
@@ -244,21 +256,53 @@ class JointPrior:
 
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
+        # A parameter is a row here, so that what is done with one is done with neighbours.
+        given = np.ascontiguousarray(coordinates.T)
+        safe = np.clip(given, -FARTHEST, FARTHEST)
+        free, possible = np.empty_like(safe), np.equal(safe, given).all(axis=0)
+        self._plain.fill(free, safe)
         values = self._values(None, rows=coordinates.shape[0])
-        safe = np.clip(coordinates, -FARTHEST, FARTHEST)
+        values.update(zip(self.free_names, free, strict=True))
         room = np.ones(coordinates.shape[0])
-        for parameter, z in zip(self.free, safe.T, strict=True):
+        for row, parameter in self._cut:
             assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            x, between = parameter.prior.from_normal(z, *bounds)
-            # Rounding may put a positive parameter on its open bound, where there is no model.
-            room = room * np.where(parameter.above_floor(x), between, 0)
-            values[parameter.name] = x
-        room = np.where(self._possible(values), room, 0)
+            free[row], between = parameter.prior.from_normal(safe[row], *bounds)
+            room *= between
+        # Rounding may put a positive parameter on its open bound, where there is no model.
+        possible &= self._above_floors(free) & self._possible(values)
         with np.errstate(divide="ignore"):
-            log_prior = np.log(room) - 0.5 * np.sum(safe**2, axis=1)
-        log_prior = np.where((safe == coordinates).all(axis=1), log_prior, -np.inf)
-        return np.stack([values[name] for name in self.free_names], axis=1), log_prior
+            log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
+        return free.T, np.where(possible, log_prior, -np.inf)
+
+    @cached_property
+    def _plain(self) -> PlainMap:
+        """The free parameters that a formula maps and nothing ever cuts."""
+        return PlainMap.of({row: p.formula for row, p in enumerate(self.free)})
+
+    @cached_property
+    def _cut(self) -> tuple[tuple[int, Parameter], ...]:
+        """The other ones, and which they are of the free ones."""
+        return tuple(
+            (row, parameter)
+            for row, parameter in enumerate(self.free)
+            if row not in self._plain.rows
+        )
+
+    @cached_property
+    def _floors(self) -> tuple[FloatArray, FloatArray]:
+        """What free parameters must be above, or reach at least: two columns."""
+        floors = np.array([parameter.floor for parameter in self.free])
+        reached = [p.declared is None or p.declared.reaches_floor for p in self.free]
+        nothing = np.full(len(self.free), -np.inf)
+        above, least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
+        return above[:, np.newaxis], least[:, np.newaxis]
+
+    def _above_floors(self, free: FloatArray) -> BoolArray:
+        """Tell which models (models,) of free parameters (free, models) are on or above floors."""
+        above, least = self._floors
+        inside: BoolArray = ((free > above) & (free >= least)).all(axis=0)
+        return inside
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
@@ -269,15 +313,17 @@ class JointPrior:
 
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
-        low, high = (np.asarray(end) for end in parameter.support)
+        low, high = parameter.support
         if parameter.declared is None or parameter.declared.bounds is None:
-            return low, high
+            return np.asarray(low), np.asarray(high)
         known = {name: values[name] for name in self._known[parameter.name]}
         least, most = self._between(parameter, known)
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
-        low = low if np.all(np.isneginf(least)) else np.maximum(low, least)
-        high = high if np.all(np.isposinf(most)) else np.minimum(high, most)
-        return low, high
+        cut = np.any(np.greater(least, low)), np.any(np.less(most, high))
+        return (
+            np.maximum(low, least) if cut[0] else np.asarray(low),
+            np.minimum(high, most) if cut[1] else np.asarray(high),
+        )
 
     def seen(self, values: Values, record: str) -> Values:
         """Return values by the names that the parts declare, as one record has them.

@@ -26,7 +26,7 @@ STARTS = 8
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
 RESIDUALS = 1000
 
-# An optimum less probable than the best by this much, nats, is no place to start from: it holds
+# An optimum less probable than the best by this much, nats, is not a place to start from: it holds
 # nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
 HOPELESS = 30.0
 
@@ -39,7 +39,7 @@ class PointFit:
     """The posterior's mode and its Gaussian approximation, in unconstrained coordinates.
 
     ``mode`` (free,), ``covariance`` (free, free), ``log_density`` at the mode; ``optima``
-    (found, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
+    (modes, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
     is that of the prior's draws.
     """
 
@@ -150,25 +150,29 @@ class _LeastSquares:
             everywhere[:, self.physical] = values
             return everywhere
 
-        def jacobian(values: FloatArray) -> FloatArray:
-            steps = 1e-5 * self.spread[self.physical]
-            both = np.concatenate([values + np.diag(steps), values - np.diag(steps)])
-            plus, minus = np.split(self.residuals(place(both)), 2)
-            slopes: FloatArray = ((plus - minus) / (2 * steps[:, np.newaxis])).T
-            return slopes
+        steps = 1e-5 * self.spread[self.physical]
+        star = np.concatenate([np.zeros((1, steps.size)), np.diag(steps), -np.diag(steps)])
+        last: list[FloatArray] = []
 
         def residuals(values: FloatArray) -> FloatArray:
-            row: FloatArray = self.residuals(place(values))[0]
-            return row
+            # With what the slopes need, in one call: they are asked for at most of these places.
+            here, plus, minus = np.split(self.residuals(place(values + star)), [1, 1 + steps.size])
+            last[:] = values.copy(), ((plus - minus) / (2 * steps[:, np.newaxis])).T
+            return here[0]
 
-        found = optimize.least_squares(
+        def jacobian(values: FloatArray) -> FloatArray:
+            if not np.array_equal(values, last[0]):
+                residuals(values)
+            return last[1]
+
+        solution = optimize.least_squares(
             residuals,
             start[self.physical],
             jac=jacobian,
             x_scale=self.spread[self.physical],
             max_nfev=60,
         )
-        optimum: FloatArray = place(found.x)[0]
+        optimum: FloatArray = place(solution.x)[0]
         return optimum
 
 
@@ -185,7 +189,7 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     place, curvature = start, None
     for _ in range(4):
         # Each round measures in the units of the last curvature: finite differences need them.
-        found = optimize.minimize(
+        solution = optimize.minimize(
             surface.value,
             surface.inwards(place),
             jac=surface.gradient,
@@ -193,9 +197,9 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
             method="trust-exact",
             options={"gtol": 1e-2, "maxiter": 60},
         )
-        place = surface.outwards(found.x)
-        curvature = surface.hessian(found.x)
-        settled = found.success and np.allclose(np.diag(curvature), 1, atol=0.2)
+        place = surface.outwards(solution.x)
+        curvature = surface.hessian(solution.x)
+        settled = solution.success and np.allclose(np.diag(curvature), 1, atol=0.2)
         surface = surface.rescaled(place, curvature)
         if settled:
             break

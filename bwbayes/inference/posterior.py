@@ -9,7 +9,7 @@ simulated from its first sample; only readings in the training windows enter
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -155,9 +155,17 @@ class Posterior:
 
     @property
     def only(self) -> Dataset:
-        """The record, of a posterior of one; see :meth:`alone` for one of several."""
-        (only,) = self.datasets
-        return only
+        """The record, of a posterior of one; see :meth:`alone` for one of several.
+
+        Raises
+        ------
+        InputError
+            There are several.
+        """
+        if len(self.datasets) > 1:
+            names = ", ".join(one.name for one in self.datasets)
+            raise InputError(f"record: several were fitted ({names}), and this is for a fit of one")
+        return self.datasets[0]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,7 +175,7 @@ class Posterior:
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (models,) at coordinates (models, free): likelihood and prior.
 
-        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is no evidence
+        −∞ where the prior is zero. A likelihood that is not a number, or infinite, is not evidence
         for a model: there the density is −∞ too.
         """
         free, result = self.prior.constrain(coordinates)
@@ -223,6 +231,11 @@ class Posterior:
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""
         return replace(self, datasets=(replace(self.only, **fields),))
+
+    def with_readings(self, displacements: Mapping[str, FloatArray]) -> Posterior:
+        """Return the posterior of other readings (samples,) of the same records, by name."""
+        datasets = (replace(one, displacement=displacements[one.name]) for one in self.datasets)
+        return replace(self, datasets=tuple(datasets))
 
     @cached_property
     def _alone(self) -> dict[str, Posterior]:

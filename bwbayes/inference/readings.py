@@ -42,7 +42,7 @@ class Readings:
 
     @classmethod
     def of(cls, displacement: FloatArray, windows: Sequence[slice]) -> Readings:
-        """Take what windows (slices) of a displacement (samples,) have; nan is no reading.
+        """Take the readings in windows (slices) of a displacement (samples,); nan marks a gap.
 
         Raises
         ------
@@ -52,7 +52,7 @@ class Readings:
         rows = np.concatenate([np.arange(w.start, w.stop) for w in windows]).astype(np.int64)
         rows = rows[np.isfinite(displacement[rows])]
         if not rows.size:
-            raise InputError("record.train: no reading is in it; give another window")
+            raise InputError("record.train: it holds no reading; give another window")
         gaps = np.diff(rows)
         stride = int(gaps.min()) if gaps.size else 1
         skipped = np.concatenate([[0.0], (gaps - stride) / stride])

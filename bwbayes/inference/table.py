@@ -9,8 +9,8 @@ to a record (its initial state, its offset) once for each, side by side, and nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -94,9 +94,6 @@ class JointTable:
     per_record, shared
         Parameters that each record has of its own, or that all share, whatever scope their part
         declares.
-    continued
-        The record that another one goes on from, by the name of that other: both have the same
-        initial state, offset and whatever else belongs to a record.
 
     Raises
     ------
@@ -108,7 +105,6 @@ class JointTable:
     records: tuple[str, ...]
     per_record: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
-    continued: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for key, given in (("per_record", self.per_record), ("shared", self.shared)):
@@ -128,10 +124,9 @@ class JointTable:
         return tuple(self._laid_out())
 
     def _laid_out(self) -> Iterator[Column]:
-        owners = dict.fromkeys(self.owner(record) for record in self.records)
         for declared in self.table.declarations:
-            if len(owners) > 1 and self._is_own(declared):
-                for record in owners:
+            if len(self.records) > 1 and self._is_own(declared):
+                for record in self.records:
                     yield Column(f"{declared.name}[{record}]", declared, record)
             else:
                 yield Column(declared.name, declared, "")
@@ -161,12 +156,6 @@ class JointTable:
         """Return the columns (models,) of θ (models, parameters) by name."""
         return dict(zip(self.names, theta.T, strict=True))
 
-    def owner(self, record: str) -> str:
-        """Return the record whose own parameters a record has: itself, or what it continues."""
-        while record in self.continued:
-            record = self.continued[record]
-        return record
-
     @cached_property
     def _places(self) -> dict[str, IntArray]:
         """Of each record, where its own θ's columns are in the joint one."""
@@ -175,7 +164,7 @@ class JointTable:
             mine = {
                 column.declaration.name: place
                 for place, column in enumerate(self.layout)
-                if column.record in ("", self.owner(record))
+                if column.record in ("", record)
             }
             places[record] = np.array([mine[name] for name in self.table.names])
         return places

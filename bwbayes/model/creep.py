@@ -73,8 +73,8 @@ class Creep:
         rising = all(one < other for one, other in pairwise((0.0, *self.times)))
         if not rising or not 0 < len(self.times) <= MOST_TIMES or not math.isfinite(self.times[-1]):
             raise InputError(
-                f"creep: {list(self.times)} are no times; give up to {MOST_TIMES} positive ones "
-                "in s that rise, or true"
+                f"creep: {list(self.times)} are not valid times; give up to {MOST_TIMES} positive "
+                "ones in s that rise, or true"
             )
 
     @property

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from scipy.special import erfcinv, erfinv, ndtr, ndtri
+from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.model.closed import Form, Frozen, Scored, closed
 
 __all__ = ["Distribution"]
 
@@ -89,21 +90,35 @@ class Distribution:
         """
         if self._is_support(lower, upper):
             return self._uncut(z), np.ones_like(z)
+        if isinstance(self.form, Scored):
+            return self._cut_score(self.form, z, lower, upper)
         whole = np.maximum(self._between(lower, upper), 0.0)
-        below = self._cdf(lower) + ndtr(z) * whole
-        above = self._sf(upper) + ndtr(-z) * whole
+        below = self.form.cdf(lower) + ndtr(z) * whole
+        above = self.form.sf(upper) + ndtr(-z) * whole
         # The smaller probability is the one that keeps its precision.
-        x = np.where(below < above, self._ppf(below), self._isf(above))
+        x = np.where(below < above, self.form.ppf(below), self.form.isf(above))
+        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
+
+    @staticmethod
+    def _cut_score(
+        form: Scored, z: FloatArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Do the same for what a formula maps to a standard normal, whose tails are alike."""
+        low, high = form.score(lower), form.score(upper)
+        start, end = ndtr(low), ndtr(-high)
+        whole = np.where(start < 0.5, ndtr(high) - start, ndtr(-low) - end)
+        whole = np.maximum(whole, 0.0)
+        below, above = start + ndtr(z) * whole, end + ndtr(-z) * whole
+        score = ndtri(np.minimum(below, above))
+        x = form.value(np.where(below < above, score, -score))
         return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
 
     def _between(self, low: FloatArray, high: FloatArray) -> FloatArray:
         """Probability between two values, from the tail in which they lie."""
-        start = self._cdf(low)
-        rising, falling = self._cdf(high) - start, self._sf(low) - self._sf(high)
+        start = self.form.cdf(low)
+        rising = self.form.cdf(high) - start
+        falling = self.form.sf(low) - self.form.sf(high)
         return np.where(start < 0.5, rising, falling)
-
-    # The distributions of default priors skip the frozen distribution where they can: its checks of
-    # arguments cost more than a short record's likelihood.
 
     def _is_support(self, lower: FloatArray, upper: FloatArray) -> bool:
         """Tell whether the bounds cut nothing."""
@@ -112,41 +127,14 @@ class Distribution:
 
     def _uncut(self, z: FloatArray) -> FloatArray:
         """Return the values of normal scores, without bounds."""
-        if self._mapped:
-            return self._value(z)
-        if self.name == "halfnormal":
-            near = np.where(z < 0, erfinv(ndtr(z)), erfcinv(ndtr(-z)))
-            return np.asarray(np.sqrt(2) * self.arguments["scale"] * near)
-        return np.where(z < 0, self._ppf(ndtr(z)), self._isf(ndtr(-z)))
+        if isinstance(self.form, Scored):
+            return self.form.value(z)
+        return np.where(z < 0, self.form.ppf(ndtr(z)), self.form.isf(ndtr(-z)))
 
-    def _score(self, x: FloatArray) -> FloatArray:
-        """Map x to a standard normal, for the two distributions that a formula maps."""
-        if self.name == "normal":
-            return (x - self.arguments["mean"]) / self.arguments["sd"]
-        with np.errstate(divide="ignore"):
-            logs = np.log(np.maximum(x, 0.0) / self.arguments["median"])
-        return np.asarray(logs / self.arguments["sigma"])
-
-    def _value(self, score: FloatArray) -> FloatArray:
-        if self.name == "normal":
-            return self.arguments["mean"] + self.arguments["sd"] * score
-        return np.asarray(self.arguments["median"] * np.exp(self.arguments["sigma"] * score))
-
-    def _cdf(self, x: FloatArray) -> FloatArray:
-        return np.asarray(ndtr(self._score(x)) if self._mapped else self.frozen.cdf(x))
-
-    def _sf(self, x: FloatArray) -> FloatArray:
-        return np.asarray(ndtr(-self._score(x)) if self._mapped else self.frozen.sf(x))
-
-    def _ppf(self, p: FloatArray) -> FloatArray:
-        return self._value(ndtri(p)) if self._mapped else np.asarray(self.frozen.ppf(p))
-
-    def _isf(self, p: FloatArray) -> FloatArray:
-        return self._value(-ndtri(p)) if self._mapped else np.asarray(self.frozen.isf(p))
-
-    @property
-    def _mapped(self) -> bool:
-        return self.name in ("normal", "lognormal")
+    @cached_property
+    def form(self) -> Form:
+        """Distribution functions, in closed form if there is one."""
+        return closed(self.name, self.arguments) or Frozen(self.frozen)
 
     @cached_property
     def support(self) -> tuple[float, float]:

@@ -74,7 +74,7 @@ def choose[Part](
             f"`python -c 'import {module}'` works where you run this"
         ) from None
     if not callable(maker):
-        raise InputError(f"{place}: {name!r} is no class; write module:Class")
+        raise InputError(f"{place}: {name!r} is not a class; write module:Class")
     return maker
 
 

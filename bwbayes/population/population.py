@@ -194,12 +194,16 @@ def _spread(
     prior = Hyperprior(float(np.mean([one.prior_mean[i] for one, i in pairs])), width, width)
     normal = likelihoods(specimens, name)
     draws = [(one.draws[:, i], one.log_prior[:, i]) for one, i in pairs]
-    found = _reweighted(draws, normal, prior, generator)
+    reweighted = _reweighted(draws, normal, prior, generator)
     p = left_out(normal, prior)
     scale = np.exp if logarithmic else _same
     among = {}
-    for i, (one, k, taken) in enumerate(zip(specimens, found.shapes, found.normal, strict=True)):
-        lower, median, upper = scale(np.quantile(found.shrunk[i], [0.025, 0.5, 0.975])).tolist()
+    for i, (one, k, taken) in enumerate(
+        zip(specimens, reweighted.shapes, reweighted.normal, strict=True)
+    ):
+        lower, median, upper = scale(
+            np.quantile(reweighted.shrunk[i], [0.025, 0.5, 0.975])
+        ).tolist()
         own = scale(np.quantile(draws[i][0], [0.025, 0.5, 0.975])).tolist()
         among[one.name] = Among(
             lower,
@@ -213,16 +217,16 @@ def _spread(
             pareto_k=float(k),
             normal=bool(taken),
         )
-    new = found.mean + found.spread * generator.standard_normal(DRAWS)
+    new = reweighted.mean + reweighted.spread * generator.standard_normal(DRAWS)
     return Spread(
         name,
         first.units[at],
         logarithmic,
-        scale(found.mean),
-        found.spread,
+        scale(reweighted.mean),
+        reweighted.spread,
         scale(new),
         among,
-        found.pareto_k,
+        reweighted.pareto_k,
     )
 
 

@@ -192,12 +192,12 @@ def _log_prior(
     """Log marginal density (draws,) of one parameter under the cut prior, up to a constant.
 
     Its own prior's, times the part of all others' prior that the constraints leave at x: by draws
-    at some places between the least and the largest x, and on straight lines between those.
+    at some quantiles of x, and on straight lines between those.
     """
     own = prior.free[column].prior
     assert own is not None
     others = np.stack([_single(p, generator) for p in prior.free], axis=1)
-    places = np.linspace(np.min(x), np.max(x), PLACES)
+    places = np.quantile(x, np.linspace(0, 1, PLACES))
     tried = np.tile(others, (PLACES, 1))
     tried[:, column] = np.repeat(places, OTHERS)
     inside = np.isfinite(prior.log_density(tried)).reshape(PLACES, OTHERS)

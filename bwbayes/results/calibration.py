@@ -108,8 +108,8 @@ class EcdfBand:
 
     def left(self, positions: FloatArray) -> BoolArray:
         """Tell which statistics (statistics,) leave the band anywhere."""
-        found = self.ecdf(positions).T
-        outside: BoolArray = ((found < self.lower) | (found > self.upper)).any(axis=1)
+        observed = self.ecdf(positions).T
+        outside: BoolArray = ((observed < self.lower) | (observed > self.upper)).any(axis=1)
         return outside
 
 
@@ -316,12 +316,12 @@ def _binomial_limits(count: int, level: int) -> tuple[float, float]:
 
 def _bands(entries: Sequence[Entry]) -> dict[str, Coverage]:
     """Mean coverage and its standard error, by the bands' names."""
-    found = {}
+    coverages = {}
     for name in entries[0]["covered"]:
         covered = np.array([entry["covered"][name] for entry in entries])
         error = np.std(covered, ddof=1) / np.sqrt(covered.size) if covered.size > 1 else np.nan
-        found[name] = Coverage(float(np.mean(covered)), float(error))
-    return found
+        coverages[name] = Coverage(float(np.mean(covered)), float(error))
+    return coverages
 
 
 def _whose(band: str) -> str:

@@ -191,9 +191,9 @@ def _explained(residual: FloatArray, *features: FloatArray) -> float:
         if spread > 0:
             columns.append((feature - np.mean(feature)) / spread)
     matrix = np.stack(columns, axis=1)
-    found, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
+    weights, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
     total = _energy(residual)
-    return 1 - _energy(residual - matrix @ found) / total if total > 0 else 0.0
+    return 1 - _energy(residual - matrix @ weights) / total if total > 0 else 0.0
 
 
 def _beside(residual: FloatArray, where: BoolArray) -> float:
@@ -211,7 +211,7 @@ def _start(r: Residuals) -> float:
     if not early.any() or not late.any():
         return 0.0
     tail = _energy(r.residual[late]) / np.sum(late)
-    # An offset of the rest is no start.
+    # An offset of the remaining readings does not count as a start.
     total = _energy(r.residual)
     return max(0.0, (_energy(r.residual[early]) - tail * np.sum(early)) / total) if total else 0.0
 
@@ -221,7 +221,7 @@ def _offset(r: Residuals) -> float:
 
 
 def _drift(r: Residuals) -> float:
-    """Trend, bent or not, that a drive which goes forth and back does not make."""
+    """Trend, bent or not, that a drive which goes back and forth does not make."""
     at = (r.time - r.time[0]) / max(r.time[-1] - r.time[0], r.interval)
     share = _explained(r.residual, at, at**2)
     # A trend beside an offset that is far larger is none.
@@ -280,7 +280,7 @@ def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
     fast = 1.4826 * float(np.median(np.abs(beside)))
     fast = max(fast, 1e-6 * float(np.ptp(residual)))
     jumps = ndimage.maximum_filter1d(np.abs(steps), 5)
-    # As long as they are few; many are no outliers.
+    # As long as they are few; many are not outliers.
     far = (np.abs(beside) > SPIKE * fast) & (np.abs(beside) > jumps)
     # The top of something broader is none.
     level = np.maximum(np.abs(padded[:-4]), np.abs(padded[4:]))
@@ -322,8 +322,7 @@ def _settled(r: Residuals) -> float:
 
 def _windows(r: Residuals) -> str:
     """Return the windows of the first spikes, as ``exclude`` takes them."""
-    half = r.interval / 2
-    windows = [f"[{t - half:.6g}, {t + half:.6g}]" for t in r.time[r.spikes][:NAMED]]
+    windows = [f"[{t:.6g}, {t + r.interval:.6g}]" for t in r.time[r.spikes][:NAMED]]
     return ", ".join(windows) + (", ..." if np.sum(r.spikes) > NAMED else "")
 
 
@@ -331,8 +330,8 @@ def _windows(r: Residuals) -> str:
 _WORDS: dict[Kind, tuple[str, str, str]] = {
     "sign": (
         "the displacement goes against the voltage",
-        "turn the sign of the displacement in the file",
-        "turn the sign of the displacement in the file",
+        "change the sign of the displacement in the file",
+        "change the sign of the displacement in the file",
     ),
     "outliers": (
         "outliers",
@@ -340,7 +339,7 @@ _WORDS: dict[Kind, tuple[str, str, str]] = {
         "empty their cells in the file, at {spikes} s: they are missing readings then",
     ),
     "lead-in": (
-        "a start that the lead-in does not tell: a transient, a drift or another actuator",
+        "a start that the lead-in does not show: a transient, a drift or another actuator",
         "let the lead-in begin later: lead_in_from = {told} in [validation.{name}]",
         "let it begin later: lead_in_from = {told} in [validation.{name}], or predict with "
         "--lead-in-from {told}; a longer --lead-in or a --window may help too",
@@ -354,7 +353,7 @@ _WORDS: dict[Kind, tuple[str, str, str]] = {
     "offset": (
         "an offset of {size} um",
         "free the offset: remove [parameters.offset]",
-        "let the record have its own, told by a lead-in that fits: own_offset = true and lead_in "
+        "let the record have its own, from a lead-in that fits: own_offset = true and lead_in "
         "in [validation.{name}], or predict with --lead-in and without --same-offset",
     ),
     "drift": (
@@ -379,7 +378,7 @@ _WORDS: dict[Kind, tuple[str, str, str]] = {
         'set voltage_is to "command" or "output", whichever it is, in [validation.{name}]',
     ),
     "loop": (
-        "residuals that follow the loop: the model is too poor, or the actuator another one",
+        "residuals that follow the loop: the model is too simple, or this is another actuator",
         'free the exponent by a prior in [parameters.exponent], or take dynamics = "second-order" '
         "in [model]",
         "fit this record itself, bwbayes run CONFIG --record FILE; if that fails too, the model is "

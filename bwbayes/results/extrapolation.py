@@ -72,6 +72,6 @@ def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> str | 
         return None
     return (
         f"the voltage moves at up to {now:.3g} V/s, and only up to {before:.3g} V/s were fitted: "
-        "faster than that the bands are an extrapolation, because the record tells little of the "
-        "lag; fit a record with a drive as fast as this one"
+        "faster than that the bands are an extrapolation, because the record says little about "
+        "the lag; fit a record with a drive as fast as this one"
     )

@@ -2,7 +2,7 @@
 
 Most operators' states are one number, ``initial``. Those that remember extrema have more: how far
 earlier drives went leaves states of their own, and each such range is a history. What a lead-in
-says of a history, and of the states in it, is found on a grid that closes in on where the lead-in
+says of a history, and of the states in it, is computed on a grid that closes in on where it
 allows them; every draw then chooses its own.
 """
 

@@ -23,7 +23,7 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 from bwbayes.sampling.diagnostics import pareto_k
 
-__all__ = ["Sway", "remarks", "spectrum", "sway", "undetermined"]
+__all__ = ["Sway", "remarks", "spectrum", "stretches_once", "sway", "undetermined"]
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -105,7 +105,7 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
     if not names:
         return []
     parts, directions = spectrum(posterior, point)
-    found = []
+    lines = []
     for i in np.flatnonzero(parts > LEFT_OPEN):
         combination = _combination(directions[:, i], names)
         text = f"the record does not determine {combination}: {parts[i]:.0%} of the prior's sd left"
@@ -114,8 +114,8 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
             text += f", next {following} with {parts[i + 1]:.0%}"
         members = [name for name in names if name in combination.split()]
         decider = _decider(posterior.prior, draws, members)
-        found.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
-    return found
+        lines.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
+    return lines
 
 
 def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
@@ -166,19 +166,19 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
         if np.std(place) > ANYWHERE:
             assert parameter.declared is not None
             return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
-    found = sway(prior, draws, names)
-    if found.part > WIDE:
-        return f"the prior decides there: the posterior has {found.part:.0%} of its sd"
-    if not found.told:
-        return "whether the prior decides there cannot be told from these draws"
-    if found.decides:
+    swayed = sway(prior, draws, names)
+    if swayed.part > WIDE:
+        return f"the prior decides there: the posterior has {swayed.part:.0%} of its sd"
+    if not swayed.told:
+        return "these draws cannot tell whether the prior decides there"
+    if swayed.decides:
         return (
-            f"the prior decides there: one twice as wide moves {found.name} by {found.moved:.1f} "
-            f"of its sd and makes an interval {found.widened:.1f} times as wide"
+            f"the prior decides there: one twice as wide moves {swayed.name} by {swayed.moved:.1f} "
+            f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
         f"the prior does not decide there (one twice as wide moves nothing by more than "
-        f"{found.moved:.1f} of its sd) but the noise model, which may be too sure"
+        f"{swayed.moved:.1f} of its sd) but the noise model, which may be too sure"
     )
 
 
@@ -195,7 +195,7 @@ def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> st
     columns = first.table.columns(alone.prior.theta(its))
     opening = first.actuator.hysteresis.opening(columns, half)
     if opening is not None and float(np.median(opening)) < SMALL:
-        return f"drive further than {2 * half:.3g} V from end to end, if the actuator may"
+        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
     if len(swings) < 2:
         return "drive the actuator up and down several times, with decreasing amplitude"
     if min(swings) > (1 - ALIKE) * max(swings):
@@ -274,7 +274,7 @@ def _information(
     slopes = (plus - minus) / (2 * STEP)
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     sds = one.noise.marginal_sd(one.table.noise(posterior.table.of(theta, one.name)))
-    weights, duration = _stretches(one.voltage, rows)
+    weights, duration = stretches_once(one.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sds[1][0], DISCREPANCY * one.extent, duration / 2]])
@@ -285,7 +285,7 @@ def _information(
     return total
 
 
-def _stretches(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
+def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
     """Weight of each sample, one over how often ``rows`` have its stretch; mean samples a stretch.
 
     A stretch that ends early, as a record's last one, counts as a part.

@@ -1,6 +1,6 @@
-"""Innovations: what a fit's residuals bring anew at each reading, and whether it is pure chance.
+"""Innovations: what each reading adds to those before it, and whether that is pure chance.
 
-Where model and noise model are right, a residual less what the readings before it foretell, over
+Where model and noise model are right, a residual less what the readings before it predict, over
 its standard deviation, is an independent standard normal number. Four things can be seen in these
 innovations that the residuals hide: whether they are white, whether they are normal, whether their
 size depends on the drive (its rate, its voltage, its direction), and whether the record starts as
@@ -125,31 +125,31 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     )
 
 
-def remarks(found: Innovations) -> tuple[str, ...]:
-    """Say, one line each, in what the innovations are not what the noise model takes them for."""
-    if found.white.size < FEWEST:
+def remarks(series: Innovations) -> tuple[str, ...]:
+    """Say, one line each, where the innovations depart from what the noise model assumes."""
+    if series.white.size < FEWEST:
         return ()
-    lines = [*_correlated(found), *_heavy(found)]
+    lines = [*_correlated(series), *_heavy(series)]
     for what in ("rate", "voltage", "direction"):
-        lines += _uneven(found, what)
+        lines += _uneven(series, what)
     return tuple(f"noise model: {line}" for line in lines)
 
 
-def odd_start(found: Innovations) -> OddStart | None:
+def odd_start(series: Innovations) -> OddStart | None:
     """Find a start of the record that the noise model cannot have made, if there is one.
 
     The first innovations are summed up over 4, 8, ... readings, up to an eighth of all. A sum that
     is odd is larger than chance allows, and than all sums of as many readings in the second half.
     The start lasts until what comes after it is odd no longer.
     """
-    size = _oddness(found.white)
+    size = _oddness(series.white)
     if not size:
         return None
     first = 0
-    # Up to a third of the record: what is odd for longer is no start.
-    while first < found.white.size // 3 and _oddness(found.white[first:], ENDED):
+    # Up to a third of the record: what is odd for longer is not a start.
+    while first < series.white.size // 3 and _oddness(series.white[first:], ENDED):
         first = max(first + 1, round(1.2 * first))
-    return OddStart(float(found.time[0]), float(found.time[first]), size)
+    return OddStart(float(series.time[0]), float(series.time[first]), size)
 
 
 def _oddness(white: FloatArray, part: float = 1.0) -> float:
@@ -168,21 +168,21 @@ def _oddness(white: FloatArray, part: float = 1.0) -> float:
     return largest
 
 
-def numbers(found: Innovations) -> dict[str, object]:
+def numbers(series: Innovations) -> dict[str, object]:
     """Return what ``summary.json`` says of the innovations."""
-    correlation = found.correlation
+    correlation = series.correlation
     return {
-        "readings": found.white.size,
-        "sd": float(np.std(found.white)),
+        "readings": series.white.size,
+        "sd": float(np.std(series.white)),
         "autocorrelation_1": float(correlation[0]) if correlation.size else None,
         "largest_autocorrelation": (
             float(correlation[np.argmax(np.abs(correlation))]) if correlation.size else None
         ),
-        "excess_kurtosis": found.kurtosis,
+        "excess_kurtosis": series.kurtosis,
         "by": {
             what: {
                 name: {"mean": float(np.mean(part)), "sd": float(np.std(part))}
-                for name, part in found.by(what)
+                for name, part in series.by(what)
                 if part.size
             }
             for what in ("rate", "voltage", "direction")
@@ -190,41 +190,41 @@ def numbers(found: Innovations) -> dict[str, object]:
     }
 
 
-def _correlated(found: Innovations) -> list[str]:
-    correlation = found.correlation
-    bound = stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(found.white.size)
+def _correlated(series: Innovations) -> list[str]:
+    correlation = series.correlation
+    bound = stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
     lag = int(np.argmax(np.abs(correlation)))
     if abs(correlation[lag]) <= max(bound, CORRELATED):
         return []
-    after = found.time[lag + 1] - found.time[0]
+    after = series.time[lag + 1] - series.time[0]
     return [
         f"innovations {after:.3g} s apart correlate by {correlation[lag]:.2f}, and should not: "
-        "the discrepancy is no process that forgets exponentially, or the sensor filters"
+        "the discrepancy does not forget exponentially, or the sensor filters"
     ]
 
 
-def _heavy(found: Innovations) -> list[str]:
-    excess, error = found.kurtosis, np.sqrt(24 / found.white.size)
+def _heavy(series: Innovations) -> list[str]:
+    excess, error = series.kurtosis, np.sqrt(24 / series.white.size)
     # Kurtosis of few numbers is skewed: one more sd than its size would need.
     if excess <= max(HEAVY, (stats.norm.isf(ALARM) + 2) * error):
         return []
-    far = int(np.sum(np.abs(found.white) > 4))
+    far = int(np.sum(np.abs(series.white) > 4))
     return [
         f"the innovations have heavy tails (excess kurtosis {excess:.1f}, {far} of "
-        f"{found.white.size} beyond 4 sds): look for outliers, or for jumps of the drive"
+        f"{series.white.size} beyond 4 sds): look for outliers, or for jumps of the drive"
     ]
 
 
-def _uneven(found: Innovations, what: str) -> list[str]:
+def _uneven(series: Innovations, what: str) -> list[str]:
     """Compare the sds, and the means, of the innovations in parts of the drive."""
-    groups = [(name, values) for name, values in found.by(what) if values.size >= FEWEST // GROUPS]
+    groups = [(name, values) for name, values in series.by(what) if values.size >= FEWEST // GROUPS]
     if len(groups) < 2:
         return []
     lines = []
     sds = [float(np.std(values)) for _, values in groups]
     high, low = int(np.argmax(sds)), int(np.argmin(sds))
     # The variance of tails that are heavy is less sure.
-    heavy = 1 + max(found.kurtosis, 0) / 2
+    heavy = 1 + max(series.kurtosis, 0) / 2
     error = np.sqrt(heavy * sum(0.5 / values.size for _, values in groups))
     ratio = sds[high] / max(sds[low], np.finfo(float).tiny)
     bound = stats.norm.isf(ALARM / 6) * error

@@ -261,7 +261,7 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
     ``widest_percent``
         The largest x↓ − x↑ at one voltage as a part of the range: what data sheets call hysteresis.
     ``remanence_um``
-        x↓(0) − x_m: what is left at zero volts after the highest voltage, against the middle; half
+        x↓(0) − x_m: what remains at zero volts after the highest voltage, against the middle; half
         of the opening in a loop that is symmetric about zero. None as for the opening.
     ``coercive_V``
         (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
@@ -333,7 +333,9 @@ def _loop(traced: Traced) -> Loop:
 def _voltages(low: float, high: float, points: int) -> FloatArray:
     """Return voltages (points,) from the lowest to the highest."""
     if not low < high:
-        raise InputError(f"loops: {low:g} to {high:g} V is no range; give a voltage that changes")
+        raise InputError(
+            f"loops: {low:g} to {high:g} V is not a range; give a voltage that changes"
+        )
     if points < 3 or points % 2 == 0:
         raise InputError(f"loops: {points} points along a branch; give an odd number from 3 on")
     return np.linspace(low, high, points)

@@ -23,16 +23,20 @@ from bwbayes.results.result import Result
 __all__ = ["posterior_tree", "write_bands", "write_posterior", "write_summary"]
 
 
-def write_posterior(path: Path, result: Result, log_likelihood: FloatArray, record: Record) -> None:
+def write_posterior(
+    path: Path, result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
+) -> None:
     """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
-    tree = posterior_tree(result, log_likelihood, record)
+    tree = posterior_tree(result, log_likelihood, records)
     temporary = path.with_suffix(".partial")
     # From memory: HDF5 does not survive a disk that is full.
     temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
     temporary.replace(path)
 
 
-def posterior_tree(result: Result, log_likelihood: FloatArray, record: Record) -> Any:
+def posterior_tree(
+    result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
+) -> Any:
     """Return the draws as arviz groups, an xarray.DataTree, and whether they have converged.
 
     Groups: posterior, sample_stats, log_likelihood (of all readings together), observed_data and
@@ -46,8 +50,9 @@ def posterior_tree(result: Result, log_likelihood: FloatArray, record: Record) -
         The run.
     log_likelihood
         (steps, ensembles, walkers), nats.
-    record
-        The training record.
+    records
+        The training records by name. The variables and times of several have their record's name
+        behind their own: ``displacement_loops``.
     """
     _, ensembles, walkers, _ = result.draws.shape
 
@@ -56,16 +61,20 @@ def posterior_tree(result: Result, log_likelihood: FloatArray, record: Record) -
             ensembles * walkers, len(values), *values.shape[3:]
         )
 
+    of = {f"_{name}" if len(records) > 1 else "": one for name, one in records.items()}
+    measured = {f"displacement{end}": np.asarray(one.displacement) for end, one in of.items()}
+    driven = {f"voltage{end}": one.voltage for end, one in of.items()}
+    times = {f"time{end}": one.time for end, one in of.items()}
     drawn = chains(result.draws)
     tree = arviz_base.from_dict(
         {
             "posterior": {p.name: drawn[..., i] for i, p in enumerate(result.free)},
             "sample_stats": {"lp": chains(result.log_density)},
-            "observed_data": {"displacement": np.asarray(record.displacement)},
-            "constant_data": {"voltage": record.voltage},
+            "observed_data": measured,
+            "constant_data": driven,
         },
-        coords={"time": record.time},
-        dims={"displacement": ["time"], "voltage": ["time"]},
+        coords=times,
+        dims={f"{name}{end}": [f"time{end}"] for end in of for name in ("displacement", "voltage")},
         check_conventions=False,  # more walkers than steps are as they should be
     )
     along = {
@@ -77,12 +86,13 @@ def posterior_tree(result: Result, log_likelihood: FloatArray, record: Record) -
     density = ("chain", "draw"), chains(log_likelihood)
     statistics = tree["sample_stats"].to_dataset()
     tree["log_likelihood"] = statistics.drop_vars("lp").assign(displacement=density)
-    for group, name, unit in (
-        ("observed_data", "displacement", "um"),
-        ("constant_data", "voltage", "V"),
+    for group, names, unit in (
+        ("observed_data", measured, "um"),
+        ("constant_data", driven, "V"),
     ):
-        tree[group][name].attrs["units"] = unit
-        tree[group]["time"].attrs["units"] = "s"
+        for name, time in zip(names, times, strict=True):
+            tree[group][name].attrs["units"] = unit
+            tree[group][time].attrs["units"] = "s"
     tree.attrs["converged"] = tree["posterior"].attrs["converged"] = int(result.outcome.converged)
     for parameter in result.free:
         tree["posterior"][parameter.name].attrs["units"] = parameter.unit

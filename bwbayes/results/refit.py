@@ -1,4 +1,4 @@
-"""Whether a fit hangs on the start of its record: a second point fit without it tells.
+"""Whether a fit depends on the start of its record: a second point fit without it tells.
 
 A switch-on transient, or a first part that belongs to something else, can drag the parameters far
 away while the noise model covers what is then missed everywhere, so that neither bands nor

@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
-from typing import NamedTuple, TypedDict
+from typing import TypedDict
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.passages import crossings, passed
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
@@ -88,7 +89,7 @@ class Experiment:
     Raises
     ------
     InputError
-        No training voltage goes forth and back, so that there is no loop to measure.
+        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     posterior: Posterior
@@ -99,9 +100,9 @@ class Experiment:
     belongs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not any(_crossings(path).both for path in self._paths.values()):
+        if not any(crossings(path).both for path in self._paths.values()):
             raise InputError(
-                "record: its training voltage does not go forth and back, so there is no loop to "
+                "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
             )
 
@@ -133,13 +134,13 @@ class Experiment:
 
     @cached_property
     def looped(self) -> str:
-        """The record whose loop is measured: the first that goes forth and back."""
-        return next(name for name, path in self._paths.items() if _crossings(path).both)
+        """The record whose loop is measured: the first that goes back and forth."""
+        return next(name for name, path in self._paths.items() if crossings(path).both)
 
     @property
     def level(self) -> float:
         """Voltage at which loops are measured, V."""
-        return _crossings(self._paths[self.looped]).level
+        return crossings(self._paths[self.looped]).level
 
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
         """Log likelihood and the two loop measures of models θ, (models, 3).
@@ -147,46 +148,14 @@ class Experiment:
         The opening (um) is the model's displacement where the voltage falls through zero, or
         through the middle of a drive beside it, less that where it rises through it, interpolated
         between samples, each the mean over all passages; the range (um) is its largest less its
-        smallest displacement. Of several records, in the first that goes forth and back.
+        smallest displacement. Of several records, in the first that goes back and forth.
         """
         displacement = posterior.simulate(theta, record=self.looped)
         path = self._paths[self.looped]
-        crossings = _crossings(path)
-        falling, rising = (
-            _passed(displacement, path, at, crossings.level)
-            for at in (crossings.falling, crossings.rising)
-        )
+        level, up, down = crossings(path)
+        falling, rising = (passed(displacement, path, at, level) for at in (down, up))
         extent = np.ptp(displacement, axis=1)
         return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
-
-
-class _Crossings(NamedTuple):
-    """Samples after which a voltage goes up and down through a level, V."""
-
-    level: float
-    rising: IntArray
-    falling: IntArray
-
-    @property
-    def both(self) -> bool:
-        return bool(self.rising.size and self.falling.size)
-
-
-def _crossings(path: FloatArray) -> _Crossings:
-    low, high = float(np.min(path)), float(np.max(path))
-    level = 0.0 if low < 0 < high else (low + high) / 2
-    above = path > level
-    up, down = ~above[:-1] & above[1:], above[:-1] & ~above[1:]
-    return _Crossings(level, np.flatnonzero(up), np.flatnonzero(down))
-
-
-def _passed(displacement: FloatArray, path: FloatArray, at: IntArray, level: float) -> FloatArray:
-    """Displacement (models,) where a path passes a level, the mean over all passages, um."""
-    before, after = path[at], path[at + 1]
-    part = (level - before) / (after - before)
-    passed = displacement[:, at] * (1 - part) + displacement[:, at + 1] * part
-    mean: FloatArray = np.mean(passed, axis=1)
-    return mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,8 +198,8 @@ class Replicate:
 
     def entry(self) -> Entry:
         """Return what is stored of it."""
-        found = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if found else []
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
         return Entry(
             number=self.number,
             converged=self.converged,
@@ -238,7 +207,7 @@ class Replicate:
             steps=self.steps,
             spacing=self.spacing,
             truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if found else {},
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
             covered=dict(self.covered),
         )
 
@@ -345,12 +314,7 @@ def _simulated(
 
 def _with_readings(posterior: Posterior, made: Mapping[str, Simulated]) -> Posterior:
     """Return a posterior with the readings of simulated records."""
-    datasets = []
-    for one in posterior.datasets:
-        displacement = made[one.name].record.displacement
-        assert displacement is not None
-        datasets.append(replace(one, displacement=displacement))
-    return replace(posterior, datasets=tuple(datasets))
+    return posterior.with_readings({name: one.reading for name, one in made.items()})
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
@@ -384,8 +348,8 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    wanted = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(wanted, steps * ensembles * walkers // RANKED), 1)
+    apart = math.ceil(time) if math.isfinite(time) else 1
+    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
     left = chained[::-spacing].reshape(-1, free)
     return spacing, thinned(left, generator, RANKED)
 

@@ -14,10 +14,13 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import innovations, loops, steps
+from bwbayes.results import agreement, innovations, learned, loops, replicated, steps
+from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.learned import Learned
 from bwbayes.results.loops import Loops
+from bwbayes.results.replicated import Replicated
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
@@ -52,12 +55,19 @@ class Result:
     verdicts
         Whether the bands hold, by their name, for those with a measurement.
     innovations
-        What each fitted reading brings anew, at the most probable draw; None unless converged.
+        The innovation of each fitted reading, at the most probable draw, by the record; empty
+        unless converged.
     loops
         The loops of the actuator, measured; None unless converged.
     steps
         The responses to the steps among the records that were predicted, by name; empty unless
         converged.
+    agreement
+        Of several records, how each agrees with the others, by name; empty unless converged.
+    learned
+        What the record taught: prior against posterior; None unless converged.
+    replicated
+        Each fitted record among replicated ones, by name; empty unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -75,9 +85,12 @@ class Result:
     bands: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
-    innovations: Innovations | None = None
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
+    agreement: Mapping[str, Agreement] = field(default_factory=dict)
+    learned: Learned | None = None
+    replicated: Mapping[str, Replicated] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -101,8 +114,9 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
-    None unless the sampling has converged.
+    ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
+    ``identifiability`` and ``replicated`` are None unless the sampling has converged;
+    ``agreement`` is there for several records alone.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -123,6 +137,8 @@ def summary(result: Result) -> dict[str, object]:
         "innovations": None,
         "loops": None,
         "step_responses": None,
+        "identifiability": None,
+        "replicated": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -130,10 +146,19 @@ def summary(result: Result) -> dict[str, object]:
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
-        if result.innovations is not None:
-            known["innovations"] = innovations.numbers(result.innovations)
+        every = {name: innovations.numbers(one) for name, one in result.innovations.items()}
+        if every:
+            # Those of one record stand alone, those of several by their names.
+            known["innovations"] = every if len(every) > 1 else next(iter(every.values()))
+        if result.agreement:
+            known["agreement"] = agreement.numbers(result.agreement)
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
+        if result.learned is not None:
+            known["identifiability"] = learned.numbers(result.learned)
+        known["replicated"] = {
+            name: replicated.numbers(one) for name, one in result.replicated.items()
+        } or None
         known["step_responses"] = steps.numbers(result.steps)
     return known
 

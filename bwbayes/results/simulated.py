@@ -29,6 +29,12 @@ class Simulated(NamedTuple):
     record: Record
     model: FloatArray
 
+    @property
+    def reading(self) -> FloatArray:
+        """What its sensor says, (samples,), um."""
+        assert self.record.displacement is not None
+        return self.record.displacement
+
 
 @dataclass(frozen=True)
 class OtherRecord:
@@ -111,18 +117,18 @@ def covered(
 
 def _target(kind: Kind, made: Simulated) -> FloatArray:
     """Return what a kind of band is for, (samples,), um."""
-    values = {
+    assert made.record.truth is not None
+    targets: dict[Kind, FloatArray] = {
         "parameter": made.model,
         "displacement": made.record.truth,
-        "sensor": made.record.displacement,
-    }[kind]
-    assert values is not None
-    return values
+        "sensor": made.reading,
+    }
+    return targets[kind]
 
 
 def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
     """Tell which of the values (samples,) that there are lie inside the end of a band."""
-    there = np.isfinite(values)
+    known = np.isfinite(values)
     low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
-    inside: FloatArray = ((low <= values) & (values <= high))[there].astype(np.float64)
+    inside: FloatArray = ((low <= values) & (values <= high))[known].astype(np.float64)
     return inside

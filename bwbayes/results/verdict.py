@@ -361,7 +361,7 @@ def _odd(start: OddStart | None) -> list[str]:
 
 
 def _moved(moved: Moved | None) -> list[str]:
-    """Say that the parameters of a fit hang on the record's start."""
+    """Say that the parameters of a fit depend on the record's start."""
     if moved is None:
         return []
     (whole, sd), (rest, its_sd) = moved.whole, moved.rest

@@ -2,17 +2,15 @@
 
 :func:`advance` is a pure function of the posterior and an :class:`EnsembleState`, random state
 included. So it does not matter where, when or in which order ensembles run: a run with two
-workers, or one that was interrupted and goes on, gives the same bits. Only this module and the
-moves know emcee.
+workers, or one that was interrupted and goes on, gives the same bits.
+:func:`advance_together` moves several at once, and makes one call of the density for all of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import emcee
 import numpy as np
 from emcee.autocorr import auto_window
 from emcee.moves import Move
@@ -23,12 +21,14 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling.walking import Steps, walk
 
 __all__ = [
     "RANDOM_STATE_WORDS",
     "Block",
     "EnsembleState",
     "advance",
+    "advance_together",
     "autocorrelation_time",
     "start",
 ]
@@ -74,35 +74,6 @@ class Block:
     end: EnsembleState
 
 
-class _Counted(Move):  # type: ignore[misc]  # emcee has no types
-    """A move that counts what it proposes to walkers and what they accept."""
-
-    def __init__(self, move: Move) -> None:
-        self.move = move
-        self.counts = np.zeros(2, dtype=np.int64)
-
-    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, NDArray[np.bool_]]:
-        """Let the move propose to every walker."""
-        state, accepted = self.move.propose(model, state)
-        self.counts += accepted.size, np.count_nonzero(accepted)
-        return state, accepted
-
-
-class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]  # emcee has no types
-    """emcee's sampler, in which a place that is not finite has no density.
-
-    Without a proper posterior walkers go there sooner or later, which emcee does not survive.
-    """
-
-    def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:
-        """Return the log density (models,) at coordinates (models, free), and nothing else."""
-        finite = np.isfinite(coords).all(axis=1)
-        density: FloatArray = np.full(len(coords), -np.inf)
-        if finite.any():
-            density[finite], _ = super().compute_log_prob(coords[finite])
-        return density, None
-
-
 def start(
     posterior: Posterior,
     point: PointFit,
@@ -114,7 +85,7 @@ def start(
 
     The optima of the point fit take turns; from there the point lies ten posterior sds off in a
     random direction (nearer where the density is zero), so that ensembles agree only after they
-    have found the same posterior.
+    have reached the same posterior.
 
     Raises
     ------
@@ -148,32 +119,70 @@ def advance(
 
     Each step takes one of the moves at random, for all walkers.
     """
-    walkers, free = state.coordinates.shape
-    counted = [(_Counted(move), weight) for move, weight in moves]
-    sampler = _Sampler(walkers, free, posterior.log_density, vectorize=True, moves=counted)
-    begin = emcee.State(
-        state.coordinates,
-        log_prob=state.log_density,
-        random_state=_unpack(state.random_state),
-        copy=True,
-    )
-    # Clusters are tight at first: emcee's check of their spread would refuse them.
+    return advance_together(posterior, [moves], [state], steps)[0]
+
+
+def advance_together(
+    posterior: Posterior,
+    moves: Sequence[Sequence[tuple[Move, float]]],
+    states: Sequence[EnsembleState],
+    steps: int,
+) -> list[Block]:
+    """Move several ensembles on, each by ``moves`` of its own, with one density call for all.
+
+    Each is moved as :func:`advance` moves it alone, and its random numbers are its own: bit for bit
+    where a density does not depend on the others of its batch, to rounding where it does (the
+    compiled engine decides for groups of models when their noise has settled). On a short record a
+    call costs more than the models in it, so that four ensembles cost little more than one.
+    """
+    randoms = [_generator(state.random_state) for state in states]
+    walks = [
+        walk(own, state.coordinates, state.log_density, random, steps)
+        for own, state, random in zip(moves, states, randoms, strict=True)
+    ]
+    ended: dict[int, Steps] = {}
+    # Far away a proposal may overflow: such a place has no density.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        last = sampler.run_mcmc(begin, steps, skip_initial_state_check=True)
-    return Block(
-        sampler.get_chain(),
-        sampler.get_log_prob(),
-        sampler.backend.accepted.astype(np.int64),
-        np.stack([move.counts for move, _ in counted]),
-        EnsembleState(last.coords, last.log_prob, _pack(last.random_state)),
+        asked = {number: next(one) for number, one in enumerate(walks)}
+        while asked:
+            density = _log_density(posterior, np.concatenate([*asked.values()]))
+            ends = np.cumsum([len(places) for places in asked.values()])[:-1]
+            answers = zip([*asked], np.split(density, ends), strict=True)
+            asked = {}
+            for number, answer in answers:
+                try:
+                    asked[number] = walks[number].send(answer)
+                except StopIteration as end:
+                    ended[number] = end.value
+    return [_block(ended[number], random) for number, random in enumerate(randoms)]
+
+
+def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
+    """Log density (models,) at coordinates (models, free), −∞ where they are not finite.
+
+    Without a proper posterior walkers go there sooner or later.
+    """
+    finite = np.isfinite(coordinates).all(axis=1)
+    if finite.all():
+        return posterior.log_density(coordinates)
+    density: FloatArray = np.full(len(coordinates), -np.inf)
+    if finite.any():
+        density[finite] = posterior.log_density(coordinates[finite])
+    return density
+
+
+def _block(made: Steps, random: np.random.RandomState) -> Block:
+    end = EnsembleState(
+        made.coordinates[-1].copy(), made.log_density[-1].copy(), _pack(random.get_state())
     )
+    return Block(made.coordinates, made.log_density, made.accepted, made.moves, end)
 
 
 def autocorrelation_time(draws: FloatArray) -> FloatArray:
     """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
 
     As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
-    but for all walkers at once: the mean is taken of their spectra, and transformed back once. It
+    here for all walkers at once: the mean is taken of their spectra, and transformed back once. It
     is nan where it cannot be told, for instance where nothing moves.
     """
     steps = draws.shape[0]
@@ -185,8 +194,8 @@ def autocorrelation_time(draws: FloatArray) -> FloatArray:
         power /= np.sum(away**2, axis=-1, keepdims=True)
         correlation = fft.irfft(np.mean(power, axis=0), padded)[:, :steps]
     times = 2 * np.cumsum(correlation, axis=1) - 1
-    found = np.array([time[auto_window(time, WINDOW)] for time in times])
-    return np.where(found > 0, found, np.nan)
+    windowed = np.array([time[auto_window(time, WINDOW)] for time in times])
+    return np.where(windowed > 0, windowed, np.nan)
 
 
 def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:
@@ -195,6 +204,9 @@ def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.
     return np.concatenate([words, rest, np.array([normal]).view(np.uint32)])
 
 
-def _unpack(words: NDArray[np.uint32]) -> tuple[str, NDArray[np.uint32], int, int, float]:
+def _generator(words: NDArray[np.uint32]) -> np.random.RandomState:
+    """Return the generator in that state."""
     normal = float(np.ascontiguousarray(words[626:628]).view(np.float64)[0])
-    return "MT19937", words[:624], int(words[624]), int(words[625]), normal
+    random = np.random.RandomState(np.random.MT19937(0))
+    random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
+    return random

@@ -40,7 +40,7 @@ from bwbayes.sampling.diagnostics import (
     nested_rhat,
     pareto_k,
 )
-from bwbayes.sampling.ensemble import Block, advance, start
+from bwbayes.sampling.ensemble import Block, advance_together, start
 from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -48,13 +48,14 @@ __all__ = [
     "Outcome",
     "SamplingPlan",
     "Watcher",
+    "best_together",
     "draws",
     "first_chain",
     "log_densities",
     "sample",
 ]
 
-# Nested R-hat of the pilot's second half below which its ensembles have found each other. After so
+# Nested R-hat of the pilot's second half below which its ensembles have met. After so
 # many steps it is enough if each stays where it is: in modes far apart differential evolution would
 # keep them for ever, and a proposal fitted to all of them will not.
 PILOT_RHAT = 1.1
@@ -74,11 +75,15 @@ LEAST_STRETCH = 1.2
 APART = 1.2
 FIRST_PART = 0.5
 
+# Walkers times samples below which a step is mostly Python's work, and below which half is.
+LIGHT = 1 << 16
+MEDIUM = 1 << 18
+
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
 
 
-def _unwatched(phase: Phase, found: Check | None) -> None:
+def _unwatched(phase: Phase, latest: Check | None) -> None:
     """Watch nothing."""
 
 
@@ -100,6 +105,9 @@ class SamplingPlan:
         The budget: steps of each ensemble that count, and before.
     least_pilot_steps
         Steps of the pilot in any case.
+    together
+        Ensembles that are moved with one call of the density. A property of what is sampled, not
+        of who computes it: on the compiled engine the last bits of densities may depend on it.
     """
 
     ess: float = 2000.0
@@ -109,6 +117,7 @@ class SamplingPlan:
     most_steps: int = 20_000
     least_pilot_steps: int = 100
     most_pilot_steps: int = 3_000
+    together: int = 1
 
     def __post_init__(self) -> None:
         if self.ensembles < 4:
@@ -125,6 +134,16 @@ class Outcome:
     stop_reason: str
     check: Check
     remarks: tuple[str, ...] = ()
+
+
+def best_together(ensembles: int, walkers: int, samples: int) -> int:
+    """Return how many ensembles to move with one call, on a record of so many samples.
+
+    All where a step is light: threads would wait for each other's Python. Half of them, for two
+    threads, where the models take as long as Python does. Else each by itself.
+    """
+    size = walkers * samples
+    return ensembles if size <= LIGHT else ensembles // 2 if size <= MEDIUM else 1
 
 
 def first_chain(
@@ -218,20 +237,22 @@ def _sampled(
         blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, passed: int, found: Check) -> int:
+def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
     part = 1.0 if passed else FIRST_PART
-    fewest = np.min([found.ess_bulk, found.ess_tail])
+    fewest = np.min([latest.ess_bulk, latest.ess_tail])
     with np.errstate(divide="ignore"):
-        steps = np.maximum(found.steps * plan.ess / fewest, LENGTH * np.max(found.autocorrelation))
-    wanted = max(part * steps / plan.block, APART * passed)
-    if not wanted > blocks:  # nan too
-        wanted = LEAST_STRETCH * blocks
-    return int(max(np.ceil(min(wanted, LARGEST_STRETCH * blocks)), blocks + 1))
+        steps = np.maximum(
+            latest.steps * plan.ess / fewest, LENGTH * np.max(latest.autocorrelation)
+        )
+    following = max(part * steps / plan.block, APART * passed)
+    if not following > blocks:  # nan too
+        following = LEAST_STRETCH * blocks
+    return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
 class _Judge:
@@ -262,11 +283,11 @@ class _Judge:
             self._prepare(number)
         self.prepared = blocks
         (every,) = self.draws = self._joined(self.draws)
-        found = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
+        latest = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
         if self.proposal is None:
-            return found
+            return latest
         (weights,) = self.log_weights = self._joined(self.log_weights)
-        return replace(found, pareto_k=pareto_k(weights.ravel()))
+        return replace(latest, pareto_k=pareto_k(weights.ravel()))
 
     @staticmethod
     def _joined(kept: list[FloatArray]) -> list[FloatArray]:
@@ -309,7 +330,7 @@ def _thinned(chain: Chain) -> tuple[str, ...]:
     thin = thinning(chain.draws("sampling"))
     if thin == 1:
         return ()
-    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to bound the memory",)
+    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to limit the memory",)
 
 
 def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
@@ -327,16 +348,17 @@ def _extend(
     watcher: Watcher,
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
-    proposal = chain.proposal_in_use(phase)
-    # Moves of its own for each: some of emcee's write to themselves.
-    futures = [
-        executor.submit(advance, posterior, sampling_moves(proposal), end, plan.block)
-        for end in chain.ends
-    ]
+    proposal, ends = chain.proposal_in_use(phase), chain.ends
+    futures = []
+    for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
+        # Moves of its own for each: some of emcee's write to themselves.
+        moves = [sampling_moves(proposal) for _ in group]
+        futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
     blocks: list[Block] = []
     for future in futures:
-        blocks.append(future.result())
-        watcher(phase, None)
+        for block in future.result():
+            blocks.append(block)
+            watcher(phase, None)
     chain.append(phase, blocks)
 
 

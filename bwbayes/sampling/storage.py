@@ -246,7 +246,7 @@ class ChainFile(Chain):
 
     @classmethod
     def _load(cls, path: Path) -> tuple[ChainFile | None, str]:
-        """Return what can be read of a file, and what ails the rest, if anything."""
+        """Return what can be read of a file, and what is wrong with the rest, if anything."""
         loaded, damage, set_aside = None, "", 0
         with Image(path) as image:
             try:

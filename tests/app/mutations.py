@@ -2,7 +2,7 @@
 
 :func:`case` makes one from its number alone, so that any of them can be made again: a config and
 the record that it names, one of the two spoilt. Records are spoilt by the line, by the cell, by
-the byte, and are made anew from arrays that belong in no record; configs by the value, by the key,
+the byte, and are made again from arrays that belong in no record; configs by the value, by the key,
 by the line and by the byte.
 """
 

@@ -164,7 +164,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 3 == page.count("data:image/png;base64,")
     for text in (
-        '<td class="text">other</td>',
+        '<td class="words">other</td>',
         "12 tests",
         "1%",
         "20 % too small",
@@ -286,12 +286,12 @@ def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
         ({0: b'{"replicates":0,"of":"x"}'}, "does not say how many"),
         ({0: b'{"replicates":3}'}, "does not say how many"),
         ({0: b'{"replicates":1e999,"of":"x"}'}, "does not say how many"),
-        ({1: b"nonsense"}, ":2: is no replicate of these; delete this line"),
-        ({1: b'{"number": 0}'}, ":2: is no replicate of these; delete this line"),
-        ({2: b"[1]"}, ":3: is no replicate of these; delete this line"),
-        ({2: b"[" * 100_000}, ":3: is no replicate of these; delete this line"),
-        ({2: b"{}"}, ":3: is no replicate of these; delete this line"),
-        ({2: b"\xff"}, ":3: is no replicate of these; delete this line"),
+        ({1: b"nonsense"}, ":2: is not one of these replicates; delete this line"),
+        ({1: b'{"number": 0}'}, ":2: is not one of these replicates; delete this line"),
+        ({2: b"[1]"}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"[" * 100_000}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"{}"}, ":3: is not one of these replicates; delete this line"),
+        ({2: b"\xff"}, ":3: is not one of these replicates; delete this line"),
     ],
 )
 def test_damaged_lines_are_refused(
@@ -318,7 +318,7 @@ def test_line_of_another_replicate_is_refused(
     def change(number: int, line: bytes) -> bytes:
         return re.sub(one, other, line) if number == 2 else line
 
-    assert_refused(whole, tmp_path, ":3: is no replicate of these; delete this line", change)
+    assert_refused(whole, tmp_path, ":3: is not one of these replicates; delete this line", change)
 
 
 def assert_refused(
@@ -377,14 +377,14 @@ def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
 def test_prior_that_leaves_nothing_leaves_no_folder(tmp_path: Path) -> None:
     """Said at once, not by the first replicate."""
     impossible = TEXT.replace("mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01")
-    with pytest.raises(InputError, match="hardly a draw has"):
+    with pytest.raises(InputError, match="hardly any draw has"):
         begun(tmp_path / "a", text=impossible)
     assert [] == list(tmp_path.iterdir())
 
 
 def test_voltage_without_a_loop_leaves_nothing(tmp_path: Path) -> None:
     ramp = TEXT.replace("train = [[0.0, 1.5]]", "train = [[0.0, 0.2]]")
-    with pytest.raises(InputError, match="does not go forth and back"):
+    with pytest.raises(InputError, match="does not go back and forth"):
         begun(tmp_path / "a", text=ramp)
     assert [] == list(tmp_path.iterdir())
 

@@ -30,6 +30,7 @@ COMMANDS = (
     "calibrate",
     "compensate",
     "export",
+    "track",
     "config",
     "models",
 )

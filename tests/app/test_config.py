@@ -29,7 +29,7 @@ def refused(text: str) -> str:
 
 def test_two_lines_are_a_config() -> None:
     found = parse(RECORD, "my.toml")
-    assert found.record.file == "record.csv"
+    assert found.records["record"].file == "record.csv"
     assert (1, "lag", "auto", "discrepancy") == (
         found.seed,
         found.model.dynamics,
@@ -255,7 +255,7 @@ def test_unknown_key_of_any_length_is_one_short_line() -> None:
 
 def test_many_windows_in_one_line_are_no_long_key() -> None:
     windows = ", ".join(f"[{i}.0, {i}.5]" for i in range(1000))
-    assert 1000 == len(parse(f"{RECORD}train = [{windows}]\n", "").record.train or [])
+    assert 1000 == len(parse(f"{RECORD}train = [{windows}]\n", "").records["record"].train or [])
 
 
 @settings(deadline=None)

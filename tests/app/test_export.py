@@ -12,7 +12,9 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.export import export as command
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.jobs.export import export
+from bwbayes.app.jobs.track import Setup, track_run
 from bwbayes.errors import InputError, NotConvergedError
 from tests.app import small
 
@@ -80,19 +82,20 @@ def test_a_file_in_the_way_is_one_line(run: Path, tmp_path: Path) -> None:
 
 def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
     made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
-    small_steps(made.path)
+    assert 4 == finish(made.path, 1, quiet=True)
     with pytest.raises(
         NotConvergedError, match=r"run: not converged: .* go on with `bwbayes resume"
     ):
         export(made.path)
-    assert not (made.path / "export").exists()
-
-
-def small_steps(path: Path) -> None:
-    """Use up the budget of a run."""
-    from bwbayes.app.commands.shared import finish  # noqa: PLC0415  # what a command needs
-
-    assert 4 == finish(path, 1, quiet=True)
+    with pytest.raises(NotConvergedError, match=r"run: not converged: .* go on with `bwb"):
+        track_run(made.path, None, Setup())
+    fit = bw.open_run(made.path)
+    with pytest.raises(NotConvergedError, match="not converged"):
+        fit.track()
+    with pytest.raises(NotConvergedError, match="not converged"):
+        fit.export(tmp_path / "out")
+    left = (made.path / "export", made.path / "track", tmp_path / "out")
+    assert not any(path.exists() for path in left)
 
 
 def test_the_command_says_what_it_wrote(

@@ -18,6 +18,7 @@ from bwbayes.app.fit import fitted
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands
 from bwbayes.results.prediction import Start
@@ -331,7 +332,7 @@ def _no_run(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"train": (5, 90)}, "window 5 to 90 s: reaches outside the record"),
         ({"dynamics": "leg"}, "dynamics: 'leg' is unknown; did you mean lag?"),
         ({"validation": {"a": {"windw": (0, 1)}}}, "fit: validation.a.windw: unknown key; did you"),
-        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is no record"),
+        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is not a record"),
         ({"validation": {"a": "none.csv"}}, "none.csv: does not exist; check the path"),
     ],
 )
@@ -342,9 +343,32 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
     assert "\n" not in str(error.value)
 
 
+def test_the_columns_of_a_file_are_recognised(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def created(*arguments: Any) -> None:
+        raise InterruptedError(arguments[-2].record)
+
+    monkeypatch.setattr(RunFolder, "create", created)
+    rows = np.stack([1e3 * record.time, record.voltage, record.displacement], axis=1)  # type: ignore[arg-type]
+    np.savetxt(
+        tmp_path / "lab.csv",
+        rows,
+        fmt="%.9g",
+        delimiter=",",
+        header="t [ms],U [V],pos",
+        comments="",
+    )
+    with pytest.raises(bw.InputError, match="pos: no unit of the displacement in its name"):
+        bw.fit(tmp_path / "lab.csv")
+    with pytest.raises(InterruptedError) as seen:
+        bw.fit(tmp_path / "lab.csv", units={"displacement": "um"})
+    np.testing.assert_allclose(record.voltage, seen.value.args[0].voltage, atol=1e-6)
+
+
 @pytest.mark.usefixtures("_no_run")
 def test_what_is_no_record_is_one_line(record: Record) -> None:
-    with pytest.raises(bw.InputError, match=r"ndarray is no record; make one with Record.from_arr"):
+    with pytest.raises(bw.InputError, match=r"ndarray is not a record; make one with Record"):
         bw.fit(record.voltage)  # type: ignore[arg-type]
     with pytest.raises(bw.InputError, match="fit: record: has no displacement"):
         bw.fit(replace(record, displacement=None, truth=None))

@@ -37,7 +37,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from tests.app.mutations import KINDS, Case, case
-from tests.found import keep
+from tests.measured import keep
 
 SEED = 1
 FEW, ALL, FITTED = 1500, 10_000, 6

@@ -30,7 +30,7 @@ from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 from tests.forks import FORKS
-from tests.found import keep
+from tests.measured import keep
 
 # Longer than anything here takes.
 PATIENCE = 300.0

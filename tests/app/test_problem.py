@@ -386,10 +386,10 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
     write_record(transient, tmp_path / "record.h5")
     text = '[record]\nfile = "record.h5"\n'
     whole = of(text, tmp_path)
-    (finding,) = whole.findings
+    (finding,) = whole.findings["record"]
     assert f"record: {finding}" in whole.remarks
     later = of(f"{text}train = [[{finding.stop + 0.01}, 5.0]]\n", tmp_path)
-    assert () == later.findings
+    assert () == later.findings["record"]
     (remark,) = of(
         f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
     ).remarks
@@ -416,7 +416,7 @@ def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
     problem = of(RECORD + "[model]\noutliers = true\n", folder)
     assert [100, 333] == np.flatnonzero(np.isnan(problem.posterior.only.displacement)).tolist()
     assert "2 readings set aside as isolated outliers, at 1, 3.33 s" in problem.remarks
-    assert [1.0, 3.33] == pytest.approx(problem.config.record.outliers)
+    assert [1.0, 3.33] == pytest.approx(problem.config.records["record"].outliers)
     (folder / "records").mkdir()
     write_record(problem.record, folder / "records" / "record.h5")
     again = resolve(problem.config, folder)

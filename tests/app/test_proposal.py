@@ -98,7 +98,7 @@ def test_columns_and_units_are_recognised(
         rows = [line.split(",")[::-1] for line in path.read_text().splitlines()[1:]]
         path.write_text("\n".join([header, *(",".join(row) for row in rows)]) + "\n")
     made = proposed(path, **units)
-    source = made.config.record
+    source = made.config.records["record"]
     read = read_record(path, columns=source.columns, units=source.units)
     assert read.interval == pytest.approx(record.interval, rel=1e-6)
     np.testing.assert_allclose(read.voltage, record.voltage, atol=1e-5)
@@ -116,7 +116,9 @@ def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:
     assert ["held_out"] == list(problem.validations)
     assert problem.posterior.only.training == (slice(0, 450),)
     assert problem.validations["held_out"].window == slice(450, 600)
-    assert problem.config.record.columns is None  # the run's own copy has the package's names
+    assert (
+        problem.config.records["record"].columns is None
+    )  # the run's own copy has the package's names
 
 
 def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: Write) -> None:
@@ -155,7 +157,7 @@ def test_a_part_is_held_out_whose_drive_the_rest_covers(write: Write) -> None:
     """Of a growing sine this is the third quarter, and not the last."""
     made = proposed(_drive(write, lambda t: (20 + 10 * t) * np.sin(2 * np.pi * t)))
     assert [3.0, 4.5] == made.config.validation["held_out"].window
-    assert [[0.0, 3.0], [4.5, 6.0]] == made.config.record.train
+    assert [[0.0, 3.0], [4.5, 6.0]] == made.config.records["record"].train
 
 
 @pytest.mark.parametrize(
@@ -194,6 +196,20 @@ def test_ten_outliers_are_set_aside(write: Write) -> None:
     assert any(text.startswith("10 readings set aside") for text in problem.remarks)
 
 
+def test_outliers_that_are_held_out_are_left_out(write: Write) -> None:
+    """A fit sets aside those it is fitted to alone."""
+    spikes = [100, 470, 555]
+
+    def spoil(displacement: FloatArray) -> None:
+        displacement[spikes] += 60.0
+
+    path = write(change=spoil)
+    made = proposed(path)
+    assert 2 == len(made.config.record.exclude or [])
+    problem = resolve(made.config, path.parent)
+    assert spikes == np.flatnonzero(~problem.record.has_reading).tolist()
+
+
 @pytest.mark.parametrize(
     ("written", "line"),
     [
@@ -229,7 +245,7 @@ def test_a_reversed_sign_is_turned_by_its_unit(write: Write, record: Record) -> 
     problem = resolve(load(path.with_suffix(".toml")), path.parent)
     assert problem.record.displacement is not None
     np.testing.assert_allclose(problem.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
-    assert () == problem.findings
+    assert () == problem.findings["record"]
 
 
 # The commands
@@ -251,7 +267,7 @@ def test_init_elsewhere_finds_the_record(write: Write) -> None:
     (path.parent / "configs").mkdir()
     out = path.parent / "configs/a.toml"
     assert 0 == command("init", path, "--out", out).return_value
-    assert "../mine.csv" == load(out).record.file
+    assert "../mine.csv" == load(out).records["record"].file
     assert 600 == resolve(load(out), out.parent).record.samples
 
 
@@ -266,7 +282,7 @@ def test_run_without_a_config_runs_the_proposed_one(
     path = write(FOREIGN.replace("pos", "pos_nm"), (1e3, 1e3, 1e3))
     ran: list[Path] = []
 
-    def finish(folder: Path, *_: object) -> int:
+    def finish(folder: Path, *_: object, **__: object) -> int:
         ran.append(folder)
         return 0
 
@@ -276,7 +292,7 @@ def test_run_without_a_config_runs_the_proposed_one(
     assert "" == done.output
     assert [tmp_path / "out"] == ran
     config = load(tmp_path / "out/config.toml")
-    assert ("mine", [[0.0, 4.5]]) == (config.name, config.record.train)
+    assert ("mine", [[0.0, 4.5]]) == (config.name, config.records["record"].train)
     assert [4.5, 6.0] == config.validation["held_out"].window
     said = command("run", path, "--out", tmp_path / "again").output
     assert "fitting 0 to 4.5 s; the rest is held out; `bwbayes init" in said
@@ -291,7 +307,7 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     header, *rows = path.read_text().splitlines()
     path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
     remark = "mine.csv:1: ignored columns: temperature_C"
-    monkeypatch.setattr(run, "finish", lambda *_: 0)
+    monkeypatch.setattr(run, "finish", lambda *_, **__: 0)
     name, _, config = command_line.partition(" ")
     if config:
         path = path.with_suffix(".toml")

@@ -55,14 +55,15 @@ def test_a_transient_in_sight_counts(
     problem, chain, outcome = finished(RunFolder(small.finished(tmp_path_factory)))
     counted = []
 
-    def told(*_: object, seen: bool) -> None:
+    def told(*_: object, record: str, seen: bool) -> None:
+        assert record == "record"
         counted.append(seen)
 
     monkeypatch.setattr("bwbayes.app.running.run.without_start", told)
     transient = Finding("switch-on transient", 0.0, 1.0, "it starts off", "leave it out")
     drift = replace(transient, kind="drift")
     for findings in ((), (drift,), (drift, transient)):
-        assemble(replace(problem, findings=findings), chain, outcome)
+        assemble(replace(problem, findings={"record": findings}), chain, outcome)
     assert [False, False, True] == counted
 
 

@@ -148,7 +148,7 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("irregular", {"time_s": replaced(TIME, 9, 0.50931)}, ":sample 9: time_s: irregular"),
     ("lengths", {"voltage_V": VOLTAGE[1:]}, ": voltage_V: 23 values where time has 24"),
     ("complex", {"voltage_V": VOLTAGE + 1j}, ": voltage_V: holds complex numbers"),
-    ("matrix", {"voltage_V": VOLTAGE.reshape(6, 4)}, ": voltage_V: shape (6, 4) is no vector"),
+    ("matrix", {"voltage_V": VOLTAGE.reshape(6, 4)}, ": voltage_V: shape (6, 4) is not a vector"),
     ("empty", dict.fromkeys(GOOD, np.zeros(0)), ": too short, samples: 0"),
     ("constant", {"displacement_um": np.ones(SAMPLES)}, ": displacement_um: constant at 1"),
     ("twice", {"voltage_mV": VOLTAGE}, ": voltage_"),

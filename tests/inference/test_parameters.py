@@ -302,7 +302,7 @@ def test_a_parameter_that_cannot_be_is_refused(name: str, what: Any, says: str) 
 @pytest.mark.parametrize(
     ("fixed", "says"),
     [
-        ({"d": 0.5, "alpha": 0.5}, "^priors: what is fixed must have 0 < alpha < d"),
+        ({"d": 0.5, "alpha": 0.5}, "^priors: fixed values must have 0 < alpha < d"),
         ({"d": 0.5, "alpha": 0.6}, "^alpha: fixed at 0.6; must hold: 0 < alpha < d"),
         ({"beta": 0.01, "gamma": 0.02}, r"^gamma: fixed at 0.02; must hold: \|gamma\| <= beta"),
         ({"beta": 0.01, "gamma": -0.02}, r"^gamma: fixed at -0.02; must hold: \|gamma\| <= beta"),
@@ -318,7 +318,7 @@ def test_fixed_values_that_contradict_each_other_are_refused(
 @pytest.mark.parametrize("fixed", [{"alpha": 50.0}, {"gamma": 9.0}])
 def test_priors_that_meet_a_constraint_nowhere_are_refused(fixed: dict[str, float]) -> None:
     prior = joint_prior(HYSTERESIS, RANGES, fixed)
-    with pytest.raises(InputError, match=r"^priors: hardly a draw"):
+    with pytest.raises(InputError, match=r"^priors: hardly any draw"):
         prior.draw(np.random.default_rng(8), 10_000)
 
 

@@ -184,9 +184,11 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     odd = innovations(posterior, best, record.start)
-    seen = any(one.kind == "switch-on transient" for one in problem.findings)
+    seen = any(one.kind == "switch-on transient" for one in problem.findings["record"])
     moved = without_start(posterior, draws, source, record.start, seen=seen) if again else None
-    verdicts = judged(problem, bands, Background.of(posterior, draws), odd, moved)
+    verdicts = judged(
+        problem, bands, Background.of(posterior, draws), {"record": odd}, {"record": moved}
+    )
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 
 

@@ -304,7 +304,7 @@ def test_band_of_a_curve_is_that_of_its_draws() -> None:
 
 @pytest.mark.parametrize(
     ("low", "high", "points", "message"),
-    [(1.0, 1.0, 201, "is no range"), (0.0, 1.0, 200, "an odd number"), (0.0, 1.0, 1, "an odd")],
+    [(1.0, 1.0, 201, "is not a range"), (0.0, 1.0, 200, "an odd number"), (0.0, 1.0, 1, "an odd")],
 )
 def test_what_cannot_be_a_loop_is_refused(
     low: float, high: float, points: int, message: str

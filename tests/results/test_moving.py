@@ -35,7 +35,7 @@ from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start
 from bwbayes.results.start import started
 from bwbayes.results.verdict import LEAD_IN_ALARM
-from tests.found import keep
+from tests.measured import keep
 from tests.results.moving import (
     RATE,
     Case,

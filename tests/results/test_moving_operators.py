@@ -26,7 +26,7 @@ from bwbayes.model.operators.memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.verdict import LEAD_IN_ALARM
-from tests.found import keep
+from tests.measured import keep
 from tests.results.moving import (
     Case,
     covered,

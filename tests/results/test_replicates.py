@@ -326,5 +326,5 @@ def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None
 
 def test_voltage_without_a_loop_is_refused() -> None:
     posterior = small().posterior.altered(voltage=np.linspace(0.0, 100.0, 80))
-    with pytest.raises(InputError, match="does not go forth and back"):
+    with pytest.raises(InputError, match="does not go back and forth"):
         Experiment(posterior, PLAN)

@@ -90,7 +90,7 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     )
     (remark,) = remarks(small, *near_truth(small))
     assert remark.startswith("the record does not determine alpha with d against beta: ")
-    assert remark.endswith("drive further than 20 V from end to end, if the actuator may")
+    assert remark.endswith("drive over more than 20 V peak to peak, if the actuator allows it")
 
 
 def test_decaying_amplitudes_need_no_words() -> None:
@@ -120,7 +120,7 @@ def test_prior_that_decides_is_said_to(amplitude: float, said: str) -> None:
     )
     remark = judged(posterior)[0]
     assert said in remark
-    asked = "drive the actuator up and down several times" if amplitude > 20 else "drive further"
+    asked = "drive the actuator up and down several times" if amplitude > 20 else "drive over more"
     assert asked in remark
 
 

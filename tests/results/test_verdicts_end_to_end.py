@@ -17,7 +17,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from tests.found import found, keep
+from tests.measured import keep, measured
 from tests.results.runs import Judged, Stand, covered, judge, problem_of
 
 RATE = 100.0
@@ -216,7 +216,7 @@ def test_good_runs_hold(tmp_path: Path) -> None:
 def test_no_spoilt_run_holds(tmp_path: Path, kind: str) -> None:
     """Of 50 of each kind none is missed; the cause is right in nine of ten of those seen."""
     counts = spoilt_runs(kind, 20261122, SPOILT, tmp_path)
-    every = found().get("spoilt runs do not hold", {})
+    every = measured().get("spoilt runs do not hold", {})
     keep("spoilt runs do not hold", every | {kind: dict(counts)})
     assert not counts["missed"]
     assert counts["right cause"] >= 0.9 * counts["seen"]

@@ -1,7 +1,7 @@
 """The same seed gives the same bits: threads or processes, one or two, straight or in five pieces.
 
-The pieces end in the middle of a block, each in another phase or place, and each goes on from the
-file alone, as a run does that was interrupted.
+So it does however many ensembles are moved together. The pieces end in the middle of a block, each
+in another phase or place, and each goes on from the file alone, as a run does that was interrupted.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,10 @@ def begin(path: Path, seed: int = 1) -> None:
     ChainFile.create(path, chain, POINT, PLAN.block, {}).close()
 
 
-def go_on(path: Path, executor: Executor, blocks: int = 0) -> Outcome:
+def go_on(path: Path, executor: Executor, blocks: int = 0, together: int = 1) -> Outcome:
+    plan = replace(PLAN, together=together)
     with ChainFile.resume(path) as chain:
-        return sample(POSTERIOR, PLAN, chain, executor, Stopper(blocks))
+        return sample(POSTERIOR, plan, chain, executor, Stopper(blocks))
 
 
 @pytest.fixture(scope="module")
@@ -89,11 +91,15 @@ def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any]
         )
 
 
+@pytest.mark.parametrize("together", [1, 3, 4])
 def test_straight(
-    tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], Outcome]
+    tmp_path: Path,
+    executor: Executor,
+    expected: tuple[dict[str, Any], Outcome],
+    together: int,
 ) -> None:
     begin(tmp_path / "chain.h5")
-    outcome = go_on(tmp_path / "chain.h5", executor)
+    outcome = go_on(tmp_path / "chain.h5", executor, together=together)
     assert_same_end(tmp_path / "chain.h5", outcome, expected)
 
 
@@ -106,7 +112,7 @@ def test_in_five_pieces(
     piece = total // PIECES
     for number in range(1, PIECES):
         with suppress(StoppedError):
-            go_on(path, executor, 4 * piece + 2)
+            go_on(path, executor, 4 * piece + 2, together=number)
         done = ChainFile.read(path)
         assert number * piece == sum(done.blocks(phase) for phase in PHASES)
     assert_same_end(path, go_on(path, executor), expected)

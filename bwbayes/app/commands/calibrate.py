@@ -1,4 +1,4 @@
-"""``bwbayes calibrate``: is the posterior what it says? Simulated records tell."""
+"""``bwbayes calibrate``: simulation-based calibration, whether posteriors are what they say."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ REPLICATES = 500
 )
 @click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
-@click.option("--overwrite", is_flag=True, help="Replace a calibration that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
 @click.option("--workers", type=click.IntRange(1), help="Replicates side by side; default: cores.")
 @executor_option
 @quiet_option
@@ -52,7 +52,7 @@ def calibrate(
 ) -> int:
     """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
 
-    Each replicate draws parameters from the config's prior, simulates its record anew and fits it
+    Each replicate draws parameters from the config's prior, simulates its record and fits it
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
     replicates did not converge.
 
@@ -71,10 +71,10 @@ def calibrate(
     changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
     from bwbayes.app.config.config import load
 
-    wanted = load(config)
-    wanted = wanted.model_copy(update=changes | ({"name": wanted.name} if wanted.name else {}))
+    chosen = load(config)
+    chosen = chosen.model_copy(update=changes | ({"name": chosen.name} if chosen.name else {}))
     where = out or Path("results") / f"{config.stem}-calibration"
-    folder = start(wanted, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
+    folder = start(chosen, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
     return _calibrate(folder, None, workers, how, quiet)
 
 

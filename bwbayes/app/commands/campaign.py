@@ -22,7 +22,7 @@ __all__ = ["campaign"]
 @click.option("--config", type=FILE, help="Config of all records; default: each proposes its own.")
 @click.option("--out", type=FILE, help="The campaign's folder; default: results/NAME-OF-FOLDER.")
 @click.option("--resume", "begun", type=FILE, help="Go on with the campaign in this folder.")
-@click.option("--overwrite", is_flag=True, help="Replace a campaign that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
 @click.option("--workers", type=click.IntRange(1), help="Records side by side; default: cores.")
 @executor_option

@@ -24,9 +24,8 @@ def check(config: Path, record: Path | None, out: Path | None) -> int:
     """
     from bwbayes.app.jobs.check import check as look
 
-    wanted = config_or_proposal(config, Console(quiet=True), refuse=False)
+    chosen = config_or_proposal(config, Console(quiet=True), refuse=False)
     if record is not None:
-        source = wanted.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        wanted = wanted.model_copy(update={"record": source})
-    look(wanted, config.parent, out or Path("results") / f"{config.stem}-check", Console())
+        chosen = chosen.with_record(record)
+    look(chosen, config.parent, out or Path("results") / f"{config.stem}-check", Console())
     return 0

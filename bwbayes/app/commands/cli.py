@@ -20,6 +20,7 @@ from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.compare import compare
 from bwbayes.app.commands.compensate import compensate
+from bwbayes.app.commands.design import design
 from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -28,6 +29,7 @@ from bwbayes.app.commands.report import report
 from bwbayes.app.commands.run import resume, run
 from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
 from bwbayes.app.commands.simulate import simulate
+from bwbayes.app.commands.track import track
 from bwbayes.errors import InputError
 
 __all__ = ["main"]
@@ -55,7 +57,9 @@ for command in (
     campaign,
     compensate,
     export,
+    track,
     compare,
+    design,
     config,
     models,
 ):
@@ -89,7 +93,7 @@ def main() -> None:
     except BrokenExecutor as error:
         # Python's own says nothing of use.
         said = "" if isinstance(error, BrokenProcessPool) else str(error)
-        said = said or "a worker process was ended; mind the memory, and resume"
+        said = said or "a worker process was killed; free some memory, and resume"
         click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:

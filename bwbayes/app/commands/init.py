@@ -50,7 +50,7 @@ def init(record: Path, units: tuple[str, ...], out: Path | None) -> int:
     console = Console()
     _show(made, console)
     console.print(
-        f"wrote {out}; look at the record with `bwbayes check {out}`, go with `bwbayes run {out}`",
+        f"wrote {out}; look at the record with `bwbayes check {out}`, then `bwbayes run {out}`",
         highlight=False,
         markup=False,
         soft_wrap=True,
@@ -77,12 +77,12 @@ def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> 
     made = propose(path, path.parent)
     if refuse and made.pointless is not None:
         raise InputError(
-            f"{path}: {made.pointless}; if it is right as it is, write a config with "
+            f"{path}: {made.pointless}; if the record is right as it is, write a config with "
             f"`bwbayes init {path}` and run that"
         )
     _show(made, console)
     held = "held_out" in made.config.validation
-    train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.record.train or ())
+    train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.records["record"].train or ())
     rest = "the rest is held out" if held else "nothing is held out"
     console.print(
         f"fitting {train}; {rest}; `bwbayes init {path}` writes this as a config",

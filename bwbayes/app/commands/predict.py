@@ -17,7 +17,7 @@ __all__ = ["predict"]
 @click.command()
 @click.argument("folder", type=FILE)
 @click.option("--record", type=FILE, help="A record to predict; measured or a voltage alone.")
-@click.option("--signal", "wanted", help="A signal to predict instead, by its name.")
+@click.option("--signal", "waveform", help="A signal to predict instead, by its name.")
 @click.option("--from-rest", is_flag=True, help="The record starts from a demagnetised actuator.")
 @click.option(
     "--lead-in", type=float, default=1.0, show_default=True, help="Estimates the offset, s."
@@ -29,17 +29,26 @@ __all__ = ["predict"]
     "--window", type=(float, float), help="Judge and write this part alone: start and stop, s."
 )
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
+@click.option(
+    "--after",
+    is_flag=True,
+    help="A forecast: go on from where the lead-in's readings leave the discrepancy, or with "
+    "--signal from the end of the training record.",
+)
+@click.option("--of", "training", help="Of several training records, the one that is meant.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
 def predict(
     folder: Path,
     record: Path | None,
-    wanted: str | None,
+    waveform: str | None,
     from_rest: bool,
     lead_in: float,
     lead_in_from: float | None,
     window: tuple[float, float] | None,
     same_offset: bool,
+    after: bool,
+    training: str | None,
     out: Path | None,
     overwrite: bool,
 ) -> int:
@@ -53,9 +62,26 @@ def predict(
     from bwbayes.app.jobs.predict import predict as write
     from bwbayes.results.prediction import Start
 
-    if (record is None) == (wanted is None):
+    if (record is None) == (waveform is None):
         raise InputError("predict: give either --record or --signal")
+    if after and record is None and window is not None:
+        raise InputError(
+            "predict: --window is for a --record; what comes after the training record is "
+            "predicted whole"
+        )
     if not 0 < lead_in < math.inf:
-        raise InputError(f"predict: a lead-in of {lead_in:g} s is no length of time; give another")
-    begin = Start(from_rest, not same_offset, lead_in, lead_in_from)
-    return write(folder, record, wanted, begin, out, Console(), window=window, overwrite=overwrite)
+        raise InputError(
+            f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
+        )
+    begin = Start(from_rest, not same_offset, lead_in, lead_in_from, after=after)
+    return write(
+        folder,
+        record,
+        waveform,
+        begin,
+        out,
+        Console(),
+        window=window,
+        of=training,
+        overwrite=overwrite,
+    )

@@ -21,7 +21,7 @@ __all__ = ["resume", "run"]
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
-@click.option("--overwrite", is_flag=True, help="Replace a run that is there already.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing run.")
 @workers_option
 @executor_option
 @quiet_option
@@ -45,8 +45,7 @@ def run(
 
     chosen = config_or_proposal(config, Console(quiet=quiet))
     if record is not None:
-        source = chosen.record.model_copy(update={"file": str(record.resolve()), "signal": None})
-        chosen = chosen.model_copy(update={"record": source})
+        chosen = chosen.with_record(record)
     if seed is not None:
         chosen = chosen.model_copy(update={"seed": seed})
     if chosen.name is None:

@@ -39,9 +39,7 @@ executor_option = click.option(
     metavar="KIND",
     help="local (default), threads, processes, dask, or dask://HOST:PORT.",
 )
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace files that are there already."
-)
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 

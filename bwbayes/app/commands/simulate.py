@@ -17,7 +17,7 @@ __all__ = ["simulate"]
 @click.argument("out", type=FILE)
 @click.option(
     "--signal",
-    "wanted",
+    "waveform",
     default="identification",
     show_default=True,
     help="identification, verification, step10, step50, step100, or sine (see the next options).",
@@ -37,7 +37,7 @@ __all__ = ["simulate"]
 @overwrite_option
 def simulate(
     out: Path,
-    wanted: str,
+    waveform: str,
     amplitude: float | None,
     frequency: float | None,
     duration: float | None,
@@ -53,13 +53,13 @@ def simulate(
     from bwbayes.app.jobs.simulate import simulate as write
 
     given = (amplitude, frequency, duration)
-    if wanted != "sine" and any(value is not None for value in given):
+    if waveform != "sine" and any(value is not None for value in given):
         raise InputError("simulate: amplitude, frequency and duration need --signal sine")
     first, second, third = (
         default if value is None else value
         for value, default in zip(given, (100.0, 1.0, 16.0), strict=True)
     )
     sine = (first, second, third)
-    for path in write(out, wanted, sine, discrepancy, seed, rate, overwrite=overwrite):
+    for path in write(out, waveform, sine, discrepancy, seed, rate, overwrite=overwrite):
         click.echo(f"wrote {path}")
     return 0

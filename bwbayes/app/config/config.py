@@ -11,10 +11,10 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import tomlkit
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
 from bwbayes.app.config.keys import Table, described, one_line
 from bwbayes.app.config.limits import LARGEST_SEED
@@ -27,7 +27,7 @@ from bwbayes.app.config.settings import (
     SignalConfig,
     ValidationConfig,
 )
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 
 __all__ = [
     "ActuatorConfig",
@@ -48,6 +48,25 @@ LARGEST_FILE = 1_000_000  # bytes
 MOST_KEY_PARTS = 100
 
 
+# What a record is called that is the only one.
+ALONE = "record"
+
+# The branches of the key, as pydantic calls them; no record can have such a name.
+ONE, SEVERAL = "one record", "several records"
+
+
+def _is_table(value: object) -> bool:
+    return isinstance(value, Mapping | RecordConfig)
+
+
+def _one_or_several(given: object) -> str:
+    """Tell the keys of one record from the tables of several."""
+    if not isinstance(given, Mapping) or not given:
+        return ONE
+    tables = all(key not in RecordConfig.model_fields and _is_table(given[key]) for key in given)
+    return SEVERAL if tables else ONE
+
+
 class Config(Table):
     """A whole run."""
 
@@ -58,9 +77,17 @@ class Config(Table):
     seed: Annotated[
         int,
         Field(ge=0, le=LARGEST_SEED),
-        described("Where all random numbers come from.", example="7"),
+        described("Seed of all random numbers.", example="7"),
     ] = 1
-    record: Annotated[RecordConfig, described("The training record; file or signal is required.")]
+    record: Annotated[
+        Annotated[RecordConfig, Tag(ONE)] | Annotated[dict[Name, RecordConfig], Tag(SEVERAL)],
+        Discriminator(_one_or_several),
+        described(
+            "The training record; file or signal is required. Several records of one actuator, "
+            "fitted jointly: a table [record.NAME] with these keys for each, under names of your "
+            "choice, and none of the keys in [record] itself."
+        ),
+    ]
     stand: Annotated[StandConfig, described("The virtual test stand, for signals.")] = StandConfig()
     model: Annotated[ModelConfig, described("The model of the actuator and of the residual.")] = (
         ModelConfig()
@@ -87,6 +114,19 @@ class Config(Table):
         ),
     ] = Field(default_factory=dict)
 
+    @field_validator("record", mode="before")
+    @classmethod
+    def _not_both(cls, given: object) -> object:
+        if isinstance(given, Mapping):
+            known = [key for key in given if key in RecordConfig.model_fields]
+            tables = [key for key, value in given.items() if key not in known and _is_table(value)]
+            if known and tables:
+                raise ValueError(
+                    f"{known[0]} is a key of one record, and {tables[0]} a table of several; move "
+                    f"{known[0]} into a table [record.NAME] of its own"
+                )
+        return given
+
     @field_validator("validation")
     @classmethod
     def _names_of_its_own(cls, given: dict[str, object]) -> dict[str, object]:
@@ -94,6 +134,46 @@ class Config(Table):
             if name == "record" or re.fullmatch(r"training(-\d+)?", name):
                 raise ValueError(f"the name {name!r} is taken by the training record")
         return given
+
+    @model_validator(mode="after")
+    def _names_of_their_own(self) -> Self:
+        for name in self.records:
+            if len(self.records) > 1 and re.fullmatch(r"record|training(-\d+)?", name):
+                raise ValueError(f"the name {name!r} of a record is taken; choose another")
+        for name, one in self.validation.items():
+            if any(re.fullmatch(rf"{re.escape(other)}(-\d+)?", name) for other in self.records):
+                raise ValueError(f"validation: the name {name!r} is taken by a training record")
+            if one.of is not None and one.of not in self.records:
+                hint = suggestion(one.of, list(self.records))
+                raise ValueError(f"validation.{name}.of: no training record {one.of!r}; {hint}")
+            if one.of is None and not one.another and len(self.records) > 1:
+                raise ValueError(
+                    f"validation.{name}: its window is of one of several records; say of which, "
+                    f'of = "{next(iter(self.records))}" for instance'
+                )
+        return self
+
+    def with_record(self, file: Path) -> Config:
+        """Return the config of another file in place of its record's.
+
+        Raises
+        ------
+        InputError
+            It has several records.
+        """
+        if not isinstance(self.record, RecordConfig):
+            names = ", ".join(self.record)
+            raise InputError(
+                f"record: the config has several ({names}), and another one cannot stand for all "
+                "of them; change their files there"
+            )
+        source = self.record.model_copy(update={"file": str(file.resolve()), "signal": None})
+        return self.model_copy(update={"record": source})
+
+    @property
+    def records(self) -> Mapping[str, RecordConfig]:
+        """The training records by name; one alone is called "record"."""
+        return {ALONE: self.record} if isinstance(self.record, RecordConfig) else self.record
 
 
 def load(path: str | Path) -> Config:

@@ -271,7 +271,13 @@ def _shown(value: object) -> str:
 
 def _is_branch(part: str) -> bool:
     """Tell the names that pydantic gives to the branches of a union from keys."""
-    return part in ("str", "float", "SignalConfig") or part.startswith("function-after")
+    return part in (
+        "str",
+        "float",
+        "SignalConfig",
+        "one record",
+        "several records",
+    ) or part.startswith("function-after")
 
 
 def _keys_at(place: list[str], root: type[BaseModel]) -> list[str]:

@@ -7,14 +7,14 @@ same words. ``parameters`` and ``validation`` are tables, as in a config.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from bwbayes.app.config.config import Config, checked
+from bwbayes.app.config.config import ALONE, Config, checked
 from bwbayes.app.config.keys import MEANINGS
 from bwbayes.app.config.model_settings import ModelConfig
 from bwbayes.app.config.settings import RecordConfig, SamplingConfig, ValidationConfig
@@ -36,14 +36,19 @@ IN_MEMORY = "records/{}.h5"
 
 
 def config_of(
-    record: Record | str | Path, keys: Mapping[str, Any], where: str = "fit"
+    record: Record | str | Path | Sequence[Any] | Mapping[str, Any],
+    keys: Mapping[str, Any],
+    where: str = "fit",
 ) -> tuple[Config, dict[str, Record]]:
-    """Return the config of a record and of keyword arguments, and the records in memory by name.
+    """Return the config of records and of keyword arguments, and the records in memory by name.
 
     Parameters
     ----------
     record
-        The training record, or its file.
+        The training record, or its file; several of them, fitted jointly, as a list or as a dict by
+        name, in which a record may be a table of the keys of [record.NAME] with ``record`` the
+        record itself. In a list a file's record is called as the file is, others record_1,
+        record_2, ... Keys of [record] beside count for all that do not say otherwise.
     keys
         Keys of a config's [record], [model] and [sampling], and ``name``, ``seed``, ``parameters``,
         ``validation`` and ``truth``. A validation is a pair (start, stop) in s, which is a window
@@ -68,13 +73,44 @@ def config_of(
         else:
             raise InputError(f"{where}: {key}: unknown key; {_hint(key, [*homes, *ABOVE])}")
     records: dict[str, Record] = {}
-    tables["record"]["file"] = _file(record, "record", records, where)
+    if isinstance(record, Record | str | Path):
+        tables["record"]["file"] = _file(record, ALONE, records, where)
+    else:
+        tables["record"] = {
+            name: tables["record"] | _training(name, one, records, where)
+            for name, one in _by_name(record, where).items()
+        }
     if isinstance(keys.get("validation"), Mapping):
         tables["validation"] = {
             name: _validation(str(name), given, records, where)
             for name, given in keys["validation"].items()
         }
     return checked(tables, where), records
+
+
+def _by_name(record: Any, where: str) -> Mapping[str, Any]:
+    """Return several records by name."""
+    if isinstance(record, Mapping) and record:
+        return {str(name): one for name, one in record.items()}
+    if not isinstance(record, list | tuple) or not record:
+        _file(record, ALONE, {}, where)
+    named: dict[str, Any] = {}
+    for number, one in enumerate(record, start=1):
+        name = Path(one).stem if isinstance(one, str | Path) else f"record_{number}"
+        if name in named:
+            raise InputError(
+                f"{where}: two records are called {name!r}; give a dict of names and records"
+            )
+        named[name] = one
+    return named
+
+
+def _training(name: str, given: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
+    """Return one of several training records as a config's table has it."""
+    if not isinstance(given, Mapping):
+        return {"file": _file(given, name, records, where)}
+    table = {key: _plain(value) for key, value in given.items() if key != "record"}
+    return table | {"file": _file(given.get("record"), name, records, where)}
 
 
 def _hint(key: str, known: list[str]) -> str:
@@ -96,7 +132,7 @@ def _validation(name: str, given: Any, records: dict[str, Record], where: str) -
         if not isinstance(given["record"], Record | str | Path):
             known = ", ".join(ValidationConfig.model_fields)
             raise InputError(
-                f"{where}: validation.{name}.record: is no record; give a Record, a file or a "
+                f"{where}: validation.{name}.record: is not a record; give a Record, a file or a "
                 f"window; other keys are {known}"
             )
         table["file"] = _file(given["record"], name, records, where)
@@ -113,7 +149,7 @@ def _file(given: Any, name: str, records: dict[str, Record], where: str) -> str:
     if isinstance(given, str | Path):
         return str(Path(given).absolute())
     raise InputError(
-        f"{where}: {name}: {type(given).__name__} is no record; make one with "
+        f"{where}: {name}: {type(given).__name__} is not a record; make one with "
         "Record.from_arrays(voltage, displacement, interval=...) or Record.from_pandas(frame)"
     )
 

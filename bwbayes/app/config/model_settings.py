@@ -84,6 +84,19 @@ class ModelConfig(ActuatorConfig):
     noise: Annotated[str, described("The model of the residual.", example='"white"')] = (
         "discrepancy"
     )
+    per_record: Annotated[
+        list[str],
+        described(
+            "Parameters that each of several records has of its own, besides initial and offset.",
+            example='["sensor_sd"]',
+        ),
+    ] = Field(default_factory=list)
+    shared: Annotated[
+        list[str],
+        described(
+            "Of initial and offset, what all of several records share.", example='["offset"]'
+        ),
+    ] = Field(default_factory=list)
     outliers: Annotated[
         bool,
         described(

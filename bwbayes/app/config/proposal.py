@@ -19,7 +19,7 @@ import numpy as np
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record, read_record
-from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.inspection import Finding, inspect, isolated_outliers
 from bwbayes.data.io.columns import UNITS, Naming, recognised, unit_in
 from bwbayes.data.io.formats import column_names
 from bwbayes.errors import InputError, InputWarning
@@ -183,6 +183,11 @@ def _text(
     held = _held_out(record)
     first, last = _span(record)
     train = [(first, last)] if held is None else _rest((first, last), held)
+    aside = [] if held is None else _spikes(record, held)
+    if aside and not any(line.startswith("exclude") for line in lines["record"]):
+        lines["record"].append(
+            f"exclude = {_windows(aside)}  # spikes in the part that is held out"
+        )
     file = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
     written = [
         *_facts(record),
@@ -248,7 +253,7 @@ def _start(record: Record) -> list[str]:
     moving = float(np.ptp(few)) > MOVES * extent
     how = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
     if away:
-        return [f"# from_rest = false  # it starts {how}: its history is unknown, and found"]
+        return [f"# from_rest = false  # it starts {how}: its history is unknown, and estimated"]
     return [
         f"# from_rest = true  # it starts {how}; say so if the actuator was demagnetised and "
         "nothing moved"
@@ -295,6 +300,13 @@ def _held_out(record: Record) -> tuple[float, float] | None:
     return None
 
 
+def _spikes(record: Record, held: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return a window (s) around each spike that is held out, where no fit sets it aside."""
+    times = record.time[isolated_outliers(record)]
+    inside = times[(held[0] <= times) & (times < held[1])].tolist()
+    return [(time, time + record.interval) for time in inside]
+
+
 def _on_grid(record: Record, time: float) -> float:
     """Return the time (s) of the nearest sample, without the noise of rounding."""
     sample = round((time - record.start) / record.interval)
@@ -312,5 +324,5 @@ def _windows(windows: list[tuple[float, float]]) -> str:
 
 
 def _quoted(text: str) -> str:
-    # A JSON string is a TOML string too, but for DEL, which no name of a column has.
+    # A JSON string is a TOML string too, except for DEL, which no column's name has.
     return json.dumps(text, ensure_ascii=False)

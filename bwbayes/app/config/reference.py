@@ -62,8 +62,8 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 ROLE = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
 
 
-def config_reference(wanted: str | None) -> str:
-    """Return what there is to know of a config's keys: of all, or of those of a name or path.
+def config_reference(requested: str | None) -> str:
+    """Describe a config's keys: all of them, or those of a name or path.
 
     A path may have the user's own names in it, and may leave out its first tables:
     ``parameters.d.prior``, ``ess``.
@@ -74,17 +74,17 @@ def config_reference(wanted: str | None) -> str:
         There is no such key.
     """
     every = list(keys(Config))
-    if wanted is None:
+    if requested is None:
         head = (
             "Every key of a config, by table. `bwbayes config KEY` shows one; notebooks and runs "
             "have whole configs."
         )
         return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(every))])
-    asked = [key for key in every if _is_asked(key, wanted.split("."))]
+    asked = [key for key in every if _is_asked(key, requested.split("."))]
     if not asked:
         known = list(dict.fromkeys(key.name for key in every if key.name != ANY))
-        last = wanted.split(".")[-1]
-        raise InputError(f"config: no key {wanted!r}; {suggestion(last, known, MEANINGS)}")
+        last = requested.split(".")[-1]
+        raise InputError(f"config: no key {requested!r}; {suggestion(last, known, MEANINGS)}")
     inside = tuple(f"{key.path}." for key in asked if key.table is not None)
     shown = [key for key in every if key in asked or key.path.startswith(inside)]
     return "\n\n".join(_entry(key) for key in shown)
@@ -102,13 +102,13 @@ def _once(every: list[Key]) -> Iterator[Key]:
             skipped = (*skipped, f"{key.path}.")
 
 
-def _is_asked(key: Key, wanted: list[str]) -> bool:
+def _is_asked(key: Key, requested: list[str]) -> bool:
     """Tell whether the path that a user wrote ends a key's path, with a name of theirs for NAME."""
     path = key.path.split(".")
     for whole in (path, path[:-1] if path[-1] == ANY else path):
-        tail = whole[-len(wanted) :]
-        if len(tail) == len(wanted) and tail[0] == wanted[0]:
-            return all(mine in (ANY, theirs) for mine, theirs in zip(tail, wanted, strict=True))
+        tail = whole[-len(requested) :]
+        if len(tail) == len(requested) and tail[0] == requested[0]:
+            return all(mine in (ANY, theirs) for mine, theirs in zip(tail, requested, strict=True))
     return False
 
 
@@ -134,18 +134,18 @@ def _wrapped(text: str, indent: str = "") -> str:
     )
 
 
-def parts_reference(wanted: str | None) -> str:
-    """Return what there is to know of a model's parts: a line of each, or all of one of them.
+def parts_reference(requested: str | None) -> str:
+    """Describe a model's parts: each in a line, or one of them in full.
 
-    ``wanted`` is a part's name or the import path of one from outside.
+    ``requested`` is a part's name or the import path of one from outside.
 
     Raises
     ------
     InputError
         There is no such part.
     """
-    if wanted is not None:
-        return "\n\n".join(_part(kind, wanted, maker) for kind, maker in _asked_parts(wanted))
+    if requested is not None:
+        return "\n\n".join(_part(kind, requested, maker) for kind, maker in _asked_parts(requested))
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():
         lines.append(f"{kind}:")
@@ -160,13 +160,13 @@ def parts_reference(wanted: str | None) -> str:
     return "\n".join(lines)
 
 
-def _asked_parts(wanted: str) -> Iterator[tuple[str, Maker]]:
-    kinds = [kind for kind, makers in PARTS.items() if wanted in makers]
+def _asked_parts(requested: str) -> Iterator[tuple[str, Maker]]:
+    kinds = [kind for kind, makers in PARTS.items() if requested in makers]
     for kind in kinds:
-        yield kind, PARTS[kind][wanted]
+        yield kind, PARTS[kind][requested]
     if not kinds:
         every = {name: maker for makers in PARTS.values() for name, maker in makers.items()}
-        part = made("models", wanted, every, {})
+        part = made("models", requested, every, {})
         yield "from outside", lambda: part
 
 

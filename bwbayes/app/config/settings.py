@@ -1,4 +1,4 @@
-"""What a config says but for the model: the home of every key's type, default and description.
+"""What a config says, except for the model: the home of every key's type, default and description.
 
 A key is a field here and nowhere else: its type is what is checked, its :func:`described` what
 ``bwbayes config`` prints. A new key is a new field, and a new table a model that
@@ -38,10 +38,10 @@ class SignalConfig(Table):
         described("Shape of a period, or steps.", example='"triangle"'),
     ] = "sine"
     amplitude: Annotated[
-        Positive | None, described("Amplitude, but of steps.", unit="V", example="100.0")
+        Positive | None, described("Amplitude; not for steps.", unit="V", example="100.0")
     ] = None
     frequency: Annotated[
-        Positive | None, described("Frequency, but of steps.", unit="Hz", example="1.0")
+        Positive | None, described("Frequency; not for steps.", unit="Hz", example="1.0")
     ] = None
     levels: Annotated[
         Annotated[list[float], Field(min_length=1)] | None,
@@ -126,7 +126,7 @@ class _Source(Table):
 
 
 class RecordConfig(_Source):
-    """The training record: its source, the readings to use, and the windows to fit.
+    """A training record: its source, the readings to use, and the windows to fit.
 
     ``start``, ``exclude`` and ``decimate`` leave out readings, never the voltage: the simulation
     runs from the file's first sample.
@@ -168,7 +168,7 @@ class RecordConfig(_Source):
         ),
     ] = None
     decimate: Annotated[
-        int, Field(ge=1), described("Every how many-th reading is used.", example="5")
+        int, Field(ge=1), described("Of so many readings one is used.", example="5")
     ] = 1
     train: Annotated[
         Windows | None,
@@ -277,6 +277,14 @@ class ValidationConfig(_Source):
             "The part of the training record that is held out, or of another record to judge.",
             unit="s",
             example="[12.0, 16.0]",
+        ),
+    ] = None
+    of: Annotated[
+        str | None,
+        described(
+            "Of several training records, the one that the window is of, or whose own parameters "
+            "another record takes where nothing tells its own; by default the first.",
+            example='"record"',
         ),
     ] = None
     from_rest: Annotated[

@@ -16,6 +16,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bwbayes.app.figures.agreement import draw_agreement
 from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.innovations import draw_innovations
@@ -33,9 +34,11 @@ __all__ = ["draw_all", "draw_alone", "save", "save_one"]
 def draw_all(result: Result) -> dict[str, Figure]:
     """Draw a run's figures, by name, in the order in which one looks at them.
 
-    ``loop``, ``loops``, ``steps``, ``bands_NAME`` for each of the result's bands, ``coverage``,
-    ``innovations``, ``corner``, ``trace`` and ``ranks``. Without convergence only the last two;
-    without bands or a measurement to hold them against, what needs them is left out.
+    ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME`` for each of
+    the result's bands, ``coverage``,
+    ``innovations`` (of several records ``innovations_NAME``), ``corner``, ``trace`` and ``ranks``.
+    Without convergence only the last two; without bands or a measurement to hold them against,
+    what needs them is left out.
     """
     figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
@@ -44,6 +47,8 @@ def draw_all(result: Result) -> dict[str, Figure]:
             looped = [bands for bands in result.bands if bands.name not in result.steps]
             if looped:
                 figures["loop"] = draw_loop(looped)
+            if result.agreement:
+                figures["agreement"] = draw_agreement(result.agreement)
             if result.loops is not None:
                 figures["loops"] = draw_loops(result.loops)
             if result.steps:
@@ -51,8 +56,11 @@ def draw_all(result: Result) -> dict[str, Figure]:
             figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
             if result.scores:
                 figures["coverage"] = draw_coverage(result.bands, result.scores)
-            if result.innovations is not None:
-                figures["innovations"] = draw_innovations(result.innovations)
+            for name, innovations in result.innovations.items():
+                several = len(result.innovations) > 1
+                figures[f"innovations_{name}" if several else "innovations"] = draw_innovations(
+                    innovations
+                )
             figures["corner"] = draw_corner(result)
         figures["trace"] = draw_trace(result)
         figures["ranks"] = draw_ranks(result)

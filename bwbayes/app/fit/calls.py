@@ -7,11 +7,14 @@ what either has written, and :func:`resume_run` goes on with it.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit, Scratch, carried_on, to_know, warn
+from bwbayes.app.config.proposal import naming_of
+from bwbayes.app.fit.fitted import Fit, carried_on, to_know
+from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
@@ -22,7 +25,7 @@ __all__ = ["fit", "open_run", "resume_run"]
 
 
 def fit(
-    record: Record | str | Path,
+    record: Record | str | Path | Sequence[Any] | Mapping[str, Any],
     *,
     folder: str | Path | None = None,
     overwrite: bool = False,
@@ -36,9 +39,12 @@ def fit(
     Parameters
     ----------
     record
-        The training record, or its file.
+        The training record, or its file, whose columns are recognised unless ``columns`` says them.
+        Several records of one actuator are fitted jointly: a list of them, or a dict by name, in
+        which a record may be a dict of the keys of [record.NAME], with ``record`` the record
+        itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
     folder
-        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is there after
+        Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
     overwrite
         Replace a run that is in the folder already.
@@ -67,6 +73,9 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
+    if isinstance(record, str | Path) and "columns" not in keys:
+        naming = naming_of(Path(record), keys.get("units"))
+        keys |= {key: table for key, table in vars(naming).items() if table}
     config, records = config_of(record, keys)
     problem = resolve(config, Path(), records)
     warn(problem.remarks, 3)
@@ -121,7 +130,7 @@ def resume_run(
     Raises
     ------
     InputError
-        No such run, or its files do not fit together.
+        No such run, or its files do not belong together.
 
     Warns
     -----

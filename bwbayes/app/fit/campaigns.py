@@ -17,7 +17,8 @@ from bwbayes.app.config.keywords import config_of
 from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.fit.calls import open_run
-from bwbayes.app.fit.fitted import Fit, Scratch, console_of, warn
+from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.campaign import carry_on, config_text, start
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
@@ -53,7 +54,9 @@ class Campaign:
         """A pandas.DataFrame with a row for each record: status, reason, means, intervals."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        return pd.read_csv(self.folder.table, index_col="record")
+        words = ("record", "file", "status", "reason", "outlier_in")
+        table = pd.read_csv(self.folder.table, index_col="record", dtype=dict.fromkeys(words, str))
+        return table.fillna(dict.fromkeys(words[1:], ""))
 
     @property
     def population(self) -> Population:
@@ -186,10 +189,10 @@ def campaign(
     if config is not None:
         text, where = config_text(Path(config)), Path(config).parent
     elif keys:
-        wanted, in_memory = config_of("each", keys, "campaign")
+        each, in_memory = config_of("each", keys, "campaign")
         if in_memory:
             raise InputError("campaign: validation: give files, which each record's run can read")
-        text = dump(wanted)
+        text = dump(each)
     scratch = Scratch() if folder is None else None
     path = scratch.path / "campaign" if scratch is not None else Path(str(folder))
     source = path.with_name(f"{path.name}-records") if isinstance(records, Mapping) else records
@@ -205,11 +208,11 @@ def campaign(
 
 
 def _write(records: Mapping[str, Record], folder: Path) -> None:
-    """Write records that are in memory, but for those that are there already."""
+    """Write the records that are in memory, except those that are written already."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, record in records.items():
         if not re.fullmatch(r"[\w][\w .+-]*", name):
-            raise InputError(f"campaign: {name!r} is no name of a file; choose another")
+            raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
         path = folder / f"{name}.h5"
         if not path.exists() or read_record(path).sha256 != record.sha256:
             write_record(record, path)

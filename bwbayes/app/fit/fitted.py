@@ -9,28 +9,25 @@ does. What the command line prints as a remark is a warning here
 from __future__ import annotations
 
 import shutil
-import sys
-import tempfile
-import warnings
-import weakref
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.fit.advice import Advice
 from bwbayes.app.fit.plots import Plots
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import Prediction, predict_another
+from bwbayes.app.running.predictions import Prediction, predict_another, residuals_along
 from bwbayes.app.running.run import (
     Run,
     assemble,
@@ -46,8 +43,9 @@ from bwbayes.app.screen import (
     show_result,
 )
 from bwbayes.control.exported import Exported
+from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
-from bwbayes.errors import InputWarning, NotConvergedError
+from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -59,14 +57,14 @@ from bwbayes.sampling.storage import ChainFile
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Fit", "Scratch", "carried_on", "console_of", "to_know", "warn"]
+__all__ = ["Fit", "carried_on", "to_know"]
 
 # Whether bands hold, in a word.
 HELD = {True: "yes", False: "NO", None: "unknown"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(Advice):
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
     Parameters
@@ -128,7 +126,7 @@ class Fit:
         Its attribute ``converged`` is 1 or 0.
         """
         density = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, density, self.problem.record)
+        return posterior_tree(self.result, density, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -172,23 +170,20 @@ class Fit:
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted, and where there is no reading.
+        nan where nothing was predicted, and where there is no reading. Those of several records
+        are those of their bands: ``fit.bands["step_10"].residuals``.
 
         Raises
         ------
         NotConvergedError
             The sampling has not converged.
+        InputError
+            Several records were fitted.
         """
         import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
 
-        record = self.problem.record
-        values = np.full(record.samples, np.nan)
-        for name, bands in self.bands.items():
-            other = self.problem.validations.get(name)
-            if other is None or other.window is not None:
-                first = round((float(bands.time[0]) - record.start) / record.interval)
-                values[first : first + bands.time.size] = bands.residuals
-        time = ("time", record.time, {"units": "s"})
+        values = residuals_along(self.problem, self.bands)
+        time = ("time", self.problem.record.time, {"units": "s"})
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
         )
@@ -208,6 +203,8 @@ class Fit:
         own_offset: bool = True,
         lead_in: float = 1.0,
         lead_in_from: float | None = None,
+        after: bool = False,
+        of: str | None = None,
     ) -> Prediction:
         """Predict another record, or a planned voltage without a displacement.
 
@@ -219,9 +216,10 @@ class Fit:
             Name of the bands; by default the file's, or "prediction".
         window
             Start and stop in s of the part that is predicted and judged; by default all of it.
-        from_rest, own_offset, lead_in, lead_in_from
+        from_rest, own_offset, lead_in, lead_in_from, after, of
             What is known of its start, as of a config's [validation.NAME]; see
-            :class:`~bwbayes.results.start.Start`.
+            :class:`~bwbayes.results.start.Start`. With ``after`` what comes after the lead-in is a
+            forecast.
 
         Raises
         ------
@@ -241,11 +239,10 @@ class Fit:
             name = name or Path(other).stem
             other = read_recognised(Path(other))
         hold = self.problem.config.model.hold
-        start = Start(
-            from_rest, own_offset, lead_in, lead_in_from, None if hold == "auto" else hold
-        )
+        known = None if hold == "auto" else hold
+        start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
         name = name or "prediction"
-        made = predict_another(self.problem, result.flat_draws, other, start, name, window)
+        made = predict_another(self.problem, result.flat_draws, other, start, name, window, of)
         warn([f"{name}: {remark}" for remark in made.remarks], 3)
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
@@ -263,11 +260,18 @@ class Fit:
     def export(self, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-        ``options`` and errors are as of :func:`bwbayes.app.jobs.export.export_draws`. What is
+        Options and errors are those of :func:`bwbayes.app.jobs.export.export_draws`. What is
         returned has the ``linear`` part as a discrete ``scipy.signal`` system.
         """
         draws = self._converged().flat_draws
         return export_draws(self.problem, draws, Path(folder), **options)[0]
+
+    def track(self, **options: Any) -> Tracking:
+        """Say how well a closed loop would follow, with and without the model.
+
+        Options are the fields of :class:`bwbayes.app.jobs.track.Setup`.
+        """
+        return track_draws(self.problem, self._converged().flat_draws, Setup(**options))
 
     def resume(
         self,
@@ -344,14 +348,6 @@ class Fit:
         )
 
 
-class Scratch:
-    """A temporary folder that goes when nobody needs it any more."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
-        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
-
-
 def carried_on(
     folder: RunFolder,
     scratch: Scratch | None,
@@ -362,7 +358,7 @@ def carried_on(
     engine: Engine | None = None,
     how: Any = None,
 ) -> Fit:
-    """Do what is left of a run; in a temporary folder without the files that ``save`` writes."""
+    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
     run: Run = go_on(
         folder,
         console_of(progress),
@@ -374,16 +370,9 @@ def carried_on(
         how=how,
     )
     made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is there already, and a cached property is a plain attribute.
+    # It is known already, and a cached property is a plain attribute.
     made.__dict__["result"] = run.result
     return made
-
-
-def console_of(progress: bool) -> Console:
-    """Return where progress goes: the terminal's own lines, and in a notebook plain ones."""
-    if Console(quiet=True).is_jupyter:
-        return Console(file=sys.stdout, force_jupyter=False, quiet=not progress)
-    return Console(stderr=True, quiet=not progress)
 
 
 def to_know(made: Fit) -> list[str]:
@@ -392,9 +381,3 @@ def to_know(made: Fit) -> list[str]:
     if not made.converged:
         lines.append(f"not converged: {made.outcome.stop_reason}; no interval is given")
     return lines
-
-
-def warn(lines: Iterable[str], level: int) -> None:
-    """Warn of each line; the caller of the function that calls this is level 3."""
-    for line in lines:
-        warnings.warn(line, InputWarning, stacklevel=level)

@@ -21,7 +21,9 @@ from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.record import draw_record
 from bwbayes.app.figures.style import STYLE
+from bwbayes.app.figures.tracking import draw_tracking
 from bwbayes.app.problem.problem import Problem
+from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -41,10 +43,14 @@ class Plots:
     result: Result
     converged: Callable[[], Result]
 
-    def record(self, kind: str = "time") -> Figure:
-        """Draw the training record: along "time", as a "loop", or its "drive"'s spectrum."""
-        problem = self.problem
-        every = draw_record(problem.record, problem.posterior.only.training, problem.findings)
+    def record(self, kind: str = "time", name: str | None = None) -> Figure:
+        """Draw a training record: along "time", as a "loop", or its "drive"'s spectrum.
+
+        Of several records the one of this name, by default the first.
+        """
+        problem, name = self.problem, self._record(name)
+        training = problem.posterior.alone(name).only.training
+        every = draw_record(problem.records[name], training, problem.findings[name])
         return _named(every, kind)
 
     def loop(self, *names: str) -> Figure:
@@ -54,18 +60,21 @@ class Plots:
         """
         return _drawn(draw_loop, [self._bands(name) for name in names] or self.converged().bands)
 
-    def bands(self, name: str = "training") -> Figure:
-        """Draw the bands of one window or record along time."""
-        return draw_alone(self._bands(name))
+    def bands(self, name: str | None = None) -> Figure:
+        """Draw the bands of one window or record along time, by default the first fitted one."""
+        return draw_alone(self._bands(name or self.converged().bands[0].name))
 
     def coverage(self) -> Figure:
         """Draw how much the bands cover against what they promise, and the readings' PIT."""
         result = self.converged()
         return _drawn(draw_coverage, result.bands, result.scores)
 
-    def innovations(self) -> Figure:
-        """Draw whether what each reading brings anew is white, normal and of one size."""
-        return _drawn(draw_innovations, self.converged().innovations)
+    def innovations(self, name: str | None = None) -> Figure:
+        """Draw whether innovations, what each reading adds, are white, normal, of one size.
+
+        Of several records in the one of this name, by default the first.
+        """
+        return _drawn(draw_innovations, self.converged().innovations[self._record(name)])
 
     def corner(self) -> Figure:
         """Draw each parameter of the posterior, and each pair of them."""
@@ -78,6 +87,16 @@ class Plots:
     def ranks(self) -> Figure:
         """Draw how the ranks of each ensemble's draws are spread."""
         return _drawn(draw_ranks, self.result)
+
+    def tracking(self, tracked: Tracking) -> Figure:
+        """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
+        return draw_tracking(tracked)
+
+    def _record(self, name: str | None) -> str:
+        """Return the name of a training record, by default of the first."""
+        if name is not None:
+            _named(self.problem.records, name)
+        return name or next(iter(self.problem.records))
 
     def _bands(self, name: str) -> Bands:
         every = {one.name: one for one in self.converged().bands}

@@ -76,7 +76,7 @@ def start(
 def experiment(problem: Problem) -> Experiment:
     """Return what the replicates of a problem have in common.
 
-    Held out are the validation windows of its own record; other records are made anew with each
+    Held out are the validation windows of its own record; other records are made again with each
     replicate's truth, at the times and with the voltage that they have.
 
     Raises
@@ -87,11 +87,12 @@ def experiment(problem: Problem) -> Experiment:
     problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
     windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
     others = {
-        name: OtherRecord(v.record, v.start, v.judged)
+        name: OtherRecord(v.record, v.start, v.judged, v.of)
         for name, v in problem.validations.items()
         if v.record is not None
     }
-    return Experiment(problem.posterior, problem.plan, windows, others)
+    belongs = {name: problem.validations[name].of for name in windows}
+    return Experiment(problem.posterior, problem.plan, windows, others, belongs=belongs)
 
 
 def carry_on(
@@ -131,7 +132,7 @@ def carry_on(
             request = request.model_copy(update={"replicates": count})
             _append(folder, request.line)
         missing = [number for number in range(request.replicates) if number not in entries]
-        # What is written last is the sign that all is there; now something is to come.
+        # It is written last, as the sign that all is done; now there is more to do.
         _clear(folder)
         if missing:
             _make(folder, common, problem.config.seed, missing, entries, workers, console, how)
@@ -144,7 +145,7 @@ def carry_on(
 
 def _identity(problem: Problem) -> str:
     """Return a digest of everything that replicates depend on."""
-    return sha256((dump(problem.config) + problem.record.sha256).encode()).hexdigest()
+    return sha256((dump(problem.config) + problem.sha256).encode()).hexdigest()
 
 
 def _make(
@@ -157,7 +158,7 @@ def _make(
     console: Console,
     how: str | Executor | None,
 ) -> None:
-    """Add the missing replicates to the entries, and write each as soon as it is there."""
+    """Add the missing replicates to the entries, and write each as soon as it is done."""
     count = min(workers or os.cpu_count() or 1, len(missing))
     unconverged = sum(not entry["converged"] for entry in entries.values())
     # Processes, also for the compiled engine: most of a replicate's time goes into Python.
@@ -173,7 +174,7 @@ def _make(
 
 
 def _append(folder: CalibrationFolder, line: bytes) -> None:
-    """Write a line that is there after a crash."""
+    """Write a line so that it survives a crash."""
     with folder.replicates.open("ab") as file:
         file.write(line)
         file.flush()
@@ -183,7 +184,7 @@ def _append(folder: CalibrationFolder, line: bytes) -> None:
 def _read(
     folder: CalibrationFolder, common: Experiment, identity: str
 ) -> tuple[_Request, dict[int, Entry]]:
-    """Read how many replicates are wanted, and those that are there; cut off half a line."""
+    """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
@@ -199,25 +200,25 @@ def _read(
             entry = _entry(line, common, entries)
         except ValueError:
             raise InputError(
-                f"{folder.replicates}:{number}: is no replicate of these; delete this line"
+                f"{folder.replicates}:{number}: is not one of these replicates; delete this line"
             ) from None
         entries[entry["number"]] = entry
     return request, entries
 
 
 def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
-    """Read the line that says how many replicates are wanted, and check that they are these."""
+    """Read the line that says how many replicates were requested, and check that they are these."""
     try:
         request = _Request.model_validate_json(line)
     except ValueError:
         raise InputError(
-            f"{folder.replicates}: does not say how many replicates there are to be; "
-            "calibrate anew with --overwrite"
+            f"{folder.replicates}: does not say how many replicates were requested; "
+            "start again with --overwrite"
         ) from None
     if request.of != identity:
         raise InputError(
             f"{folder.replicates}: these are replicates of another config or record than the "
-            "folder's; put that back, or calibrate anew with --overwrite"
+            "folder's; restore that, or start again with --overwrite"
         )
     return request
 
@@ -236,20 +237,20 @@ def _entry(line: bytes, common: Experiment, others: Mapping[int, Entry]) -> Entr
 
 
 def _clear(folder: CalibrationFolder) -> None:
-    """Remove what an earlier end has left."""
+    """Remove what an earlier run has written."""
     for path in (folder.summary, folder.path / "calibration.html"):
         path.unlink(missing_ok=True)
     shutil.rmtree(folder.path / "figures", ignore_errors=True)
 
 
 def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration) -> None:
-    """Write everything that a calibration leaves; the summary last, as the sign that all is there.
+    """Write all files of a calibration; the summary last, as the sign that all is done.
 
     Nothing in it depends on when or how it was computed.
     """
     numbers = summary(calibration) | {
         "seed": problem.config.seed,
-        "data_sha256": problem.record.sha256,
+        "data_sha256": problem.sha256,
         "versions": versions(problem.posterior.engine),
     }
     figures = draw_calibration(calibration, problem.parameters)

@@ -132,7 +132,7 @@ def carry_on(
         if missing:
             done = len(fitted) - len(missing)
             refused |= _fit(folder, origin, missing, done, workers, console, how)
-        console.print("putting the records together ...", highlight=False)
+        console.print("combining the records ...", highlight=False)
         campaign = _together(folder, files, refused)
         _write(folder, campaign)
     return campaign
@@ -221,7 +221,7 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
 
 
 def _write(folder: CampaignFolder, campaign: CampaignResult) -> None:
-    """Write the campaign's files; the summary last, as the sign that all is there.
+    """Write the campaign's files; the summary last, as the sign that all is done.
 
     Nothing in them depends on when or how it was computed.
     """

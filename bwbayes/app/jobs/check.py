@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,10 +17,10 @@ from bwbayes.app.figures import save
 from bwbayes.app.figures.record import draw_record
 from bwbayes.app.figures.style import unit_text
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.report import picture, symbol, template
+from bwbayes.app.report.page import Table, picture, template
+from bwbayes.app.report.words import symbol
 from bwbayes.app.screen import show_priors
 from bwbayes.data import Record
-from bwbayes.data.inspection import Finding
 from bwbayes.inference import conflict, pointfit
 from bwbayes.results import identifiability
 
@@ -46,7 +45,7 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     config
         The config; its files are relative to `folder`.
     out
-        The page's folder, made if need be; a page that stands there is replaced.
+        The page's folder, made if need be; an existing page is replaced.
     console
         Shows the record, what is wrong with it, priors and point fit.
 
@@ -63,19 +62,21 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     fitted = dict(zip(posterior.names, free[0], strict=True))
     likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
     # The findings are remarks too, but here they come with what to do.
-    remarks = [r for r in problem.remarks if r not in {f"record: {one}" for one in findings}]
+    shown = {f"{name}: {one}" for name, every in findings.items() for one in every}
+    remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += conflict.conflicts(posterior.prior, likely, problem.defaults)
     untold = identifiability.remarks(posterior, point, likely)
-    page = write_page(out, problem, findings, [*remarks, *untold], fitted)
+    page = write_page(out, problem, [*remarks, *untold], fitted)
 
     def say(text: str) -> None:
         console.print(text, highlight=False, soft_wrap=True)
 
-    say("record: " + escape("; ".join(fact for _, fact in _facts(problem.record))))
-    for one in findings:
-        say(f"{escape(one.kind)}: {escape(one.text)}\n    what to do: {escape(one.remedy)}")
-    if not findings:
-        say("nothing wrong shows in the record")
+    for name, record in problem.records.items():
+        say(f"{name}: " + escape("; ".join(fact for _, fact in _facts(record))))
+        for one in findings[name]:
+            say(f"{escape(one.kind)}: {escape(one.text)}\n    what to do: {escape(one.remedy)}")
+        if not findings[name]:
+            say("nothing wrong shows in the record")
     show_priors(posterior.prior, console, fitted)
     for remark in remarks:
         say(f"note: {escape(remark)}")
@@ -88,25 +89,37 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
 def write_page(
     out: Path,
     problem: Problem,
-    findings: Sequence[Finding],
     remarks: Sequence[str],
     fitted: Mapping[str, float],
 ) -> Path:
     """Write the page and its pictures to a folder, and return the page's path."""
-    record = problem.record
-    figures = draw_record(record, problem.posterior.only.training, findings)
+    figures, facts, several = {}, [], len(problem.records) > 1
+    for name, record in problem.records.items():
+        training = problem.posterior.alone(name).only.training
+        for kind, figure in draw_record(record, training, problem.findings[name]).items():
+            figures[f"{kind}_{name}" if several else kind] = figure
+        for subject, fact in _facts(record):
+            facts.append((f"{subject}, {name}" if several else subject, fact))
     pictures = save(figures, out / "figures")
     page = template("check.html.j2").render(
-        name=problem.config.name or record.origin,
-        findings=findings,
+        name=problem.config.name or problem.record.origin,
+        findings=[one for every in problem.findings.values() for one in every],
         remarks=remarks,
-        facts=_facts(record),
-        pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
-        parameters=list(_rows(problem, fitted)),
+        about="; ".join(f"{subject} {fact}" if several else fact for subject, fact in facts),
+        known=facts,
+        pictures=[picture(png, name, *_caption(name)) for name, png in pictures.items()],
+        parameters=_table(problem, fitted),
     )
     path = out / "check.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def _caption(name: str) -> tuple[str, str]:
+    """Return title and text of a figure; of several records its name is that of its record too."""
+    kind, _, record = name.partition("_")
+    title, text = CAPTIONS[kind]
+    return (f"{title}: {record}" if record else title), text
 
 
 def _facts(record: Record) -> list[tuple[str, str]]:
@@ -120,15 +133,16 @@ def _facts(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def _rows(problem: Problem, fitted: Mapping[str, float]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": parameter.name,
-            "description": parameter.description,
-            "symbol": symbol(parameter),
-            "unit": unit_text(parameter.unit),
-            "prior": str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}",
-            "point": f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "",
-        }
+def _table(problem: Problem, fitted: Mapping[str, float]) -> Table:
+    rows = [
+        (
+            parameter.description,
+            symbol(parameter).html,
+            str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}",
+            f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "",
+            unit_text(parameter.unit),
+        )
         for parameter in problem.parameters
     ]
+    titles = ("Parameter", "Symbol", "Prior or value", "Point fit", "Unit")
+    return Table("priors", "Parameters", titles, rows)

@@ -42,7 +42,7 @@ def simulate(
     Raises
     ------
     InputError
-        An unknown signal, impossible values, or a file that is there already or cannot be written.
+        An unknown signal, impossible values, or a file that exists already or cannot be written.
     """
     parameters = out.with_name(f"{out.stem}.truth.json")
     beside = out.with_name(f"{out.stem}.truth{out.suffix}")

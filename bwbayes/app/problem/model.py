@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,13 @@ __all__ = ["actuator_of", "explicit_model", "in_words"]
 OPTIONS = ("passive", "thresholds", "odd", "terms")
 
 
-def actuator_of(model: ActuatorConfig, record: Record) -> Actuator:
+def actuator_of(
+    model: ActuatorConfig, record: Record, every: Sequence[Record] | None = None
+) -> Actuator:
     """Put the actuator together that a config asks for; ``auto`` and ``true`` ask the record.
+
+    Gain and creep count from the voltages of ``every`` record of the actuator; by default there is
+    none but this.
 
     Raises
     ------
@@ -33,14 +39,18 @@ def actuator_of(model: ActuatorConfig, record: Record) -> Actuator:
     hold: Hold = "zero" if record.voltage_is == "command" else "first"
     if isinstance(model, ModelConfig) and model.hold != "auto":
         hold = model.hold
-    span = Span(float(np.min(record.voltage)), float(np.max(record.voltage)))
+    every = every or [record]
+    span = Span(
+        min(float(np.min(one.voltage)) for one in every),
+        max(float(np.max(one.voltage)) for one in every),
+    )
     return Actuator(
         model.dynamics,
         hold,
         record.interval,
         made("model.hysteresis", model.hysteresis, HYSTERESIS, _options(model), Operator),
         PolynomialGain(tuple(model.gain), span) if model.gain else None,
-        _creep(model, record, span),
+        _creep(model, every, span),
         span,
     )
 
@@ -54,13 +64,14 @@ def explicit_model(model: ModelConfig, actuator: Actuator) -> ModelConfig:
     return model.model_copy(update={"creep": times, **_chosen(actuator.hysteresis)})
 
 
-def _creep(model: ActuatorConfig, record: Record, span: Span) -> Creep | None:
-    """Return the creep that a config asks for, if any; ``true`` takes its times from the record."""
+def _creep(model: ActuatorConfig, every: Sequence[Record], span: Span) -> Creep | None:
+    """Return the creep that a config asks for, if any; ``true`` asks the records."""
     if model.creep is False or model.creep == []:
         if model.creep_growth:
             raise InputError("model.creep_growth: there is no creep; give creep = true with it")
         return None
-    times = creep_times(record.interval, record.duration) if model.creep is True else model.creep
+    shortest, longest = min(one.interval for one in every), max(one.duration for one in every)
+    times = creep_times(shortest, longest) if model.creep is True else model.creep
     return Creep(tuple(times), model.creep_growth, span)
 
 

@@ -7,16 +7,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from bwbayes.app.config.config import Config, ParameterConfig
+from bwbayes.app.config.config import ALONE, Config, ParameterConfig
+from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.defaults import ranges_of
+from bwbayes.inference.defaults import joined, ranges_of
 from bwbayes.inference.noise import NOISES
 from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.table import Column, JointTable
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
@@ -24,54 +27,108 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 
-__all__ = ["as_config", "context_of", "every_declaration", "parameters_of"]
+__all__ = [
+    "as_config",
+    "contexts_of",
+    "every_declaration",
+    "parameters_of",
+    "place_of",
+    "readings_of",
+]
 
 # No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
 LARGEST = 1e60
 
 
 def parameters_of(
-    config: Config, declarations: Sequence[Declaration], context: Context
+    config: Config, table: JointTable, contexts: Mapping[str, Context]
 ) -> list[Parameter]:
-    """Return the parameters that a model's parts declare.
+    """Return the parameters that a model's parts declare, in the order of θ's columns.
+
+    ``contexts`` are those of :func:`contexts_of`.
 
     Raises
     ------
     InputError
         The config says something of a parameter that the model does not have, or cannot have.
     """
-    _require_known("parameters", config.parameters, declarations)
-    _require_known("truth", config.truth, [*declarations, *every_declaration()])
-    given = {d.name: config.parameters.get(d.name, ParameterConfig()) for d in declarations}
-    if config.record.from_rest:
-        given |= {"initial": config.parameters.get("initial", ParameterConfig(fixed=0.0))}
-    return [_parameter(d, given[d.name], context) for d in declarations]
+    declarations, columns = table.table.declarations, table.layout
+    named = [replace(column.declaration, name=column.name) for column in columns]
+    _require_known("parameters", config.parameters, [*declarations, *named])
+    _require_known("truth", config.truth, [*declarations, *named, *every_declaration()])
+    return [
+        _parameter(column, _given(config, column), contexts[column.record]) for column in columns
+    ]
 
 
-def context_of(config: Config, record: Record, training: tuple[slice, ...]) -> Context:
-    """Return what default priors may know, from the training windows (slices) of the record.
+def _given(config: Config, column: Column) -> ParameterConfig:
+    """Return what a config says of a column of θ: of it alone, or of all records' together."""
+    name = column.declaration.name
+    given = config.parameters.get(column.name, config.parameters.get(name))
+    if given is not None:
+        return given
+    if name == "initial":
+        names = [column.record] if column.record else list(config.records)
+        rested = [config.records[record].from_rest for record in names]
+        if all(rested):
+            return ParameterConfig(fixed=0.0)
+        if any(rested):
+            raise InputError(
+                "model.shared: initial cannot be shared by records of which some start from rest "
+                "and some do not; remove it"
+            )
+    return ParameterConfig()
+
+
+def contexts_of(
+    config: Config, records: Mapping[str, Record], training: Mapping[str, tuple[slice, ...]]
+) -> dict[str, Context]:
+    """Return what default priors may know of each record, by name, and ("") of all together.
+
+    From the training windows (slices) of the records.
 
     Raises
     ------
     InputError
-        Voltage or displacement does not vary there.
+        Voltage or displacement does not vary there, in any of them.
     """
-    rows = np.concatenate([np.arange(window.start, window.stop) for window in training])
+    ranges = {
+        name: ranges_of(record.voltage, readings_of(record), record.interval, training[name])
+        for name, record in records.items()
+    }
+    varied = [one for one in ranges.values() if one.voltage > 0 and one.displacement > 0]
+    if not varied:
+        (place,) = [place_of(name) for name in list(records)[:1]]
+        raise InputError(f"{place}.train: voltage or displacement is constant there; widen it")
+    every = joined(varied)
+    contexts = {"": Context(every, dict(_stated(config)))}
+    for name, one in ranges.items():
+        # A record whose voltage stands still says where its sensor is, and nothing else.
+        known = one if one in varied else replace(every, middle=one.middle)
+        contexts[name] = Context(known, dict(_stated(config, name)))
+    return contexts
+
+
+def place_of(name: str) -> str:
+    """Return where a config speaks of a training record of that name."""
+    return "record" if name == ALONE else f"record.{name}"
+
+
+def readings_of(record: Record) -> FloatArray:
+    """Return the displacement of a record that has one."""
     assert record.displacement is not None
-    voltage, displacement = record.voltage[rows], record.displacement[rows]
-    if np.ptp(voltage) == 0 or np.nanmax(displacement) == np.nanmin(displacement):
-        raise InputError("record.train: voltage or displacement is constant there; widen it")
-    ranges = ranges_of(record.voltage, record.displacement, record.interval, training)
-    return Context(ranges, dict(_stated(config)))
+    return record.displacement
 
 
-def _stated(config: Config) -> Iterator[tuple[str, float | Distribution]]:
-    """Yield what the config states of parameters: values, and priors."""
+def _stated(config: Config, record: str = "") -> Iterator[tuple[str, float | Distribution]]:
+    """Yield what the config states of parameters, also of a record's own: values, and priors."""
+    mine = f"[{record}]"
     for name, given in config.parameters.items():
+        known = name.removesuffix(mine)
         if given.prior is not None:
-            yield name, _distribution(name, given.prior)
+            yield known, _distribution(name, given.prior)
         elif given.fixed is not None:
-            yield name, given.fixed
+            yield known, given.fixed
 
 
 def every_declaration() -> list[Declaration]:
@@ -99,9 +156,9 @@ def _require_known(
             )
 
 
-def _parameter(declared: Declaration, given: ParameterConfig, context: Context) -> Parameter:
+def _parameter(column: Column, given: ParameterConfig, context: Context) -> Parameter:
     """Put what the config says of a parameter before what its part declares."""
-    name = declared.name
+    name, declared, record = column
     prior, fixed = None, given.fixed
     if given.prior is not None:
         prior = _distribution(name, given.prior)
@@ -123,14 +180,20 @@ def _parameter(declared: Declaration, given: ParameterConfig, context: Context) 
     return Parameter(
         name,
         given.unit or unit,
-        given.label or declared.label,
-        given.description or declared.description,
+        given.label or labelled(declared.label, record),
+        given.description or declared.description + (f" of {record}" if record else ""),
         prior,
         fixed,
         -np.inf if given.lower is None else given.lower,
         np.inf if given.upper is None else given.upper,
         declared,
+        record,
     )
+
+
+def labelled(label: str, record: str) -> str:
+    """Return a label in LaTeX with the name of its record, if it has one, above."""
+    return rf"{label}^{{\mathrm{{{record.replace('_', chr(92) + '_')}}}}}" if record else label
 
 
 def _require_in_proportion(name: str, values: Collection[float]) -> None:
@@ -143,7 +206,7 @@ def _require_in_proportion(name: str, values: Collection[float]) -> None:
 def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:
     arguments = {key: value for key, value in prior.items() if key != "distribution"}
     try:
-        # The distribution itself refuses arguments that are no numbers.
+        # The distribution itself refuses arguments that are not numbers.
         return Distribution(str(prior["distribution"]), arguments)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"parameters.{name}.prior: {error}") from None

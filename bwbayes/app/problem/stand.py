@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.model import actuator_of
 from bwbayes.data import Record
@@ -14,18 +16,18 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 __all__ = ["planned", "recoverable", "stand_of"]
 
 
-def planned(config: Config, waveform: Waveform) -> Record:
-    """Return the part of a signal's command that becomes the training record."""
+def planned(config: Config, waveform: Waveform, stop: float | None) -> Record:
+    """Return the part of a signal's command, up to ``stop`` in s, that a training record has."""
     rate = config.stand.sample_rate
     record = Record(waveform.sample(rate)[1], None, 1 / rate, voltage_is="command")
-    return record if config.record.stop is None else record.upto(config.record.stop)
+    return record if stop is None else record.upto(stop)
 
 
-def stand_of(config: Config, training: Record) -> VirtualTestStand:
+def stand_of(config: Config, training: Sequence[Record]) -> VirtualTestStand:
     """Return the virtual stand that a config asks for.
 
-    Gain and creep count from the range of the ``training`` record's voltage, as in a fit to it, so
-    that a fit can recover their true values.
+    Gain and creep count from the range of the ``training`` records' voltages, as in a fit to them,
+    so that a fit can recover their true values.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def stand_of(config: Config, training: Record) -> VirtualTestStand:
         of the actuator.
     """
     try:
-        actuator = actuator_of(config.stand.model, training)
+        actuator = actuator_of(config.stand.model, training[0], training)
     except InputError as error:
         raise InputError(f"stand.{error}") from None
     stand = config.stand
@@ -44,7 +46,7 @@ def stand_of(config: Config, training: Record) -> VirtualTestStand:
 
 
 def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
-    """Return the true values but for what means something else in a fitted actuator.
+    """Return the true values, except those that mean something else in a fitted actuator.
 
     Parts that differ may have parameters of the same name.
     """

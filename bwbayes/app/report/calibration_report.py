@@ -12,7 +12,8 @@ from typing import Any
 from bwbayes.app.figures.style import unit_text
 from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import picture, symbol, template
+from bwbayes.app.report.page import Table, picture, template
+from bwbayes.app.report.words import symbol
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration
 from bwbayes.results.replicates import EXTRA, RANKED
@@ -68,57 +69,58 @@ def render(
         shortcomings=calibration.shortcomings,
         replicates=calibration.replicates,
         unconverged=[str(number) for number in calibration.unconverged],
-        levels=LEVELS,
-        rows=_rows(problem, calibration),
-        limits=[_percent(calibration.limits[level]) for level in LEVELS],
+        statistics=_statistics(problem, calibration),
         bands=_bands(calibration),
-        priors=[
-            {"name": p.name, "symbol": symbol(p), "unit": unit_text(p.unit), "prior": str(p.prior)}
-            for p in problem.parameters
-            if p.fixed is None
-        ],
+        priors=Table(
+            "priors",
+            "Priors",
+            ("Parameter", "Symbol", "Prior", "Unit"),
+            [
+                (p.name, symbol(p).html, str(p.prior), unit_text(p.unit))
+                for p in problem.parameters
+                if p.fixed is None
+            ],
+        ),
         power=calibration.power,
         tests=2 * len(calibration.statistics),
         family_level=f"{FAMILY_LEVEL:.0%}",
         judged_from=JUDGED_FROM,
         ranked=RANKED,
         pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
-        facts=_facts(problem, numbers),
+        known=_facts(problem, numbers),
     )
 
 
-def _rows(problem: Problem, calibration: Calibration) -> list[dict[str, Any]]:
-    """Return a row for each statistic."""
+def _statistics(problem: Problem, calibration: Calibration) -> Table:
+    """Return a row for each statistic, and the limits of its intervals' coverage."""
     known = {p.name: (p.description, unit_text(p.unit)) for p in problem.parameters}
     known |= {name: (EXTRA_WORDS[name][0], unit_text(EXTRA_WORDS[name][1])) for name in EXTRA}
-    return [
-        {
-            "name": name,
-            "description": known[name][0],
-            "unit": known[name][1],
-            "p": f"{one.p:.2g}",
-            "adjusted": f"{one.adjusted:.2g}",
-            "ecdf": "leaves the band" if one.outside else "inside",
-            "covered": [f"{one.covered[level]:.1%}" for level in LEVELS],
-        }
+    rows = [
+        (
+            *known[name],
+            f"{one.p:.2g}",
+            f"{one.adjusted:.2g}",
+            "leaves the band" if one.outside else "inside",
+            *(f"{one.covered[level]:.1%}" for level in LEVELS),
+        )
         for name, one in calibration.statistics.items()
     ]
+    limits = [_percent(calibration.limits[level]) for level in LEVELS]
+    rows.append(("99 % binomial limits", "", "", "", "", *limits))
+    tests = ("Statistic", "Unit", "p, smooth test", "p, adjusted", "ECDF of ranks")
+    titles = (*tests, *(f"{level} % interval" for level in LEVELS))
+    return Table("statistics", "Ranks and intervals", titles, rows)
 
 
-def _bands(calibration: Calibration) -> list[dict[str, Any]]:
+def _bands(calibration: Calibration) -> Table:
     """Return a row for each kind of band of held-out windows and of other records, if any."""
     rows = []
     for other, kind in product(calibration.predicted, KINDS):
         coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
-        of = other or "held-out samples"
-        rows.append(
-            {
-                "kind": kind,
-                "of": of,
-                "covered": [f"{c.mean:.1%} ± {c.error:.1%}" for c in coverages],
-            }
-        )
-    return rows
+        covered = [f"{c.mean:.1%} ± {c.error:.1%}" for c in coverages]
+        rows.append((kind, other or "held-out samples", *covered))
+    titles = ("Band", "of", *(f"{level} %" for level in LEVELS))
+    return Table("bands", "Coverage of the bands", titles, rows)
 
 
 def _percent(pair: Sequence[float]) -> str:
@@ -126,12 +128,19 @@ def _percent(pair: Sequence[float]) -> str:
 
 
 def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
-    record, model, plan = problem.record, problem.config.model, problem.plan
+    model, plan = problem.config.model, problem.plan
     held_out = [v.window for v in problem.validations.values() if v.window is not None]
     judged = sum(window.stop - window.start for window in held_out)
-    fitted = sum(window.stop - window.start for window in problem.posterior.only.training)
+    windows = [window for one in problem.posterior.datasets for window in one.training]
+    fitted = sum(window.stop - window.start for window in windows)
     return [
-        ("voltage", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
+        *(
+            (
+                "voltage" if len(problem.records) == 1 else f"voltage, {name}",
+                f"{record.origin}: {record.samples} samples every {record.interval:g} s",
+            )
+            for name, record in problem.records.items()
+        ),
         ("fitted, held out", f"{fitted} samples, {judged} samples"),
         ("model", in_words(model)),
         ("noise", model.noise),

@@ -3,7 +3,7 @@
 ``records/NAME/`` is the run of the record ``NAME.csv`` (or another suffix), as ``bwbayes run``
 leaves it. ``campaign.jsonl`` says which folder of records it is about, and then has a line for each
 run that came to its end: the digests of the record's file and of the run's summary. So a campaign
-can be continued from any moment on; a record that was changed is fitted anew, and a run that was
+can be continued from any moment on; a record that was changed is fitted again, and a run that was
 resumed by itself is looked at again.
 """
 
@@ -162,7 +162,7 @@ class CampaignFolder:
             return Origin.model_validate_json(first)
         except ValidationError:
             raise InputError(
-                f"{self.journal}: does not say which records it is about; begin anew with "
+                f"{self.journal}: does not say which records it is about; start again with "
                 "--overwrite"
             ) from None
 
@@ -190,7 +190,7 @@ class CampaignFolder:
         return every
 
     def note(self, one: Finished) -> None:
-        """Write a line that is there after a crash."""
+        """Write a line so that it survives a crash."""
         with self.journal.open("ab") as file:
             file.write(one.model_dump_json().encode() + b"\n")
             file.flush()

@@ -130,7 +130,7 @@ class Cluster(Executor):
         elif made.status == "error":
             raised = made.exception(timeout=PATIENCE)
             if type(raised).__name__ == "KilledWorker":
-                raised = BrokenExecutor(f"{DEATHS} workers died under one call; mind the memory")
+                raised = BrokenExecutor(f"{DEATHS} workers died during one call; free some memory")
             _fail(future, raised)
         else:
             _fail(future, self._gone(None))

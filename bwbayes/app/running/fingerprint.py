@@ -10,6 +10,7 @@ of its own), and what is predicted.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -26,14 +27,13 @@ FREE_TO_CHANGE = (
     "stand",
     "truth",
     "validation",
-    "record.file",
-    "record.remarks",
-    "record.signal",
     "sampling.engine",
     "sampling.ess",
     "sampling.steps",
     "sampling.pilot_steps",
 )
+# Of each record: where it comes from.
+SOURCE = re.compile(r"record\.([^.]+\.)?(file|remarks|signal)(\..*)?")
 NAMES_FOR_PEOPLE = ("label", "description")
 
 # What chains were sampled with before a config could say it.
@@ -42,6 +42,8 @@ UNSAID: Mapping[str, object] = {
     "model.gain": [],
     "model.creep": False,
     "model.creep_growth": False,
+    "model.per_record": [],
+    "model.shared": [],
 }
 
 
@@ -104,6 +106,7 @@ def _values(config: Config) -> dict[str, object]:
         key: value
         for key, value in _flat(config.model_dump(exclude_none=True))
         if not any(key == one or key.startswith(f"{one}.") for one in FREE_TO_CHANGE)
+        and not SOURCE.fullmatch(key)
         and not (key.startswith("parameters.") and key.endswith(NAMES_FOR_PEOPLE))
     }
 

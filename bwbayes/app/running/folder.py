@@ -58,10 +58,10 @@ class RunFolder:
         Raises
         ------
         InputError
-            It exists and ``overwrite`` is not given, or it is no run's, or it cannot be written.
+            It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
         if path.name == "..":
-            raise InputError(f"{path}: is no name of a folder; choose one with --out")
+            raise InputError(f"{path}: is not a valid folder name; choose one with --out")
         if path.exists():
             if not overwrite:
                 raise InputError(
@@ -74,10 +74,8 @@ class RunFolder:
         try:
             shutil.rmtree(draft, ignore_errors=True)
             (draft / "records").mkdir(parents=True)
-            write_record(problem.record, draft / "records/record.h5")
-            for name, validation in problem.validations.items():
-                if validation.record is not None:
-                    write_record(validation.record, draft / f"records/{name}.h5")
+            for name, record in {**problem.records, **problem.others}.items():
+                write_record(record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
             if cls.MARK:
                 (draft / cls.MARK).write_bytes(mark)
@@ -113,7 +111,7 @@ class RunFolder:
 
     def _has_records(self) -> bool:
         """Tell a folder that was made from one that holds a config alone."""
-        return (self.path / "records/record.h5").is_file()
+        return any((self.path / "records").glob("*.h5"))
 
     def _is_of_its_kind(self) -> bool:
         """Tell a run's folder from a calibration's."""
@@ -161,7 +159,7 @@ class CalibrationFolder(RunFolder):
 
     @property
     def replicates(self) -> Path:
-        """What they are replicates of, how many are wanted, and then a line for each."""
+        """What they are replicates of, how many were requested, and then a line for each."""
         return self.path / self.MARK
 
     @property

@@ -108,10 +108,7 @@ def _config(task: Task) -> Config:
     """Return the config of a record."""
     if task.config:
         config = parse(task.config, "campaign.toml")
-        source = config.record.model_copy(
-            update={"file": str(task.file.absolute()), "signal": None}
-        )
-        config = config.model_copy(update={"record": source})
+        config = config.with_record(task.file)
     else:
         made = propose(task.file, task.where)
         if made.pointless is not None:

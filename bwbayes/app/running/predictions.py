@@ -8,7 +8,7 @@ on the data alone: the same record under another name gets the same bands.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from html import escape
 from io import StringIO
@@ -22,13 +22,20 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
+from bwbayes.errors import InputError, suggestion
 from bwbayes.results import innovations
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.innovations import Innovations
-from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+from bwbayes.results.prediction import (
+    Start,
+    forecast,
+    predict_record,
+    predict_windows,
+    thinned,
+)
 from bwbayes.results.refit import Moved
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores, as_summary, score
@@ -84,7 +91,7 @@ class Prediction(Bands):
         return pd.DataFrame(dict(self.columns()))
 
     def plot(self) -> Figure:
-        """Draw the bands along time: voltage, displacement, and what is left without the mean."""
+        """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         return draw_alone(self)
 
     def numbers(self) -> dict[str, object]:
@@ -131,6 +138,7 @@ def predict_another(
     start: Start,
     name: str,
     window: tuple[float, float] | None = None,
+    of: str | None = None,
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
@@ -148,6 +156,9 @@ def predict_another(
         Name of the bands.
     window
         Start and stop in s of the part that is predicted and judged; by default all of it.
+    of
+        The training record whose own parameters it takes where nothing tells its own; by default
+        the first.
 
     Raises
     ------
@@ -158,32 +169,78 @@ def predict_another(
     remarks = tuple(beyond_training(posterior, record.voltage, record.interval))
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"predict {record.sha256}")
-    bands = predict_record(posterior, chosen, record, start, source, name, window)
+    of = training_record(problem, of)
+    alone, its = posterior.alone(of), posterior.its(chosen, of)
+    bands = predict_record(alone, its, record, start, source, name, window)
     verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
     scores = None if verdict is None else score(bands, scoring(seed, bands))
     return Prediction.of(bands, scores, verdict, remarks)
 
 
+def predict_after(
+    problem: Problem, flat: FloatArray, voltage: FloatArray, name: str, of: str | None = None
+) -> Prediction:
+    """Predict what follows on a training record whose last sample goes on into a planned voltage.
+
+    ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name, by default the
+    first. All else is as in :func:`predict_another`; see
+    :func:`~bwbayes.results.prediction.forecast`.
+    """
+    posterior, seed, of = problem.posterior, problem.config.seed, training_record(problem, of)
+    record = problem.records[of]
+    remarks = tuple(beyond_training(posterior, voltage, record.interval))
+    chosen = thinned(flat, generator(seed, "draws"))
+    source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
+    alone, its = posterior.alone(of), posterior.its(chosen, of)
+    return Prediction.of(forecast(alone, its, record, voltage, source, name), remarks=remarks)
+
+
+def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> FloatArray:
+    """Return readings less the mean of the bands along the training record, (samples,), um.
+
+    Raises
+    ------
+    InputError
+        Several records were fitted.
+    """
+    if len(problem.records) > 1:
+        raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
+    values = np.full(problem.record.samples, np.nan)
+    for name, window in problem.windows(*problem.records).items():
+        values[window] = bands[name].residuals
+    return values
+
+
+def training_record(problem: Problem, name: str | None) -> str:
+    """Return the name of a training record, by default of the first.
+
+    Raises
+    ------
+    InputError
+        No training record is called so.
+    """
+    if name is not None and name not in problem.records:
+        hint = suggestion(name, list(problem.records))
+        raise InputError(f"predict: no training record {name!r}; {hint}")
+    return name or next(iter(problem.records))
+
+
 def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
-    """Predict the training windows and everything held out."""
+    """Predict the training windows of all records and everything held out."""
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(result.flat_draws, generator(seed, "draws"))
-    training = posterior.only.training
-    windows = {
-        "training" if len(training) == 1 else f"training-{i + 1}": window
-        for i, window in enumerate(training)
-    }
-    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    # By content: the same record under another name gets the same bands.
-    source = generator(seed, f"predict {problem.record.sha256}")
-    bands = predict_windows(posterior, chosen, problem.record, windows, source)
+    bands: list[Bands] = []
+    for name, alone, its in posterior.each(chosen):
+        record, windows = problem.records[name], problem.windows(name)
+        # By content: the same record under another name gets the same bands.
+        source = generator(seed, f"predict {record.sha256}")
+        bands += predict_windows(alone, its, record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:
             source = generator(seed, f"predict {other.record.sha256}")
+            alone, its = posterior.alone(other.of), posterior.its(chosen, other.of)
             bands.append(
-                predict_record(
-                    posterior, chosen, other.record, other.start, source, name, other.judged
-                )
+                predict_record(alone, its, other.record, other.start, source, name, other.judged)
             )
     return tuple(bands)
 
@@ -192,27 +249,29 @@ def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    found: Innovations,
-    moved: Moved | None,
+    series: Mapping[str, Innovations],
+    moved: Mapping[str, Moved | None],
 ) -> dict[str, Verdict]:
-    """Judge all bands that have readings, by name."""
-    start = innovations.odd_start(found)
+    """Judge all bands that have readings, by name.
+
+    ``series`` and ``moved`` are by the name of the training record.
+    """
+    records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for one in bands:
-        # Of several training windows the first one holds the start.
-        at_start = one.training and one.time[0] <= found.time[0] <= one.time[-1]
         far = beyond_training(problem.posterior, one.voltage, one.interval)
-        verdict = (
-            assess(one, background, start=start, moved=moved, beyond=far)
-            if at_start
-            else assess(one, background, beyond=far)
-        )
+        record = records.get(one.name) if one.training else None
+        start, away = None, None
+        # Of several training windows the first one holds the start.
+        if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
+            start, away = innovations.odd_start(series[record]), moved[record]
+        verdict = assess(one, background, start=start, moved=away, beyond=far)
         if verdict is not None:
             verdicts[one.name] = verdict
     return verdicts
 
 
 def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it hangs on the readings, not on a name."""
+    """Return the generator that scores bands: it depends on the readings, not on a name."""
     assert bands.measured is not None
     return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")

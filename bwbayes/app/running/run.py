@@ -24,9 +24,9 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
-from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.report.report import render
+from bwbayes.app.running.facts import facts_of, stepped
 from bwbayes.app.running.fingerprint import fingerprint, require_same, version_remarks
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import judged, predictions, scoring
@@ -37,16 +37,17 @@ from bwbayes.errors import InputError
 from bwbayes.inference import conflict, pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results import identifiability, innovations
+from bwbayes.results import agreement, identifiability, innovations
+from bwbayes.results.learned import learned
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import thinned
 from bwbayes.results.refit import without_start
+from bwbayes.results.replicated import replicated
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
 from bwbayes.results.verdict import Background
-from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import Outcome, draws, first_chain, log_densities, sample
 from bwbayes.sampling.storage import ChainFile
 
@@ -108,7 +109,7 @@ def carry_on(
     engine: Engine | None = None,
     how: str | Executor | None = None,
 ) -> Result:
-    """Do what is left of a run and write its files, as :func:`go_on` does; return the result."""
+    """Finish a run and write its files, as :func:`go_on` does; return the result."""
     return go_on(
         folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
     ).result
@@ -125,7 +126,7 @@ def go_on(
     files: bool = True,
     how: str | Executor | None = None,
 ) -> Run:
-    """Do what is left of a run.
+    """Finish a run.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ def go_on(
     """
     begun = time.monotonic()
     with folder.locked(), one_thread():
-        if any(wanted is not None for wanted in (ess, steps, engine)):
+        if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
         with (
@@ -160,7 +161,7 @@ def go_on(
             executor(workers, problem.posterior.engine, how) as pool,
             Progress(console, problem.plan) as progress,
         ):
-            # It is written last, as the sign that all is there; now something is to come.
+            # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
@@ -216,7 +217,7 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
 
 
 def _chain(
-    folder: RunFolder, problem: Problem, console: Console, wanted: Engine | None
+    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
 ) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
@@ -224,7 +225,7 @@ def _chain(
         chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
         begun, now = chain.attributes()["engine"], posterior.engine
         if begun != now:
-            if wanted is None:
+            if requested is None:
                 chain.close()
                 raise InputError(
                     f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
@@ -236,7 +237,7 @@ def _chain(
     point = pointfit.fit(posterior, generator(config.seed, "point fit"))
     attributes: dict[str, str | int] = {
         "config": dump(config),
-        "data_sha256": problem.record.sha256,
+        "data_sha256": problem.sha256,
         "posterior": fingerprint(config),
         "versions": json.dumps(versions(posterior.engine)),
         "engine": posterior.engine,
@@ -250,7 +251,7 @@ def _chain(
 
 def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
     """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
-    if noted.get("data_sha256") != problem.record.sha256:
+    if noted.get("data_sha256") != problem.sha256:
         raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
     require_same(noted.get("posterior"), problem.config, path)
 
@@ -259,9 +260,9 @@ def _retarget(
     folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
 ) -> None:
     config = load(folder.config)
-    wanted = {"ess": ess, "steps": steps, "engine": engine}
+    changes = {"ess": ess, "steps": steps, "engine": engine}
     sampling = config.sampling.model_copy(
-        update={name: value for name, value in wanted.items() if value is not None}
+        update={name: value for name, value in changes.items() if value is not None}
     )
     text = dump(config.model_copy(update={"sampling": sampling}))
     parse(text, "resume")  # refuses what a config cannot say
@@ -282,8 +283,9 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         *conflict.conflicts(posterior.prior, flat, problem.defaults),
         *identifiability.remarks(posterior, chain.point, flat),
     ]
-    columns = posterior.table.columns(posterior.prior.theta(flat))
-    remarks += posterior.only.actuator.hysteresis.remarks(columns, posterior.names)
+    _, alone, its = next(posterior.each(flat))
+    columns = alone.table.columns(alone.prior.theta(its))
+    remarks += alone.only.actuator.hysteresis.remarks(columns, alone.names)
     result = Result(
         name=problem.config.name or "run",
         outcome=outcome,
@@ -291,7 +293,7 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         draws=sampled,
         log_density=log_densities(chain),
         moves=chain.moves("sampling"),
-        facts=_facts(problem, posterior, chain),
+        facts=facts_of(problem, chain),
         remarks=tuple(remarks),
         truth=problem.config.truth,
     )
@@ -300,17 +302,35 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
     bands = predictions(problem, result)
     best = flat[int(np.argmax(result.log_density))]
-    found = innovations.innovations(posterior, best, problem.record.start)
-    # By a second point fit, without the record's start.
+    series = {
+        name: innovations.innovations(alone, one[0], problem.records[name].start)
+        for name, alone, one in posterior.each(best[np.newaxis])
+    }
+    # By a second point fit, without a record's start.
     source = generator(problem.config.seed, "without start")
-    moved = without_start(
-        posterior,
-        thinned(flat, source),
-        source,
-        problem.record.start,
-        seen=any(one.kind == "switch-on transient" for one in problem.findings),
+    some = thinned(flat, source)
+    moved = {
+        name: without_start(
+            posterior,
+            some,
+            source,
+            record.start,
+            record=name,
+            seen=any(one.kind == "switch-on transient" for one in problem.findings[name]),
+        )
+        for name, record in problem.records.items()
+    }
+    begin = {name: record.start for name, record in problem.records.items()}
+    compared = agreement.agreements(
+        posterior, chain.point, generator(problem.config.seed, "agreement"), begin
     )
-    verdicts = judged(problem, bands, Background.of(posterior, flat), found, moved)
+    several = len(problem.records) > 1
+    odd = [
+        f"{name}: {remark}" if several else remark
+        for name, one in series.items()
+        for remark in innovations.remarks(one)
+    ]
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
     return replace(
         result,
         bands=bands,
@@ -320,37 +340,16 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
             if one.name in verdicts
         },
         verdicts=verdicts,
-        innovations=found,
+        innovations=series,
         loops=measure_loops(posterior, chosen),
-        steps=measure_steps(posterior, chosen, problem.others),
-        remarks=(*result.remarks, *innovations.remarks(found)),
+        steps=measure_steps(posterior, chosen, stepped(problem)),
+        agreement=compared,
+        learned=learned(posterior.prior, sampled, result.log_density, source),
+        replicated={
+            one.name: replicated(posterior, chosen, source, one.name) for one in posterior.datasets
+        },
+        remarks=(*result.remarks, *agreement.remarks(compared), *odd),
     )
-
-
-def _facts(problem: Problem, posterior: Posterior, chain: ChainFile) -> dict[str, str]:
-    record, config = problem.record, problem.config
-    windows = ", ".join(
-        f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
-        for w in posterior.only.training
-    )
-    accepted = {
-        phase: ", ".join(
-            f"{n} {accepted / p:.0%}" for n, (p, accepted) in chain.moves(phase).items()
-        )
-        for phase in PHASES
-    }
-    return {
-        "record": f"{record.origin}: {record.samples} samples every {record.interval:g} s",
-        "fitted": windows,
-        "model": in_words(config.model),
-        "noise": config.model.noise,
-        "sampling": (
-            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; "
-            f"{', '.join(f'{chain.steps(phase)} steps of {phase}' for phase in PHASES)}"
-        ),
-        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
-        "engine": posterior.engine,
-    }
 
 
 def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
@@ -374,15 +373,15 @@ def numbers_of(
         "go_on": None if result.outcome.converged else going_on(folder.path, problem),
         "wall_s": seconds,
         "versions": versions(problem.posterior.engine),
-        "data_sha256": problem.record.sha256,
+        "data_sha256": problem.sha256,
     }
 
 
 def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
-    """Write everything that a run leaves; the summary last, as the sign that all is there."""
+    """Write all files of a run; the summary last, as the sign that all is done."""
     numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
-    write_posterior(folder.path / "posterior.nc", result, density, problem.record)
+    write_posterior(folder.path / "posterior.nc", result, density, problem.records)
     (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)

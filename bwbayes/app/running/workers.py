@@ -137,6 +137,9 @@ class Processes(Executor):
         self.count = count
         self.lock = threading.Lock()
         self.closed = False
+        # Pools that broke are kept: Python's end of one waits for ever for its own lock if the last
+        # reference to it goes meanwhile.
+        self.broken: list[ProcessPoolExecutor] = []
         self.pool = self._started()
 
     @property
@@ -169,6 +172,12 @@ class Processes(Executor):
         _start(pool, self.count)
         return pool
 
+    def _replace(self, broken: ProcessPoolExecutor) -> None:
+        """Start processes in place of those, if nobody has."""
+        if self.pool is broken:
+            self.broken.append(broken)
+            self.pool = self._started()
+
     def _send(self, future: Future[Any], call: bytes, tried: int) -> None:
         """Make a call, once more if its process dies."""
         with self.lock:
@@ -178,7 +187,8 @@ class Processes(Executor):
             except BrokenProcessPool:
                 if self.closed:
                     raise
-                pool = self.pool = self._started()
+                self._replace(pool)
+                pool = self.pool
                 made = pool.submit(_called, call)
         made.add_done_callback(partial(self._done, future, call, tried, pool))
 
@@ -197,8 +207,7 @@ class Processes(Executor):
         if isinstance(error, BrokenProcessPool) and tried < TRIES and not self.closed:
             try:
                 with self.lock:
-                    if self.pool is pool:
-                        self.pool = self._started()
+                    self._replace(pool)
                 self._send(future, call, tried + 1)
             except RuntimeError as broken:  # shut down meanwhile
                 future.set_exception(broken)

@@ -147,10 +147,10 @@ def _real_vector(path: Path, name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
         kinds = {"c": "complex numbers", "b": "logical values"}
-        problem = kinds.get(array.dtype.kind, "text or another type that is no number")
+        problem = kinds.get(array.dtype.kind, "text or another type that is not a number")
         raise InputError(f"{path}: {name}: holds {problem}; store real numbers")
     if array.size != max(array.shape, default=1):
-        raise InputError(f"{path}: {name}: shape {array.shape} is no vector; store one row")
+        raise InputError(f"{path}: {name}: shape {array.shape} is not a vector; store one row")
     return array.ravel()
 
 
@@ -228,7 +228,7 @@ def _check_lengths(table: Table, needed: Iterable[str]) -> None:
         if quantity not in table.columns:
             names = [name for name in table.names if name]
             near = difflib.get_close_matches(COMMON_NAMES[quantity], names, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"found: {', '.join(names[:10])}"
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names[:10])}"
             header = None if table.first_line is None else -1  # the line above the first sample
             raise table.error(f"missing; add it ({hint})", quantity, header)
     samples = table.columns["time"].values.size
@@ -353,7 +353,7 @@ def _uneven(
     step, before = float(steps[sample - 1]), float(time[sample - 1])
     if step > 1.5 * usual:
         if held:
-            problem = f"gap of {step:.6g} s is no whole number of intervals of {usual:.6g} s"
+            problem = f"gap of {step:.6g} s is not a whole number of intervals of {usual:.6g} s"
             return table.error(f"{problem}; resample it or cut the record", "time", sample)
         missing = round(step / usual) - 1
         problem = f"gap of {step:.6g} s after {before:.9g} s, about {missing} missing"

@@ -120,8 +120,8 @@ def column_names(path: str | Path) -> list[str]:
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
     """Write a record so that reading it gives the same numbers.
 
-    A file that stands there is replaced at once or not at all. The truth goes beside a text file,
-    and one that stands there from an earlier record is removed.
+    An existing file is replaced at once or not at all. The truth goes beside a text file, and
+    that of an earlier record is removed.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
         _write_whole(path, lambda part: write_hdf5(record, part))
     else:
         truth_path = _truth_path(path)
-        truth_path.unlink(missing_ok=True)  # first, lest it ever stand beside another record
+        truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
         _write_whole(path, lambda part: write_csv(record, part))
         if record.truth is not None:
             truth = replace(record, displacement=record.truth)

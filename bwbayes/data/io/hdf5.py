@@ -38,10 +38,10 @@ def read_hdf5(path: Path, naming: Naming) -> Table:
     Raises
     ------
     InputError
-        If it is no HDF5 file, is damaged, or has datasets that are no vectors of real numbers.
+        If it is not an HDF5 file, is damaged, or has datasets other than real vectors.
     """
     if not h5py.is_hdf5(path):
-        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it anew")
+        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
     try:
         check_lists(path)
         with h5py.File(path, "r") as file:
@@ -51,7 +51,7 @@ def read_hdf5(path: Path, naming: Naming) -> Table:
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
-        raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it anew") from error
+        raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it again") from error
 
 
 def group_table(path: Path, group: Any, naming: Naming, notes: dict[str, str]) -> Table:
@@ -90,7 +90,7 @@ def record_arrays(record: Record) -> dict[str, Any]:
 
 
 def _group_of_columns(path: Path, file: Any) -> Any:
-    """Return the root if datasets stand there, else the only group that has some."""
+    """Return the root if it holds datasets, else the only group that holds some."""
     objects = (file, *(file[name] for name in _linked(file)))
     groups = [group for group in objects if isinstance(group, h5py.Group) and any(datasets(group))]
     if not groups or groups[0] == file:

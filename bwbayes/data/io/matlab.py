@@ -50,7 +50,7 @@ def read_mat(path: Path, naming: Naming) -> Table:
     Raises
     ------
     InputError
-        If it is no MATLAB file, is damaged, or has variables that are no vectors of real numbers.
+        If it is not a MATLAB file, is damaged, or has variables other than real vectors.
     """
     try:
         return _read_7_3(path, naming) if h5py.is_hdf5(path) else _read_5(path, naming)
@@ -59,7 +59,7 @@ def read_mat(path: Path, naming: Naming) -> Table:
     except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         problem = f"not a MATLAB file, damaged or cut off ({reason})"
-        raise InputError(f"{path}: {problem}; save it anew") from error
+        raise InputError(f"{path}: {problem}; save it again") from error
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:

@@ -235,7 +235,7 @@ def _fault(
         if last and (not ended or problem.startswith("missing")):
             problem = f"the last line is cut off ({problem.partition(';')[0]}); remove it"
         return InputError(f"{where}{number}: {column + ': ' if column else ''}{problem}")
-    return InputError(f"{where} cannot be read as numbers; write it anew")
+    return InputError(f"{where} cannot be read as numbers; write it again")
 
 
 def _fault_in_line(line: str, columns: list[_Header]) -> tuple[str, str] | None:

@@ -67,9 +67,12 @@ def moments(
         memory = actuator.begin(column, voltage, from_rest=from_rest)
         stage = prepare(actuator.hysteresis, column, voltage, memory)
         able = stage.able
-        models = _models(actuator, column, stage.rest, steady, voltage)[able]
-        mine = stage.kind, stage.own[able], stage.plan
-        sums[:, able] = kernels.sums(*record, models, *mine, *parts, *unknowns)
+        models, own = _models(actuator, column, stage.rest, steady, voltage), stage.own
+        if able.all():
+            sums = kernels.sums(*record, models, stage.kind, own, stage.plan, *parts, *unknowns)
+        else:
+            mine = stage.kind, own[able], stage.plan
+            sums[:, able] = kernels.sums(*record, models[able], *mine, *parts, *unknowns)
     others = np.flatnonzero(~able)
     size = max(LARGEST // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
@@ -164,5 +167,7 @@ def _models(
         *strengths,
         *[nothing] * (MOST_TIMES - len(strengths)),
     ]
-    assert len(rows) == len(lanes.PARAMETERS)
-    return np.stack(rows, axis=1)
+    made = np.empty((models, len(lanes.PARAMETERS)))
+    for place, row in zip(made.T, rows, strict=True):
+        place[:] = row
+    return made

@@ -1,8 +1,8 @@
 """The Jiles-Atherton and the domain wall model compiled: model by model, stretch by stretch.
 
 The same steps as :mod:`bwbayes.model.operators.walls` takes, so that both engines have the same
-error. Steps of an integrator do not end at samples; so this is no stage that takes samples as they
-come, but makes the drive of a whole record, which is then taken as given.
+error. An integrator's steps do not end at samples, so this is not a stage that takes samples as
+they come: it makes the drive of a whole record, which is then taken as given.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def _fold(
 ) -> None:
     """Add what a number of samples brought to the products, and move the responses on.
 
-    ``weight`` is what is left of each response after them.
+    ``weight`` is what remains of each response after them.
     """
     count = series.size
     for k in range(count):

@@ -37,7 +37,7 @@ __all__ = ["BoucWen"]
 SHAPE = ("alpha", "beta", "gamma", "exponent")
 
 # Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
-# what is left for β has its median a little above 1/U, and room for a factor of thirty either way.
+# what remains for β has its median a little above 1/U, and room for a factor of thirty either way.
 BETA, BETA_SIGMA = 0.15, 2.3
 GAMMA = 4.0
 

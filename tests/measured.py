@@ -1,7 +1,7 @@
-"""What was found when what takes long was last run in full, as the README quotes it.
+"""The figures of the slow tests and benchmarks from when they last ran in full.
 
-The slow tests and the benchmarks write their figures to ``found.json``; the README's are held
-against it, so that none is quoted from memory.
+They are kept in ``measured.json``, and the README's figures are compared with them, so that none is
+quoted from memory.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["found", "keep"]
+__all__ = ["keep", "measured"]
 
 PATH = Path(__file__).with_suffix(".json")
 
 
-def found() -> dict[str, Any]:
+def measured() -> dict[str, Any]:
     """Return all figures, by promise."""
     figures: dict[str, Any] = json.loads(PATH.read_text(encoding="utf-8"))
     return figures
@@ -24,5 +24,5 @@ def found() -> dict[str, Any]:
 
 def keep(promise: str, figures: Mapping[str, Any]) -> None:
     """Store the figures of a promise in place of older ones."""
-    every = (found() if PATH.is_file() else {}) | {promise: figures}
+    every = (measured() if PATH.is_file() else {}) | {promise: figures}
     PATH.write_text(json.dumps(every, indent=1, sort_keys=True) + "\n", encoding="utf-8")

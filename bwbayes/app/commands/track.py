@@ -1,0 +1,79 @@
+"""``bwbayes track``: how well a displacement would be followed, with and without the model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from bwbayes.app.commands.shared import FILE, overwrite_option, quiet_option
+
+__all__ = ["track"]
+
+
+@click.command()
+@click.argument("folder", type=FILE)
+@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/track.")
+@click.option(
+    "--frequency",
+    "frequencies",
+    type=float,
+    multiple=True,
+    help="Of the references, Hz; may be given again; default: 0.1 Hz to where dynamics matter.",
+)
+@click.option("--amplitude", type=float, help="Of the references, um; default: 80 % of the reach.")
+@click.option(
+    "--limits",
+    type=(float, float),
+    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
+)
+@click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
+@click.option(
+    "--delay", type=int, default=1, show_default=True, help="Samples from reading to answer."
+)
+@click.option(
+    "--gain-margin", type=float, default=2.0, show_default=True, help="That all draws keep."
+)
+@click.option(
+    "--phase-margin",
+    type=float,
+    default=60.0,
+    show_default=True,
+    help="That all draws keep, degrees.",
+)
+@click.option("--draws", type=int, default=200, show_default=True, help="Simulated actuators.")
+@overwrite_option
+@quiet_option
+def track(
+    folder: Path,
+    out: Path | None,
+    frequencies: tuple[float, ...],
+    amplitude: float | None,
+    limits: tuple[float, float] | None,
+    rate: float,
+    delay: int,
+    gain_margin: float,
+    phase_margin: float,
+    draws: int,
+    overwrite: bool,
+    quiet: bool,
+) -> int:
+    """Say how well the actuator of the run in FOLDER would follow the paper's signals.
+
+    On the virtual test stand, with every draw of the posterior for actuator: a linear command, the
+    mean model's inverse (feed-forward), a PID controller, and both together.
+
+    Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
+    """
+    from bwbayes.app.jobs.track import Setup, show, track_run
+
+    setup = Setup(
+        limits, rate, delay, gain_margin, phase_margin, frequencies or None, amplitude, draws
+    )
+    made, files = track_run(folder, out, setup, overwrite=overwrite)
+    if not quiet:
+        show(made, Console())
+        for path in files:
+            click.echo(f"wrote {path}")
+    return 0

@@ -1,0 +1,39 @@
+"""Tracking error against frequency, with and without a model, for each signal."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from bwbayes.app.figures.style import COLOURS, STYLE, hide_unused
+from bwbayes.control.tracking import CONTROLLERS, Tracking
+
+__all__ = ["draw_tracking"]
+
+BAND_ALPHA = 0.25
+
+
+def draw_tracking(tracking: Tracking) -> Figure:
+    """Draw the rms errors of the controllers: mean over the draws, and where 95 % of them lie."""
+    with mpl.rc_context(STYLE):
+        rows = (len(tracking.signals) + 1) // 2
+        figure = Figure(figsize=(10, 3.4 * rows + 0.4), layout="constrained")
+        axes = figure.subplots(rows, 2, squeeze=False, sharex=True, sharey=True)
+        panels = hide_unused(axes, len(tracking.signals), "frequency (Hz)")
+        table = tracking.to_pandas().groupby(["signal", "controller"])
+        for panel, signal in zip(panels, tracking.signals, strict=True):
+            for controller, colour in zip(CONTROLLERS, COLOURS, strict=False):
+                part = table.get_group((signal, controller))
+                band = part["rms_um_low"], part["rms_um_high"]
+                panel.fill_between(part["frequency_Hz"], *band, fc=colour, alpha=BAND_ALPHA, lw=0)
+                panel.plot(
+                    part["frequency_Hz"], part["rms_um"], "o-", ms=3, color=colour, label=controller
+                )
+            panel.set_title(signal)
+            panel.set_xscale("log")
+            panel.set_yscale("log")
+        for left in axes[:, 0]:
+            left.set_ylabel("rms error (µm)")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(handles))
+    return figure

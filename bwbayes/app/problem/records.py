@@ -1,0 +1,241 @@
+"""The records of a config: from files or from the virtual stand, cut, split and looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.app.config.config import (
+    ALONE,
+    Config,
+    RecordConfig,
+    SignalConfig,
+    ValidationConfig,
+)
+from bwbayes.app.problem.parameters import place_of
+from bwbayes.app.problem.stand import planned, stand_of
+from bwbayes.data import Record, read_record
+from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.record import require_readable
+from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.data.waveforms import (
+    Carrier,
+    Decay,
+    Sine,
+    Staircase,
+    Triangle,
+    Waveform,
+    signal,
+)
+from bwbayes.errors import InputError
+from bwbayes.results.prediction import Start
+
+__all__ = [
+    "Windows",
+    "findings_of",
+    "generator",
+    "other_record",
+    "sampled_waveform",
+    "start_of",
+    "training_records",
+    "unlike",
+    "windows_of",
+]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of one training record, as slices: to fit, and held out by name."""
+
+    training: tuple[slice, ...]
+    held_out: Mapping[str, slice]
+
+
+def generator(seed: int, purpose: str) -> np.random.Generator:
+    """Return the generator of one purpose of a run: each has a stream of its own."""
+    return np.random.default_rng([seed, *purpose.encode()])
+
+
+def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
+    """Return the waveform of that name, or the one a config describes."""
+    if isinstance(wanted, str):
+        return signal(wanted)
+    carrier: Carrier
+    if wanted.shape == "steps":
+        carrier = Staircase(tuple(wanted.levels or ()), wanted.dwell or 0.0)
+    else:
+        shape = Sine if wanted.shape == "sine" else Triangle
+        carrier = shape(wanted.amplitude or 0.0, wanted.frequency or 0.0)
+    return Waveform(
+        carrier,
+        wanted.duration,
+        wanted.start,
+        Decay(wanted.decay_from, wanted.decay),
+    )
+
+
+def training_records(
+    config: Config, folder: Path, given: Mapping[str, Record]
+) -> tuple[dict[str, Record], VirtualTestStand | None]:
+    """Return the training records by name, and the stand that made some, if one did.
+
+    ``given`` are those that are in memory, by name.
+    """
+    read: dict[str, Record] = {}
+    commands: dict[str, Waveform] = {}
+    for name, source in config.records.items():
+        if source.file is not None:
+            read[name] = _read(source, folder, given.get(name))
+        else:
+            assert source.signal is not None
+            commands[name] = sampled_waveform(source.signal)
+            read[name] = planned(config, commands[name], source.stop)
+    stand = stand_of(config, list(read.values())) if commands else None
+    for name, waveform in commands.items():
+        assert stand is not None
+        purpose = "record" if name == ALONE else f"record {name}"
+        made = stand.run(waveform, generator(config.seed, purpose))
+        read[name] = _named(made, config.records[name].signal)
+    records = {name: _cut(config.records[name], record) for name, record in read.items()}
+    for name, record in records.items():
+        require_readable(record, place_of(name))
+    return records, stand
+
+
+def _cut(source: RecordConfig, record: Record) -> Record:
+    """Leave out the readings that a config leaves out."""
+    if source.exclude is not None:
+        record = record.exclude([(window[0], window[1]) for window in source.exclude])
+    if source.start is not None or source.stop is not None:
+        end = record.start + record.duration if source.stop is None else source.stop
+        record = record.upto(end, source.start)
+    if source.decimate > 1:
+        record = record.decimate(source.decimate)
+    return record
+
+
+def _read(source: RecordConfig | ValidationConfig, folder: Path, given: Record | None) -> Record:
+    """Return the record that is given, or else read the source's file."""
+    if given is not None:
+        return replace(given, voltage_is=source.voltage_is or given.voltage_is)
+    assert source.file is not None
+    return read_record(
+        folder / source.file,
+        voltage_is=source.voltage_is,
+        columns=source.columns,
+        units=source.units,
+    )
+
+
+def other_record(
+    config: Config,
+    name: str,
+    folder: Path,
+    training: Mapping[str, Record],
+    given: Record | None,
+) -> Record:
+    """Return the record of a validation: from memory, a file, or the virtual stand."""
+    source = config.validation[name]
+    if source.file is not None:
+        record = _read(source, folder, given)
+        if given is not None:
+            require_readable(record, f"validation.{name}")
+    else:
+        assert source.signal is not None
+        waveform = sampled_waveform(source.signal)
+        stand = stand_of(config, list(training.values()))
+        record = _named(
+            stand.run(waveform, generator(config.seed, f"record {name}")), source.signal
+        )
+        require_readable(record, f"validation.{name}")
+    # Said now: it would be a pity after the sampling.
+    try:
+        start_of(config, name).window(record)
+    except InputError as error:
+        raise InputError(f"validation.{name}.lead_in: {error}") from None
+    if source.window is not None:
+        try:
+            record.window_slice(source.window[0], source.window[1])
+        except InputError as error:
+            raise InputError(f"validation.{name}.{error}") from None
+    return record
+
+
+def start_of(config: Config, name: str) -> Start:
+    """Return what a config knows of another record's start; its hold is its own, unless given."""
+    source, hold = config.validation[name], config.model.hold
+    return Start(
+        source.from_rest,
+        source.own_offset,
+        source.lead_in,
+        source.lead_in_from,
+        None if hold == "auto" else hold,
+    )
+
+
+def _named(record: Record, wanted: str | SignalConfig | None) -> Record:
+    name = wanted.shape if isinstance(wanted, SignalConfig) else wanted
+    return replace(record, origin=f"{record.origin}, {name} signal")
+
+
+def windows_of(config: Config, name: str, record: Record) -> Windows:
+    """Return the windows of a training record.
+
+    Raises
+    ------
+    InputError
+        A window outside of the record, windows that overlap, or one without a reading.
+    """
+    source, place = config.records[name], place_of(name)
+    held_out = {
+        n: v.window
+        for n, v in config.validation.items()
+        if v.window and not v.another and v.of in (name, None)
+    }
+    if source.train is None:
+        first, last = np.flatnonzero(record.has_reading)[[0, -1]]
+        train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
+    else:
+        train = [(window[0], window[1]) for window in source.train]
+    try:
+        split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
+    except InputError as error:
+        raise InputError(str(error).replace("record.train", f"{place}.train")) from None
+    parts = [(f"{place}.train", window) for window in split.training]
+    parts += [(f"validation.{n}.window", w) for n, w in zip(held_out, split.held_out, strict=True)]
+    for where, part in parts:
+        if not record.has_reading[part].any():
+            begin, end = record.time[part][[0, -1]]
+            raise InputError(
+                f"{where}: no readings from {begin:g} to {end:g} s; choose another window, or see "
+                f"start, exclude and decimate in [{place}]"
+            )
+    return Windows(split.training, dict(zip(held_out, split.held_out, strict=True)))
+
+
+def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
+    """Return what is wrong with a record, but for places that no window looks at."""
+    # Borders that differ by less than half a sample are the same.
+    times = [
+        record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
+    ]
+    return tuple(
+        one
+        for one in inspect(record)
+        if any(one.start < stop and start < one.stop for start, stop in times)
+    )
+
+
+def unlike(config: Config, name: str, record: Record) -> Iterator[str]:
+    """Yield what is wrong with the record of a file that is predicted."""
+    if config.validation[name].file is None:
+        return
+    for one in inspect(record):
+        if one.kind == "switch-on transient":
+            remedy = f"lead_in_from = {one.stop:.3g} under [validation.{name}]"
+            yield f"{name}: {one.kind}: {one.text}; {remedy}"
+        elif one.kind not in ("one amplitude", "few readings"):
+            yield f"{name}: {one}"

@@ -1,0 +1,74 @@
+"""How numbers and symbols are written: as exactly as they are known, in plain characters."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from typing import NamedTuple
+
+from markupsafe import Markup
+
+from bwbayes.inference.parameters import Parameter
+from bwbayes.results.scores import Scores
+
+__all__ = ["Symbol", "covered", "digits", "symbol"]
+
+
+class Symbol(NamedTuple):
+    """A symbol in plain characters: its base, and what stands below."""
+
+    base: str
+    below: str
+
+    @property
+    def html(self) -> Markup:
+        """The symbol with its subscript."""
+        below = Markup("<sub>{}</sub>").format(self.below) if self.below else Markup("")
+        return Markup("<i>{}</i>").format(self.base) + below
+
+
+def symbol(parameter: Parameter) -> Symbol:
+    r"""Return a parameter's LaTeX label in plain characters, or its name if that cannot be done.
+
+    Greek letters, one subscript and ``\mathrm`` are understood.
+    """
+    text = re.sub(r"\\mathrm\{(\w*)\}", r"\1", parameter.label)
+    text = re.sub(r"\\([A-Za-z]+)", _greek, text)
+    found = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
+    if found is None:
+        return Symbol(parameter.name, "")
+    return Symbol(found[1], found[2] or found[3] or "")
+
+
+def _greek(found: re.Match[str]) -> str:
+    """Return the Greek letter that a LaTeX command stands for, or the command."""
+    size = "CAPITAL" if found[1][0].isupper() else "SMALL"
+    try:
+        return unicodedata.lookup(f"GREEK {size} LETTER {found[1].upper()}")
+    except KeyError:
+        return found[0]
+
+
+def digits(value: float, sd: float) -> str:
+    """Write a value as exactly as its standard deviation with two digits is written.
+
+    ``digits(0.69712, 0.0061234)`` is ``0.6971``. Far from one, with a power of ten.
+    """
+    if not (math.isfinite(value) and math.isfinite(sd) and sd > 0):
+        return f"{value:.6g}"
+    place = int(f"{sd:.1e}".partition("e")[2]) - 1
+    if place < -7 or place > 3:
+        leading = int(f"{value:e}".partition("e")[2]) if value else place
+        return f"{value:.{max(leading - place, 0)}e}"
+    # Adding zero takes the sign from a negative zero.
+    return f"{round(value, -place) + 0.0:.{max(-place, 0)}f}"
+
+
+def covered(scores: Scores, kind: str, level: int) -> str:
+    """Write how much a band covers, with its standard error; nothing if that is not known."""
+    share, error = scores.coverage[kind], scores.coverage_error[kind]
+    if share is None:
+        return ""
+    text = f"{100 * share[level]:.1f}"
+    return f"{text} %" if error is None else f"{text} ± {100 * error[level]:.1f} %"

@@ -1,0 +1,209 @@
+"""What a record taught: how far each parameter's posterior is narrower than its prior, and why.
+
+The contraction 1 − (posterior sd / prior sd)² is near one where the record decided and near zero
+where it told nothing. Scaling the power of the prior, or of the likelihood, by a little shows which
+of them a posterior hangs on: one that moves with the prior and not with the likelihood is what was
+put in. Together with the combinations of parameters that stayed widest this is what a user should
+know before quoting a single parameter.
+"""
+
+# mypy: allow-untyped-calls
+# arviz_stats says that it has types, but its functions have none.
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import arviz_base
+import numpy as np
+from arviz_stats import psense  # type: ignore[attr-defined]  # not in an __all__
+from scipy import linalg
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.parameters import JointPrior
+
+__all__ = ["Combination", "Learned", "Taught", "learned", "numbers"]
+
+# Draws of the prior, and of the posterior that the sensitivities are worked out from.
+PRIOR_DRAWS, DRAWS = 4000, 4000
+
+# Sensitivities above this are not small (Kallioinen and others, section 4).
+SENSITIVE = 0.05
+
+# Combinations that are named: so many, where this part of the prior's sd or more is left.
+COMBINATIONS, LEFT = 3, 1 / 3
+
+# Members of a combination have this part of its largest weight or more.
+MEMBER = 0.3
+
+# Normal scores beyond this have no probability that a float can hold.
+FARTHEST = 37.0
+
+
+@dataclass(frozen=True)
+class Taught:
+    """What is known of one parameter after a record.
+
+    ``contraction`` as above, in the normal scores of its prior, so that it is the same for a
+    parameter and its logarithm; below zero where the posterior is wider than the prior.
+    ``prior`` and ``likelihood`` are the power-scaling sensitivities.
+    """
+
+    contraction: float
+    prior: float
+    likelihood: float
+
+    @property
+    def prior_decides(self) -> bool:
+        """Whether it moves with the prior, and not with the likelihood."""
+        return self.prior >= SENSITIVE > self.likelihood
+
+    @property
+    def conflict(self) -> bool:
+        """Whether it moves with both: prior and readings pull, maybe apart."""
+        return self.prior >= SENSITIVE and self.likelihood >= SENSITIVE
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Parameters that were determined together worst, in words, and the prior's sd left of it."""
+
+    text: str
+    left: float
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a record taught: by parameter, the worst combinations, and what to say of it."""
+
+    parameters: Mapping[str, Taught]
+    combinations: tuple[Combination, ...]
+    remarks: tuple[str, ...]
+
+
+def learned(
+    prior: JointPrior,
+    draws: FloatArray,
+    log_density: FloatArray,
+    generator: np.random.Generator,
+) -> Learned:
+    """Hold the posterior against the prior.
+
+    Parameters
+    ----------
+    prior
+        The joint prior.
+    draws
+        (steps, ensembles, walkers, free), parameters in their own units.
+    log_density
+        (steps, ensembles, walkers), nats, as the chain has it: in its coordinates.
+    generator
+        Draws from the prior.
+
+    Notes
+    -----
+    N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
+    likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
+    """
+    every = max(log_density.size // DRAWS, 1)
+    thin = draws.reshape(-1, draws.shape[-1])[::every]
+    density = log_density.ravel()[::every] - prior.constrain(prior.unconstrain(thin))[1]
+    after = _scores(prior, thin)
+    before = _scores(prior, prior.draw(generator, PRIOR_DRAWS))
+    contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
+    by_prior, by_likelihood = _sensitivities(prior, thin, density)
+    parameters = {
+        name: Taught(float(contraction[i]), by_prior[name], by_likelihood[name])
+        for i, name in enumerate(prior.free_names)
+    }
+    combinations = tuple(_combinations(prior.free_names, before, after))
+    return Learned(parameters, combinations, tuple(_remarks(parameters, combinations)))
+
+
+def numbers(taught: Learned) -> dict[str, object]:
+    """Return it as ``identifiability`` in summary.json."""
+    return {
+        "parameters": {
+            name: {
+                "contraction": one.contraction,
+                "prior_sensitivity": one.prior,
+                "likelihood_sensitivity": one.likelihood,
+                "prior_decides": one.prior_decides,
+            }
+            for name, one in taught.parameters.items()
+        },
+        "combinations": [asdict(one) for one in taught.combinations],
+        "remarks": list(taught.remarks),
+    }
+
+
+def _scores(prior: JointPrior, free: FloatArray) -> FloatArray:
+    """Return normal scores of draws (draws, free) under each parameter's own prior."""
+    columns = []
+    for parameter, column in zip(prior.free, free.T, strict=True):
+        assert parameter.prior is not None
+        low, high = (np.asarray(end) for end in parameter.support)
+        columns.append(parameter.prior.to_normal(column, low, high))
+    return np.clip(np.stack(columns, axis=1), -FARTHEST, FARTHEST)
+
+
+def _sensitivities(
+    prior: JointPrior, draws: FloatArray, log_likelihood: FloatArray
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return power-scaling sensitivities to prior and likelihood, by parameter.
+
+    From draws (draws, free), taken as one chain: weights depend on no order.
+    """
+    tree = arviz_base.from_dict(
+        {
+            "posterior": {name: draws[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},
+            "log_prior": {"joint": prior.log_density(draws)[np.newaxis]},
+            "log_likelihood": {"joint": log_likelihood[np.newaxis]},
+        }
+    )
+    taught = []
+    for group in ("prior", "likelihood"):
+        said = psense(tree, group=group)
+        taught.append({name: float(said[name]) for name in prior.free_names})
+    return taught[0], taught[1]
+
+
+def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -> list[Combination]:
+    """Return the directions that kept most of their prior sd, in words.
+
+    In the prior's own normal scores, whose spread the constraints may have changed: the
+    eigenvectors of the posterior's covariance relative to the prior's.
+    """
+    prior, posterior = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (before, after))
+    variances, directions = linalg.eigh(posterior, prior)
+    said: list[Combination] = []
+    for i in range(len(variances) - 1, -1, -1):
+        left = float(np.sqrt(max(variances[i], 0.0)))
+        if left < LEFT or len(said) == COMBINATIONS:
+            break
+        # How the scores move together along it, and not what picks it out.
+        move = posterior @ directions[:, i]
+        said.append(Combination(_worded(move, names), left))
+    return said
+
+
+def _worded(move: FloatArray, names: Sequence[str]) -> str:
+    move = move / move[np.argmax(np.abs(move))]
+    order = np.argsort(-np.abs(move), kind="stable")
+    first, *others = [i for i in order if abs(move[i]) > MEMBER]
+    parts = [f"{'with' if move[i] > 0 else 'against'} {names[i]}" for i in others]
+    return " ".join([names[first], *parts])
+
+
+def _remarks(parameters: Mapping[str, Taught], combinations: Sequence[Combination]) -> list[str]:
+    said = [
+        f"{name}: the prior decides (power-scaling sensitivity {one.prior:.2f} to the prior, "
+        f"{one.likelihood:.2f} to the readings; contraction {one.contraction:.2f})"
+        for name, one in parameters.items()
+        if one.prior_decides
+    ]
+    if combinations:
+        worst = combinations[0]
+        said.append(f"determined worst: {worst.text}, with {worst.left:.0%} of the prior's sd left")
+    return said

@@ -1,0 +1,168 @@
+"""Does the record look like one that the model would make? Posterior predictive checks.
+
+Each of some posterior draws makes the readings anew, with its own noise. Whatever a picture shows
+of the real readings (how far they range, the area of their loops, how their residuals hang together
+from one to the next and over which times, where they lie in the band) is worked out from the made
+ones too. A number that hardly any of them reaches says what the model, noise included, does not do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import periodogram
+from scipy.special import ndtr
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.posterior import Posterior
+
+__all__ = ["STATISTICS", "Replicated", "Statistic", "numbers", "replicated"]
+
+# Replicated records; p-values come in steps of one over them.
+RECORDS = 200
+
+# A p-value below this, two-sided, is odd.
+ODD = 0.01
+
+# The parts of the spectrum, as parts of the highest frequency.
+SLOW, MIDDLE = 0.01, 0.1
+
+# What is looked at: title and unit for people.
+STATISTICS: Mapping[str, tuple[str, str]] = {
+    "range_um": ("Range of the readings", "um"),
+    "loop_area_um_V": ("Area of the loops", "um V"),
+    "residual_sd_um": ("Sd of the residuals", "um"),
+    "residual_lag_1": ("Correlation of neighbouring residuals", "-"),
+    "residual_slow": (f"Power of the residuals below {SLOW:g} of the highest frequency", "-"),
+    "residual_fast": (f"Power of the residuals above {MIDDLE:g} of the highest frequency", "-"),
+    "pit_mean": ("Mean place in the band", "-"),
+    "pit_outside": ("Readings outside of the 90 % band", "-"),
+}
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A number of the real readings among those of the replicated ones.
+
+    ``lower`` and ``upper`` hold 95 % of the replicated ones; ``p`` is the part of them that is
+    larger, equal ones counted half.
+    """
+
+    observed: float
+    lower: float
+    upper: float
+    p: float
+
+    @property
+    def odd(self) -> bool:
+        """Whether hardly any replicated record has as much, or as little."""
+        return min(self.p, 1 - self.p) < ODD / 2
+
+
+@dataclass(frozen=True)
+class Replicated:
+    """The statistics by name, and how many records were made."""
+
+    statistics: Mapping[str, Statistic]
+    records: int
+
+
+def replicated(
+    posterior: Posterior,
+    draws: FloatArray,
+    generator: np.random.Generator,
+    record: str | None = None,
+) -> Replicated:
+    """Check the training readings of a record against replicated ones.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units; ``RECORDS`` of them are used.
+    generator
+        Chooses draws, and draws their noise.
+    record
+        The record's name; may be left out of one alone.
+    """
+    one = posterior.only if record is None else posterior.alone(record).only
+    count = min(RECORDS, len(draws))
+    chosen = draws[generator.choice(len(draws), count, replace=False)]
+    theta = posterior.prior.theta(chosen)
+    rows = one.readings.rows
+    simulated = posterior.simulate(theta, rows, record)
+    noise = one.table.noise(posterior.table.of(theta, one.name))
+    middle = np.mean(simulated, axis=0)
+    variance = np.sum(np.square(one.noise.marginal_sd(noise)), axis=0)
+    sd = np.sqrt(np.mean(variance) + np.var(simulated, axis=0))
+    voltage, samples = one.voltage[rows], int(rows[-1]) + 1
+    # Where readings are missing they are missing in all.
+    neighbours = np.flatnonzero(np.diff(rows) == one.readings.stride)
+
+    def looked_at(readings: FloatArray) -> list[float]:
+        return _statistics(readings, voltage, middle, sd, neighbours)
+
+    made = []
+    for mean, own in zip(simulated, noise, strict=True):
+        discrepancy, sensor = one.noise.draw(own[np.newaxis], samples, generator)
+        made.append(looked_at(mean + (discrepancy + sensor)[rows]))
+    every, observed = np.array(made), np.array(looked_at(one.readings.values))
+    lower, upper = np.quantile(every, [0.025, 0.975], axis=0)
+    p = np.mean(every > observed, axis=0) + 0.5 * np.mean(every == observed, axis=0)
+    values = np.stack([observed, lower, upper, p], axis=1).tolist()
+    return Replicated(
+        {name: Statistic(*row) for name, row in zip(STATISTICS, values, strict=True)}, count
+    )
+
+
+def numbers(checked: Replicated) -> dict[str, object]:
+    """Return it as ``replicated`` in summary.json."""
+    return {
+        "records": checked.records,
+        "statistics": {
+            name: {
+                "observed": one.observed,
+                "lower_95": one.lower,
+                "upper_95": one.upper,
+                "p": one.p,
+                "odd": one.odd,
+            }
+            for name, one in checked.statistics.items()
+        },
+    }
+
+
+def _statistics(
+    readings: FloatArray,
+    voltage: FloatArray,
+    middle: FloatArray,
+    sd: FloatArray,
+    neighbours: IntArray,
+) -> list[float]:
+    """Work out all ``STATISTICS`` of readings (readings,)."""
+    residual = readings - middle
+    centred = residual - np.mean(residual)
+    at = neighbours
+    total = float(np.sum(centred**2))
+    lag = float(np.sum(centred[at] * centred[at + 1])) / total if total > 0 else 0.0
+    frequency, power = periodogram(residual, detrend="constant")
+    whole = float(np.sum(power))
+    place = frequency / frequency[-1]
+    slow = float(np.sum(power[place <= SLOW])) / whole if whole > 0 else 0.0
+    fast = float(np.sum(power[place > MIDDLE])) / whole if whole > 0 else 0.0
+    pit = ndtr(residual / sd)
+    # ∮ y du, by trapezes; turns of either direction count with their sign.
+    area = float(np.abs(np.sum(0.5 * (readings[1:] + readings[:-1]) * np.diff(voltage))))
+    return [
+        float(np.ptp(readings)),
+        area,
+        float(np.std(residual)),
+        lag,
+        slow,
+        fast,
+        float(np.mean(pit)),
+        float(np.mean(np.abs(pit - 0.5) > 0.45)),
+    ]

@@ -1,0 +1,191 @@
+"""``bwbayes compare`` and ``fit.compare``: the same numbers, one page, and refusals in a line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import warnings
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bwbayes as bw
+from bwbayes.app.commands import cli
+from bwbayes.app.fit.fitted import Fit
+from bwbayes.data import Record
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.model.boucwen import hysteresis
+
+CONFIG = """\
+seed = 3
+[record]
+file = "record.csv"
+from_rest = true
+train = [[0.0, 4.0]]
+[model]
+dynamics = "none"
+noise = "white"
+[parameters]
+gamma = { fixed = 0.0172 }
+[sampling]
+ess = 200
+[validation.later]
+window = [4.0, 6.0]
+"""
+
+
+def measured(alpha: float = 0.36) -> Record:
+    """Return a record of 300 readings of a Bouc-Wen actuator, from rest."""
+    time = np.arange(300) / 50
+    voltage = 100 * np.sin(2 * np.pi * 0.8 * time) * (1 - 0.1 * time)
+    displacement = 0.7 * voltage - hysteresis(voltage, alpha=alpha, beta=0.0272, gamma=0.0172)[0]
+    displacement = displacement + 0.3 * np.random.default_rng(1).normal(size=time.size)
+    return Record.from_arrays(voltage, displacement, interval=0.02)
+
+
+def fitted(record: Record, hysteresis: str, **keys: Any) -> Fit:
+    keys = {"train": (0, 4), "validation": {"later": (4, 6)}} | keys
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # bands of a wrong model do not hold
+        return bw.fit(
+            record,
+            hysteresis=hysteresis,
+            name=hysteresis,
+            dynamics="none",
+            noise="white",
+            from_rest=True,
+            ess=200,
+            progress=False,
+            workers=1,
+            **keys,
+        )
+
+
+@pytest.fixture(scope="module")
+def fits() -> tuple[Fit, Fit]:
+    record = measured()
+    return fitted(record, "bouc-wen"), fitted(record, "linear")
+
+
+def run(arguments: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr("sys.argv", ["bwbayes", "compare", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> None:
+    one, other = fits
+    made = other.compare(one, future=False, workers=1)
+    assert made.recommended == "bouc-wen"
+    assert made.alike == ()
+    assert "bouc-wen is recommended" in repr(made)
+    frame = made.to_pandas()
+    assert list(frame.index) == ["bouc-wen", "linear"]
+    assert frame.loc["bouc-wen", "held_out_nrmse"] == pytest.approx(
+        one.bands["later"].scores.nrmse  # type: ignore[union-attr]
+    )
+    folder = made.save(tmp_path / "out")
+    said = json.loads((folder / "comparison.json").read_text())
+    assert said["recommended"] == "bouc-wen"
+    assert said["models"]["linear"]["difference"]["held_out"]["value"] < 0
+    with (folder / "comparison.csv").open(encoding="utf-8") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == ["bouc-wen", "linear"]
+    page = (folder / "comparison.html").read_text(encoding="utf-8")
+    for line in (*made.lines, *made.against):
+        assert escape(line) in page
+    evidence = said["models"]["bouc-wen"]["log_evidence"]
+    assert f"{evidence:.2f}" in page
+
+
+def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
+    fit, linear = fits
+    time = np.arange(150) / 50
+    wave = np.sin(2 * np.pi * time)
+    signals = {"steady": 100 * wave, "fading": 100 * wave * (1 - 0.3 * time), "far": 300 * wave}
+    best, second, last = fit.design("beta", candidates=signals)
+    assert (best.name, second.name) == ("fading", "steady")
+    assert last.refused.startswith("goes from")
+    assert linear.design(50 * wave, voltages=(-100, 100))[0].left < 1
+    with pytest.raises(InputError, match="is not a free parameter"):
+        linear.design("beta")
+
+
+def test_other_records_windows_and_held_out_parts_are_refused(
+    fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    one, _ = fits
+    with pytest.raises(InputError, match="different records, or in different units"):
+        one.compare(fitted(measured(0.35), "linear"))
+    record = one.problem.record
+    other = fitted(record, "linear", train=(0, 3))
+    with pytest.raises(InputError, match="fitted to different windows"):
+        one.compare(other)
+    other = fitted(record, "linear", validation={})
+    with pytest.raises(InputError, match=r"differ in what is held out \(later\)"):
+        one.compare(other)
+    # As a command: one line, and status 2.
+    paths = [str(one.save(tmp_path / "a")), str(other.save(tmp_path / "b"))]
+    assert run(paths, monkeypatch) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["a"], "give two runs or more"),
+        (["a", "b", "--models", "linear"], "goes with one CONFIG"),
+        (["a", "a"], "the same run is there twice"),
+        (["a", "b"], "a: no run here"),
+        (["{config}", "--models", "liner"], "did you mean linear"),
+        (["{config}", "--models", "linear; linear"], "is there twice"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line_and_status_2(
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
+    assert run([one.format(config="c.toml") for one in arguments], monkeypatch) == 2
+    printed = capsys.readouterr().err
+    assert said in printed
+    assert printed.count("\n") == 1
+
+
+def test_a_config_is_run_with_each_model_and_gone_on_with(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
+    record = measured()
+    assert record.displacement is not None
+    rows = np.column_stack([record.time, record.voltage, record.displacement])
+    np.savetxt(
+        "record.csv", rows, delimiter=",", header="time_s,voltage_V,displacement_um", comments=""
+    )
+    models = ["--models", "linear; bouc-wen", "--no-future", "--workers", "1"]
+    arguments = ["c.toml", *models, "--out", "out"]
+    assert run(arguments, monkeypatch) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"bouc-wen is recommended", shown)
+    # gamma is stated, and the linear model has none.
+    assert (tmp_path / "out/linear/summary.json").is_file()
+    before = (tmp_path / "out/bouc-wen/chain.h5").read_bytes()
+    assert run(arguments, monkeypatch) == 2
+    assert "comparison.json: exists" in capsys.readouterr().err
+    (tmp_path / "out/comparison.json").unlink()
+    assert run(arguments, monkeypatch) == 0
+    assert before == (tmp_path / "out/bouc-wen/chain.h5").read_bytes()
+    (tmp_path / "c.toml").write_text(CONFIG.replace("seed = 3", "seed = 4"), encoding="utf-8")
+    (tmp_path / "out/comparison.json").unlink()
+    assert run(arguments, monkeypatch) == 2
+    assert "holds another run" in capsys.readouterr().err

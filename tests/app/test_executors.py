@@ -1,0 +1,289 @@
+"""Executors, here and on a cluster: the same bits, whoever dies on the way."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+
+from bwbayes.app.jobs import calibrate
+from bwbayes.app.running import cluster as cluster_module
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import go_on
+from bwbayes.app.running.workers import Processes, executor, side_by_side
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.ensemble import advance
+from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, sample
+from tests.app import small
+from tests.app.test_calibrate import assert_same_end as assert_same_calibration
+from tests.app.test_calibrate import begun as begun_calibration
+from tests.inference.problems import short_posterior
+
+distributed = pytest.importorskip("distributed", reason="bwbayes[dask] is not installed")
+
+# dask's own processes and sockets end when the interpreter gets to it.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+PLAN = SamplingPlan(
+    ess=50, walkers=24, block=10, least_pilot_steps=20, most_pilot_steps=20, most_steps=40
+)
+PATIENCE = 120.0
+
+
+def posterior() -> Any:
+    return short_posterior(samples=40)
+
+
+def chain() -> Chain:
+    """Return a chain before its first step."""
+    one = posterior()
+    point = pointfit.fit(one, np.random.default_rng(1))
+    return first_chain(one, point, PLAN, np.random.default_rng(2))
+
+
+def sampled(pool: Executor, watcher: Callable[..., None] = lambda *_: None) -> Any:
+    """Return all draws of the small sampling."""
+    one, begun = posterior(), chain()
+    sample(one, PLAN, begun, pool, watcher)
+    return draws(one, begun)
+
+
+@pytest.fixture(scope="module")
+def here() -> Any:
+    """Return the draws as one thread of this process makes them."""
+    with executor(1) as pool:
+        return sampled(pool)
+
+
+@contextmanager
+def scheduler(workers: int) -> Iterator[tuple[str, Any, list[Any]]]:
+    """Run a real scheduler and so many workers, each a process; give its address and them all."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def started(*arguments: str) -> Any:
+        return subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    host, port = address.split(":")
+    main = started("scheduler", "--host", host, "--port", port, "--no-dashboard")
+    each = [
+        started("worker", f"tcp://{address}", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        for _ in range(workers)
+    ]
+    try:
+        yield address, main, each
+    finally:
+        for process in (*each, main):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[tuple[str, Any, list[Any]]]:
+    with scheduler(2) as running:
+        yield running
+
+
+def test_a_cluster_gives_the_same_bits_and_gets_the_posterior_once(
+    here: Any, cluster: tuple[str, Any, list[Any]]
+) -> None:
+    with executor(how=f"dask://{cluster[0]}") as pool:
+        pool.client.wait_for_workers(2, timeout=PATIENCE)  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(here, sampled(pool))
+        assert 1 == len(pool.sent)  # type: ignore[attr-defined]
+        assert 4 == side_by_side(pool, None, 10)
+        assert 3 == side_by_side(pool, None, 3)
+
+
+def test_a_client_that_somebody_made_is_an_executor_and_stays_open(
+    cluster: tuple[str, Any, list[Any]],
+) -> None:
+    client = distributed.Client(f"tcp://{cluster[0]}")
+    try:
+        with executor(how=client) as pool:
+            assert [4] == [pool.submit(pow, 2, 2).result()]
+            error = pool.submit(int, "x").exception()
+            assert isinstance(error, ValueError)
+        assert "running" == client.status
+    finally:
+        client.close()
+
+
+def test_a_worker_killed_within_a_block_costs_no_bit(
+    here: Any, cluster: tuple[str, Any, list[Any]]
+) -> None:
+    """After the first block; the scheduler gives what it was at to the other."""
+    _, _, workers = cluster
+    killed = []
+
+    def watcher(*_: object) -> None:
+        if not killed:
+            killed.append(workers[0].pid)
+            workers[0].kill()
+
+    with executor(how=f"dask://{cluster[0]}") as pool:
+        np.testing.assert_array_equal(here, sampled(pool, watcher))
+    assert killed
+
+
+def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
+    """One line says so, the blocks that are there stay, and the end is the same to the bit."""
+    one, begun = posterior(), chain()
+    with scheduler(1) as (address, main, _):
+
+        def watcher(*_: object) -> None:
+            if begun.blocks("pilot"):
+                main.kill()
+
+        with (
+            executor(how=f"dask://{address}") as pool,
+            pytest.raises(BrokenExecutor, match="the scheduler is gone"),
+        ):
+            sample(one, PLAN, begun, pool, watcher)
+    assert 0 < begun.blocks("pilot")
+    assert not begun.blocks("sampling")
+    with executor(1) as pool:
+        sample(one, PLAN, begun, pool)
+    np.testing.assert_array_equal(here, draws(one, begun))
+
+
+@pytest.mark.slow
+def test_with_the_scheduler_lost_a_run_is_resumed_here(tmp_path: Path) -> None:
+    expected = go_on(small.begun(tmp_path / "here"), small.quiet(), workers=1, files=False)
+    folder = small.begun(tmp_path / "there")
+    with scheduler(1) as (address, main, _):
+        threading.Thread(target=_kill_at_first_block, args=(folder, main), daemon=True).start()
+        with pytest.raises(BrokenExecutor, match="the scheduler is gone"):
+            go_on(folder, small.quiet(), how=f"dask://{address}", files=False)
+    resumed = go_on(RunFolder.open(folder.path), small.quiet(), workers=1, files=False)
+    np.testing.assert_array_equal(expected.result.draws, resumed.result.draws)
+
+
+def _kill_at_first_block(folder: RunFolder, process: Any) -> None:
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end and not folder.chain.is_file():
+        time.sleep(0.01)
+    size = folder.chain.stat().st_size
+    while time.monotonic() < end and folder.chain.stat().st_size == size:
+        time.sleep(0.01)
+    process.kill()
+
+
+@pytest.mark.slow
+def test_a_calibration_on_a_cluster_is_the_same(tmp_path: Path) -> None:
+    for how in ("threads", "dask"):
+        folder = begun_calibration(tmp_path / how)
+        calibrate.carry_on(folder, small.quiet(), workers=2, how=how)
+    assert_same_calibration(tmp_path / "threads", tmp_path / "dask")
+
+
+def test_nobody_there_and_words_that_are_none_are_said_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cluster_module, "PATIENCE", 0.2)
+    with pytest.raises(InputError, match="no scheduler there; start one with `dask scheduler`"):
+        executor(how="dask://127.0.0.1:9").__enter__()
+    with pytest.raises(InputError, match="'ray' is unknown; write one of local, threads"):
+        executor(how="ray").__enter__()
+    with pytest.raises(InputError, match="object has no submit"):
+        executor(how=object()).__enter__()  # type: ignore[arg-type]
+
+
+class Foreign(Executor):
+    """An executor of somebody else, that sends what pickle sends."""
+
+    def __init__(self) -> None:
+        self.pool = ThreadPoolExecutor(2)
+        self.sent = 0
+
+    def submit(self, fn: Any, /, *args: Any, **_: Any) -> Future[Any]:
+        """Send a call."""
+        self.sent += 1
+        return self.pool.submit(pickle.loads(pickle.dumps(fn)), *pickle.loads(pickle.dumps(args)))
+
+
+def test_any_executor_with_a_submit_gives_the_same_bits(here: Any) -> None:
+    foreign = Foreign()
+    with executor(how=foreign) as pool:
+        np.testing.assert_array_equal(here, sampled(pool))
+    assert foreign.sent > 8
+
+
+def die_once(mark: Path) -> int:
+    """End this process, but not a second time."""
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_is_replaced_and_its_call_made_again(tmp_path: Path) -> None:
+    pool = Processes(1)
+    try:
+        (before,) = pool.processes
+        after = pool.submit(die_once, tmp_path / "mark").result(PATIENCE)
+        assert [after] == pool.processes
+        assert before != after
+    finally:
+        pool.shutdown()
+
+
+@pytest.mark.slow
+def test_one_call_that_ends_its_processes_does_not_end_all() -> None:
+    pool = Processes(1)
+    try:
+        with pytest.raises(BrokenProcessPool):
+            pool.submit(die).result(PATIENCE)
+        assert 4 == pool.submit(pow, 2, 2).result(PATIENCE)
+    finally:
+        pool.shutdown()
+
+
+def test_whoever_is_interrupted_does_not_wait_for_processes() -> None:
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        _interrupted()
+    assert time.monotonic() - begun < PATIENCE / 2
+
+
+def _interrupted() -> None:
+    with executor(1, how="processes") as pool:
+        pool.submit(time.sleep, PATIENCE)
+        raise KeyboardInterrupt
+
+
+def test_a_block_is_the_unit_that_is_sent() -> None:
+    """What an executor is given besides the posterior is a block's state, some kilobytes."""
+    state = chain().ends[0]
+    assert len(cloudpickle.dumps((advance, state))) < 20_000

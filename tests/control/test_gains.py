@@ -1,0 +1,140 @@
+"""Margins are those of textbooks and of closed-loop poles; a design keeps them with every draw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.control.gains import Gains, Robustness, design, margins
+from bwbayes.control.sampled import SampledModel
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.operators.bouc_wen import BoucWen
+from tests.control import cases
+
+every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
+
+
+def models(name: str, count: int = 20, interval: float = 1e-3) -> SampledModel:
+    actuator = cases.actuator(name, "zero", interval)
+    return SampledModel.of(actuator, cases.theta(actuator, count, name))
+
+
+def without_hysteresis(slope: float) -> SampledModel:
+    """Return a gain behind a hold."""
+    actuator = Actuator("none", "zero", 1e-3, BoucWen())
+    values = {"d": slope, "alpha": 1e-12 * slope, "beta": 1.0, "exponent": 1.0}
+    return SampledModel.of(
+        actuator, np.array([[values.get(one, 0.0) for one in actuator.parameters]])
+    )
+
+
+def scaled(gains: Gains, factor: float) -> Gains:
+    first, second, third = (factor * one for one in gains.steps)
+    return replace(gains, steps=(first, second, third))
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    speed=st.floats(0.01, 0.4),
+    slope=st.floats(0.1, 10.0),
+    delay=st.integers(0, 4),
+)
+def test_margins_of_an_integrator_are_the_closed_form(
+    speed: float, slope: float, delay: int
+) -> None:
+    """L = K z^−(1+D) / (1 − 1/z): |L| = K / (2 sin(θ/2)), its lag is π/2 + (D + 1/2) θ."""
+    made = without_hysteresis(slope)
+    found = margins(Gains((speed / slope, 0.0, 0.0), 1e-3), made, cases.SPAN, delay)
+    crossing = 2 * np.arcsin(speed / 2)
+    gain = 2 * np.sin(np.pi / (2 * (2 * delay + 1))) / speed
+    assert found.gain[0] == pytest.approx(gain, rel=0.02)
+    assert found.phase[0] == pytest.approx(90 - np.degrees((delay + 0.5) * crossing), abs=1.0)
+    assert found.crossover[0] == pytest.approx(crossing / (2 * np.pi * 1e-3), rel=0.02)
+    assert bool(gain > 1) == (found.pole[0] < 1)
+
+
+@every_actuator
+def test_at_its_gain_margin_a_loop_has_a_pole_on_the_circle(name: str) -> None:
+    """Frequency response and closed-loop poles are worked out apart, and agree."""
+    draws = models(name)
+    gains = design(draws, draws, cases.SPAN, 1, Robustness())[0]
+    factors = margins(gains, draws, cases.SPAN, 1).gain
+    for row in (0, 7):
+        one = SampledModel.of(draws.actuator, cases.theta(draws.actuator, 20, name)[row : row + 1])
+        inside = margins(scaled(gains, 0.98 * factors[row]), one, cases.SPAN, 1)
+        beyond = margins(scaled(gains, 1.02 * factors[row]), one, cases.SPAN, 1)
+        assert inside.pole[0] < 1 < beyond.pole[0]
+
+
+@every_actuator
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_a_design_keeps_its_margins_and_is_the_fastest(name: str, delay: int) -> None:
+    draws = models(name)
+    wanted = Robustness(2.5, 50.0)
+    gains, found = design(draws, draws, cases.SPAN, delay, wanted)
+    assert found.stable
+    assert (found.gain >= wanted.gain).all()
+    assert (found.phase >= wanted.phase).all()
+    faster = margins(scaled(gains, 1.03), draws, cases.SPAN, delay)
+    kept = (faster.gain >= wanted.gain) & (faster.phase >= wanted.phase) & (faster.circle > 0)
+    assert not kept.all()
+
+
+def test_the_controllers_zeros_are_the_models_poles() -> None:
+    draws = models("bouc-wen, second-order", 1)
+    gains, _ = design(draws, draws, cases.SPAN, 1, Robustness())
+    poles = np.roots(draws.sections.denominator[0, 0])
+    np.testing.assert_allclose(np.roots(gains.steps), poles, atol=1e-12)
+    # As K_p e + K_i ∫ e + K_d e′ in steps: backward differences.
+    first, second, third = gains.steps
+    assert first == pytest.approx(
+        gains.proportional + gains.integral * 1e-3 + gains.derivative / 1e-3
+    )
+    assert second == pytest.approx(-gains.proportional - 2 * gains.derivative / 1e-3)
+    assert third == pytest.approx(gains.derivative / 1e-3)
+
+
+def test_slopes_that_change_from_sample_to_sample_leave_it_stable() -> None:
+    """What the circle criterion promises, tried: increments die out whatever the slopes are."""
+    draws = models("bouc-wen, second-order", 3)
+    gains, found = design(draws, draws, cases.SPAN, 1, Robustness())
+    assert (found.circle > 0).all()
+    generator = np.random.default_rng(3)
+    least, largest = draws.slopes(cases.SPAN)
+    _, first, second = draws.sections.numerator[0, 0]
+    _, back, far = draws.sections.denominator[0, 0]
+    worst = 0.0
+    for _ in range(20):
+        x, w, errors, queue = [1.0, 0.9], [0.0, 0.0], [0.0, 0.0], [0.0]
+        for _ in range(400):
+            errors.append(-x[-1])
+            change = sum(q * e for q, e in zip(gains.steps, errors[:-4:-1], strict=True))
+            queue.append(change)
+            slope = generator.choice([least[0], largest[0]])
+            # Increments of the drive; the displacement's own sum them up.
+            w.append(w[-1] + slope * queue.pop(0))
+            x.append(first * w[-1] + second * w[-2] - back * x[-1] - far * x[-2])
+        worst = max(worst, abs(x[-1]))
+    assert worst < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("gain", "phase"), [(1.0, 60.0), (np.inf, 60.0), (np.nan, 60.0), (2.0, 0.0), (2.0, 90.0)]
+)
+def test_margins_that_no_loop_can_have_are_one_line(gain: float, phase: float) -> None:
+    with pytest.raises(InputError, match=r"^(gain|phase) margin: "):
+        Robustness(gain, phase)
+
+
+def test_a_slope_that_may_vanish_is_refused() -> None:
+    actuator = Actuator("none", "zero")
+    theta = cases.theta(actuator)
+    theta[0, actuator.parameters.index("d")] = 0.4
+    one = SampledModel.of(actuator, theta)
+    with pytest.raises(InputError, match="slopes as low as"):
+        design(one, one, cases.SPAN, 1, Robustness())

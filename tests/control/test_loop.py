@@ -1,0 +1,139 @@
+"""The closed loop: a slow one that begins anew at every sample, and the stand's own amplifier."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.gains import Gains, Robustness, design
+from bwbayes.control.loop import Noise, Plan, Stand, follow
+from bwbayes.control.sampled import SampledModel
+from bwbayes.data.teststand import Amplifier
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.operator import Span
+from tests.control import cases
+
+QUIET = Noise(np.zeros(2), np.zeros(2), np.ones(2))
+
+
+def of(name: str, count: int, copies: int) -> tuple[Actuator, FloatArray, SampledModel]:
+    actuator = cases.actuator(name, "zero")
+    theta = cases.theta(actuator, count, name)
+    return actuator, theta, SampledModel.of(actuator, np.tile(theta, (copies, 1)))
+
+
+def references(samples: int = 121) -> FloatArray:
+    time = 1e-3 * np.arange(samples)
+    return np.stack([40 * np.sin(2 * np.pi * 12 * time), np.where(time < 0.05, 30.0, -20.0)])
+
+
+def slowly(
+    actuator: Actuator, theta: FloatArray, plan: Plan, gains: Gains, stand: Stand
+) -> tuple[FloatArray, FloatArray]:
+    """Return rms and largest error, simulating the whole past at every sample."""
+    controllers, signals, samples = plan.ahead.shape
+    shape = controllers, signals, len(theta)
+    rms, largest = np.empty(shape), np.empty(shape)
+    for c, s, m in np.ndindex(shape):
+        held: list[float] = []
+        missed: list[float] = []
+        answers, errors = [0.0] * stand.delay, [0.0, 0.0]
+        answer = 0.0
+        for t in range(samples - 1):
+            # Held voltages act a sample later, so the present one may be anything.
+            voltage = np.array([0.0, *held, 0.0])
+            x = actuator.displacement(theta[m : m + 1], voltage, from_rest=True)[0, -1]
+            missed.append(x - plan.reference[s, t])
+            reading = stand.sensor.step * np.round(x / stand.sensor.step)
+            errors.append(plan.targets[c, s, t] - reading)
+            if plan.looks[c]:
+                answer += sum(q * e for q, e in zip(gains.steps, errors[:-4:-1], strict=True))
+                later = plan.ahead[c, s, t + stand.delay] if t + stand.delay < samples else 0.0
+                answer = min(max(answer, stand.limits.low - later), stand.limits.high - later)
+            answers.append(answer)
+            command = plan.ahead[c, s, t] + answers.pop(0)
+            level = stand.amplifier.step * np.round(command / stand.amplifier.step)
+            level = min(max(level, stand.limits.low), stand.limits.high)
+            reach, last = stand.amplifier.slew * 1e-3, held[-1] if held else 0.0
+            held.append(min(max(level, last - reach), last + reach))
+        judged = np.array(missed[plan.begins :])
+        rms[c, s, m] = np.sqrt(np.mean(judged**2))
+        largest[c, s, m] = np.abs(judged).max()
+    return rms, largest
+
+
+@pytest.mark.parametrize("name", ["bouc-wen, second-order", "plays, lag, gain"])
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
+    actuator, theta, rows = of(name, 2, 6)
+    wanted = references()
+    ahead = np.stack([wanted / 0.6, np.zeros_like(wanted), wanted / 0.6])
+    # So near that it is met: then the answers are kept to what is still to be had.
+    stand = Stand(Span(-55.0, 45.0), delay, Amplifier(current=0.02))
+    plan = Plan(
+        np.clip(ahead, -55, 45),
+        np.stack([0 * wanted, wanted, wanted]),
+        (False, True, True),
+        wanted,
+        10,
+    )
+    gains = Gains((1.2, -0.9, 0.02), 1e-3)
+    got = follow(plan, gains, rows, QUIET, stand, np.random.default_rng(1))
+    rms, largest = slowly(actuator, theta, plan, gains, stand)
+    np.testing.assert_allclose(got.rms, rms, rtol=1e-9)
+    np.testing.assert_allclose(got.largest, largest, rtol=1e-9)
+    assert (got.limited > 0).any()
+
+
+def test_without_feedback_it_is_the_virtual_stands_amplifier_and_actuator() -> None:
+    actuator, theta, rows = of("bouc-wen with all", 2, 2)
+    wanted = references(400)
+    command = np.clip(wanted / 0.5, -80, 80)
+    command[:, 0] = 0.0
+    stand = Stand(Span(-100.0, 100.0))
+    plan = Plan(command[np.newaxis], wanted[np.newaxis], (False,), wanted, 0)
+    gains = Gains((1.0, 0.0, 0.0), 1e-3)
+    got = follow(plan, gains, rows, QUIET, stand, np.random.default_rng(1))
+    for s in range(2):
+        output = stand.amplifier.output(command[s], 1e-3)
+        x = actuator.displacement(theta, output, from_rest=True)[:, :-1]
+        rms = np.sqrt(np.mean((x - wanted[s, :-1]) ** 2, axis=1))
+        np.testing.assert_allclose(got.rms[0, s], rms, rtol=1e-9)
+
+
+def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
+    """At rest: the rms error is that of the process, 400 draws of 100 of its times.
+
+    Within five standard errors of the mean square, which for an Ornstein-Uhlenbeck process over
+    N times is sd² sqrt(2 / N): of 40,000 times 0.7 % each, so a false alarm once in a million, and
+    a process with a wrong time or sd 4 % off is noticed. Sensor noise alone leaves none.
+    """
+    _, _, rows = of("bouc-wen", 1, 400)
+    wanted = np.zeros((1, 1001))
+    plan = Plan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), wanted, 0)
+    noise = Noise(np.full(400, 0.5), np.full(400, 1.5), np.full(400, 0.01))
+    gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(cases.SPAN)
+    got = follow(plan, gains, rows, noise, stand, np.random.default_rng(8))
+    spread = 1.5**2 * np.sqrt(2 / 40_000)
+    assert np.mean(got.rms**2) == pytest.approx(1.5**2, abs=5 * spread)
+    alone = noise._replace(discrepancy=np.zeros(400))
+    assert 0 == follow(plan, gains, rows, alone, stand, np.random.default_rng(8)).largest.max()
+
+
+def test_out_of_reach_for_long_it_comes_back_at_once() -> None:
+    """Without anti-windup an integrator would have a second's errors to take back."""
+    actuator, theta, rows = of("bouc-wen, second-order", 2, 1)
+    limits = Span(-50.0, 50.0)
+    one = SampledModel.of(actuator, theta)
+    gains, _ = design(one, one, limits, 1, Robustness())
+    wanted = np.concatenate([np.full(1000, 200.0), np.zeros(201)])[np.newaxis]
+
+    def error(begins: int) -> float:
+        plan = Plan(np.zeros((1, 1, 1201)), wanted[np.newaxis], (True,), wanted, begins)
+        stand, generator = Stand(limits), np.random.default_rng(1)
+        return float(follow(plan, gains, rows, QUIET, stand, generator).largest.max())
+
+    assert 100 < error(900)
+    # Sixty samples after the reference is back: a DAC's step is 0.07 um.
+    assert error(1060) < 0.2

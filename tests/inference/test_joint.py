@@ -1,0 +1,224 @@
+"""The posterior of several records: a sum over them, with what is shared there once.
+
+Exactness is held against the posteriors of the records alone, and against the whole record where
+two records are its halves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.noise import noise_model
+from bwbayes.inference.outliers import outliers
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.table import JointTable
+from bwbayes.model.actuator import Actuator
+from bwbayes.results.identifiability import spectrum
+from bwbayes.results.prediction import predict_windows
+from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
+
+ENGINES = get_args(Engine)
+
+# The records: samples, periods, amplitude in V, sampling interval in s, and whether from rest.
+RECORDS = {"loops": (240, 4.0, 100.0, INTERVAL, True), "slow": (150, 1.5, 60.0, 0.025, False)}
+
+
+def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Dataset:
+    """Return one of the records, simulated, with an offset of its own."""
+    samples, periods, amplitude, interval, from_rest = RECORDS[name]
+    actuator = Actuator(dynamics, "first", interval)
+    voltage = decaying_sine(samples, periods, amplitude)
+    offset = 3.0 if from_rest else -2.0
+    displacement = offset + ring_bender(actuator, noise, voltage, samples)
+    windows = (slice(0, samples // 2), slice(samples // 2 + 10, samples))
+    model = noise_model(noise, interval)
+    return Dataset(voltage, displacement, windows, actuator, model, from_rest, name)
+
+
+def joint(
+    *datasets: Dataset,
+    per_record: tuple[str, ...] = (),
+    shared: tuple[str, ...] = (),
+    engine: Engine = "numpy",
+) -> Posterior:
+    """Return the posterior of records with the default priors of the first."""
+    first = datasets[0]
+    names = tuple(one.name for one in datasets)
+    table = JointTable(first.table, names, per_record, shared)
+    usual = posterior_of(first.voltage, first.displacement, first.actuator, "discrepancy", {})
+    known = {p.name: p for p in usual.prior.parameters}
+    parameters = []
+    for name, declared, record in table.layout:
+        parameter = known[declared.name]
+        rested = {one.name for one in datasets if one.from_rest}
+        if declared.name == "initial" and rested and (record in rested or not record):
+            parameter = Parameter.of(declared, 0.0)
+        parameters.append(replace(parameter, name=name, record=record))
+    prior = JointPrior(parameters, first.actuator.hysteresis.holds)
+    return Posterior(tuple(datasets), prior, engine, table)
+
+
+def drawn(posterior: Posterior, models: int, seed: int = 1) -> FloatArray:
+    """Return θ (models, parameters) from the prior."""
+    prior = posterior.prior
+    return prior.theta(prior.draw(np.random.default_rng(seed), models))
+
+
+LOOPS, SLOW = dataset("loops"), dataset("slow")
+
+
+def test_a_record_has_its_own_columns_named_after_it_and_one_alone_has_plain_names() -> None:
+    both, alone = joint(LOOPS, SLOW), joint(LOOPS)
+    shape, noise = "d alpha beta gamma exponent", "sensor_sd discrepancy_sd discrepancy_time"
+    own = "initial[loops] initial[slow] lag offset[loops] offset[slow]"
+    assert f"{shape} {own} {noise}".split() == [*both.table.names]
+    assert LOOPS.table.names == alone.table.names
+    assert both.alone("slow").table.names == alone.table.names
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> None:
+    """Each at its own θ; other intervals, starts, windows and ranges of the voltage."""
+    both = joint(LOOPS, SLOW, engine=engine)
+    theta = drawn(both, 7)
+    expected = np.zeros(7)
+    for one in (LOOPS, SLOW):
+        mine = [
+            name if name in both.table.names else f"{name}[{one.name}]" for name in one.table.names
+        ]
+        columns = [both.table.names.index(name) for name in mine]
+        expected += one.likelihood("numpy").log_density(theta[:, columns])
+    np.testing.assert_allclose(both.log_likelihood(theta), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_two_halves_of_a_record_that_share_all_are_the_whole(engine: Engine) -> None:
+    """White noise has no memory, so that the sum over windows is the whole, to rounding."""
+    whole = dataset("loops", "white")
+    halves = [
+        replace(whole, training=(window,), name=f"half-{i}")
+        for i, window in enumerate(whole.training)
+    ]
+    one = joint(whole, engine=engine)
+    two = joint(*halves, shared=("initial", "offset"), engine=engine)
+    assert one.table.names == two.table.names
+    z = np.random.default_rng(2).standard_normal((6, len(one.names)))
+    np.testing.assert_allclose(one.log_density(z), two.log_density(z), rtol=1e-10)
+    # The twin: with an offset of its own each half knows less.
+    loose = joint(*halves, shared=("initial",))
+    assert len(loose.names) == len(one.names) + 1
+
+
+def test_own_parameters_change_their_own_record_alone() -> None:
+    both = joint(LOOPS, SLOW, per_record=("sensor_sd",))
+    theta = drawn(both, 3)
+    moved = theta.copy()
+    for name in ("offset[slow]", "sensor_sd[slow]"):
+        moved[:, both.table.names.index(name)] += 1.0
+    before, after = (both.simulate(t, record="loops") for t in (theta, moved))
+    np.testing.assert_array_equal(before, after)
+    away = both.simulate(moved, record="slow") - both.simulate(theta, record="slow")
+    assert np.abs(away).min() > 0
+    changes = [
+        likelihood.log_density(both.table.of(moved, name))
+        - likelihood.log_density(both.table.of(theta, name))
+        for name, likelihood in zip(both.table.records, both.likelihoods, strict=True)
+    ]
+    assert not changes[0].any()
+    assert changes[1].all()
+
+
+def test_draws_of_a_record_are_those_of_its_columns() -> None:
+    both = joint(LOOPS, SLOW, per_record=("sensor_sd",))
+    free = both.prior.draw(np.random.default_rng(3), 5)
+    theta = both.prior.theta(free)
+    for name, alone, its in both.each(free):
+        np.testing.assert_array_equal(alone.prior.theta(its), both.table.of(theta, name))
+    (only,) = joint(LOOPS).each(free[:, : len(joint(LOOPS).names)])
+    np.testing.assert_array_equal(only.draws, free[:, : len(joint(LOOPS).names)])
+
+
+def test_bounds_hold_in_every_record() -> None:
+    """With alpha of each record its own: 0 < alpha < d, and |gamma| <= beta."""
+    both = joint(LOOPS, SLOW, per_record=("alpha", "gamma"))
+    column = both.table.columns(drawn(both, 200))
+    for record in ("loops", "slow"):
+        assert (column[f"alpha[{record}]"] < column["d"]).all()
+        assert (np.abs(column[f"gamma[{record}]"]) <= column["beta"]).all()
+    free = both.prior.draw(np.random.default_rng(5), 50)
+    back, _ = both.prior.constrain(both.prior.unconstrain(free))
+    np.testing.assert_allclose(back, free, rtol=1e-6, atol=1e-9)
+    # A shared parameter whose bounds hang on the records' own obeys the tightest.
+    tight = joint(LOOPS, SLOW, per_record=("beta",))
+    column = tight.table.columns(drawn(tight, 200))
+    least = np.minimum(column["beta[loops]"], column["beta[slow]"])
+    assert (np.abs(column["gamma"]) <= least).all()
+
+
+def test_a_point_fit_of_two_records_finds_the_truth_of_both() -> None:
+    """And leaves less open than one record does."""
+    fixed = joint(LOOPS, SLOW)
+    point = pointfit.fit(fixed, np.random.default_rng(4))
+    place = dict(zip(fixed.names, point.mode, strict=True))
+    free = dict(zip(fixed.names, fixed.prior.constrain(point.mode[np.newaxis])[0][0], strict=True))
+    assert place.keys() == free.keys()
+    assert free["offset[loops]"] == pytest.approx(3.0, abs=2.0)
+    assert free["offset[slow]"] == pytest.approx(-2.0, abs=2.0)
+    assert free["d"] == pytest.approx(0.7, rel=0.1)
+    left = spectrum(fixed, point)[0]
+    alone = fixed.alone("loops")
+    one = pointfit.fit(alone, np.random.default_rng(4))
+    assert left.max() < spectrum(alone, one)[0].max()
+
+
+def test_outliers_are_found_in_the_record_that_has_them() -> None:
+    spoilt = SLOW.displacement.copy()
+    spoilt[40] += 60.0
+    both = joint(LOOPS, replace(SLOW, displacement=spoilt))
+    aside = outliers(both, np.random.default_rng(6))
+    assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
+
+
+def test_windows_of_a_record_are_predicted_with_its_own_parameters() -> None:
+    both = joint(LOOPS, SLOW)
+    free = both.prior.draw(np.random.default_rng(7), 20)
+    shifted = free.copy()
+    shifted[:, both.names.index("offset[slow]")] += 5.0
+    means = []
+    for draws in (free, shifted):
+        _, alone, its = list(both.each(draws))[1]
+        record = Record(SLOW.voltage, SLOW.displacement, 0.025)
+        (bands,) = predict_windows(
+            alone, its, record, {"slow": slice(0, 150)}, np.random.default_rng(8)
+        )
+        means.append(bands.mean)
+    # From an unknown start, which the readings tell, all but what dies out moves with the offset.
+    assert np.median(means[1] - means[0]) == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"per_record": ("sensor",)}, r"model.per_record: no part here has 'sensor'; did you mean"),
+        ({"shared": ("creep_1",)}, r"model.shared: no part here has 'creep_1'; "),
+        (
+            {"per_record": ("offset",), "shared": ("offset",)},
+            "model.per_record: 'offset' is in model.shared too; remove it from one of them",
+        ),
+    ],
+)
+def test_scopes_of_parameters_that_there_are_not_are_refused(
+    given: dict[str, tuple[str, ...]], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        joint(LOOPS, SLOW, **given)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Tests of what specimens say of their population."""

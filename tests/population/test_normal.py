@@ -1,0 +1,92 @@
+"""Normal likelihoods in closed form, against integrals on a dense grid and what is obvious."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
+
+PRIOR = Hyperprior(0.2, 1.0, 0.7)
+MEASURED = NormalLikelihoods(np.array([0.1, 0.4, 0.3, 0.9]), np.array([100.0, 25.0, 400.0, 0.0]))
+
+
+def test_posterior_of_the_spread_is_that_of_an_integral_on_a_dense_grid() -> None:
+    """Mean and spread on a grid, specimens integrated out one by one by their convolution."""
+    mean = np.linspace(-1.5, 2.0, 701)[:, np.newaxis]
+    spread = np.linspace(1e-3, 3.0, 600)
+    logs = stats.norm.logpdf(mean, 0.2, 1.0) + stats.halfnorm.logpdf(spread, scale=0.7)
+    for m, precision in zip(MEASURED.mean[:3], MEASURED.precision[:3], strict=True):
+        logs = logs + stats.norm.logpdf(m, mean, np.sqrt(1 / precision + spread**2))
+    density = np.exp(logs - np.max(logs))
+    density /= np.sum(density)
+    seen = spreads(MEASURED, PRIOR)
+    for power in (1, 2):
+        assert np.sum(density * spread**power) == pytest.approx(
+            seen.probability @ seen.spread**power, rel=5e-3
+        )
+    assert np.sum(density * mean) == pytest.approx(seen.probability @ seen.mean, abs=2e-3)
+    square = seen.probability @ (seen.variance + seen.mean**2)
+    assert np.sum(density * mean**2) == pytest.approx(square, rel=5e-3)
+    drawn = seen.draw(np.random.default_rng(1), 20_000)
+    # Five standard errors of 20,000 draws.
+    assert np.mean(drawn[0]) == pytest.approx(
+        np.sum(density * mean), abs=5 * np.std(drawn[0]) / 141
+    )
+    assert np.mean(drawn[1]) == pytest.approx(
+        np.sum(density * spread), abs=5 * np.std(drawn[1]) / 141
+    )
+
+
+def test_log_density_of_the_prior_is_scipys() -> None:
+    mean, spread = np.array([0.0, 1.0, 2.0]), np.array([0.1, 1.0, -0.1])
+    expected = stats.norm.logpdf(mean, 0.2, 1.0) + stats.halfnorm.logpdf(spread, scale=0.7)
+    np.testing.assert_allclose(expected, PRIOR.log_density(mean, spread), rtol=1e-12)
+
+
+@given(st.floats(0.01, 3.0), st.floats(-2.0, 2.0), st.floats(0.05, 2.0))
+@settings(max_examples=30, deadline=None)
+def test_a_record_given_a_population_is_a_convolution(
+    spread: float, mean: float, sd: float
+) -> None:
+    one = NormalLikelihoods(np.array([0.3]), np.array([sd**-2.0]))
+    y = np.linspace(-30, 30, 60_001)
+    product = stats.norm.pdf(0.3, y, sd) * stats.norm.pdf(y, mean, spread)
+    found = one.marginal(np.array([mean]), np.array([spread]))[0, 0]
+    assert np.exp(found) == pytest.approx(np.trapezoid(product, y), rel=1e-5, abs=1e-12)
+
+
+def test_a_shrunk_specimen_is_the_conjugate_normal() -> None:
+    mean, spread = np.full(100_000, 0.5), np.full(100_000, 0.2)
+    drawn = MEASURED.shrunk(1, mean, spread, np.random.default_rng(2))
+    precision = 25 + 1 / 0.2**2
+    expected = (0.4 * 25 + 0.5 / 0.2**2) / precision
+    # Five standard errors.
+    assert np.mean(drawn) == pytest.approx(expected, abs=5 * precision**-0.5 / 316)
+    assert np.std(drawn) == pytest.approx(precision**-0.5, rel=5 / 447)
+
+
+def test_a_record_that_tells_nothing_is_the_population_and_moves_nothing() -> None:
+    known = NormalLikelihoods(MEASURED.mean[:3], MEASURED.precision[:3])
+    np.testing.assert_allclose(
+        spreads(known, PRIOR).probability, spreads(MEASURED, PRIOR).probability, rtol=1e-9
+    )
+    assert 1.0 == left_out(MEASURED, PRIOR)[3]
+
+
+def test_p_of_a_specimen_left_out_is_even_and_sees_one_that_is_off() -> None:
+    """Kolmogorov-Smirnov at 1e-3 over 400 sound specimens; one of eight spreads off is seen."""
+    generator = np.random.default_rng(3)
+    p = []
+    for _ in range(50):
+        mean, spread = generator.normal(0.2, 1.0), abs(generator.normal(0, 0.7))
+        sd = generator.uniform(0.02, 0.2, 8)
+        measured = mean + np.hypot(spread, sd) * generator.standard_normal(8)
+        p.append(left_out(NormalLikelihoods(measured, sd**-2.0), PRIOR))
+    assert stats.kstest(np.concatenate(p), "uniform").pvalue > 1e-3
+    off = np.array([0.0, 0.05, -0.05, 0.02, -0.03, 0.01, 0.04, 0.9])
+    p_off = left_out(NormalLikelihoods(off, np.full(8, 1e4)), PRIOR)
+    assert p_off[7] < 1e-4 < np.min(p_off[:7])
