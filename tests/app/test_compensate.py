@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.jobs.compensate import FILES, compensate_run
 from bwbayes.control.wished import shaped
 from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.model.inverse.limits import Limits
 from tests.app import small
-from tests.app.test_export import small_steps
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +103,6 @@ def bw_limits(**others: float) -> Limits:
 def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
     made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
 
-    small_steps(made.path)
+    assert 4 == finish(made.path, 1, quiet=True)
     with pytest.raises(NotConvergedError, match=r"run: not converged: .* `bwbayes resume"):
         compensate_run(made.path, shaped("sine", 0.02, 30.0, 0.5))
