@@ -42,6 +42,9 @@ LEFT = math.sqrt(0.5)
 # Samples that a period must have.
 PER_PERIOD = 10
 
+# A middle that is nearer to zero than this part of the amplitude is zero.
+ROUND = 1e-3
+
 # Most samples of a signal.
 MOST_SAMPLES = 1_000_000
 
@@ -212,7 +215,9 @@ def track(
     frequencies = _frequencies(mean, wishes.frequencies)
     ends = _reach(mean, limits)
     amplitude = _amplitude(wishes.amplitude, ends)
-    middle, rise = ends.middle, _rise(mean)
+    # A range about zero needs no way to its middle.
+    middle = ends.middle if abs(ends.middle) > ROUND * amplitude else 0.0
+    rise = _rise(mean)
     gains, kept = design(mean, draws, limits, stand.delay, wishes.robustness)
 
     names = tuple(SHAPES)
