@@ -23,19 +23,19 @@ from bwbayes.comparison.table import table
 from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Compared", "Finished", "compared"]
+__all__ = ["Comparable", "Compared", "compared"]
 
 
-class Finished(Protocol):
-    """What a comparison needs of a fit."""
+class Comparable(Protocol):
+    """A fit, as far as a comparison looks at it."""
 
     @property
     def problem(self) -> Problem:
-        """What was fitted."""
+        """Config, records and posterior."""
 
     @property
     def chain(self) -> ChainFile:
-        """The draws."""
+        """All draws, on disk."""
 
     @property
     def outcome(self) -> Outcome:
@@ -94,7 +94,7 @@ class Compared:
 
 
 def compared(
-    fits: Sequence[Finished], *, future: bool = True, workers: int | None = None
+    fits: Sequence[Comparable], *, future: bool = True, workers: int | None = None
 ) -> Compared:
     """Compare fits, named as their configs are, or by number where that is not enough.
 
