@@ -28,6 +28,8 @@ COMMANDS = (
     "predict",
     "report",
     "calibrate",
+    "compare",
+    "design",
     "export",
     "track",
     "config",
