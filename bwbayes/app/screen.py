@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -52,7 +53,7 @@ CHANGED = 0.03
 ON_SCREEN = (0, 1, 2, 4, 5, 6, 8)
 
 PARAMETER_COLUMNS = ("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
-SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers")
+SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers, %")
 
 
 def show_result(result: Result, folder: RunFolder | None, console: Console) -> None:
@@ -63,7 +64,7 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
     show_verdicts(result.verdicts.values(), console)
     rows = list(parameter_rows(result))
     if rows:
-        table = Table(*PARAMETER_COLUMNS)
+        table = _table(*PARAMETER_COLUMNS)
         for row in rows:
             table.add_row(*map(escape, row))
         console.print(table)
@@ -74,6 +75,11 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
     show_remarks(result.remarks, console)
     if folder is not None:
         console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _table(*columns: str) -> Table:
+    """Return an empty table that is narrow enough for a terminal of 80 columns."""
+    return Table(*columns, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
 
 
 def show_remarks(remarks: Iterable[str], console: Console) -> None:
@@ -93,7 +99,7 @@ def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
             name,
             f"{row['mean']:.5g}",
             f"{row['sd']:.2g}",
-            f"{row['lower_95']:.5g} to {row['upper_95']:.5g}",
+            f"{row['lower_95']:.4g} to {row['upper_95']:.4g}",
             row["unit"],
             f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
             f"{row['rhat']:.3f}",
@@ -120,7 +126,7 @@ def show_scores(
     scores: Mapping[str, Scores], console: Console, verdicts: Mapping[str, Verdict] | None = None
 ) -> None:
     """Show how predictions turned out."""
-    table = Table("prediction", *(["holds"] if verdicts else []), *SCORE_COLUMNS)
+    table = _table("prediction", *(["holds"] if verdicts else []), *SCORE_COLUMNS)
     for name, one in scores.items():
         held = [_held(verdicts[name])] if verdicts else []
         table.add_row(name, *held, *score_texts(one))
@@ -131,7 +137,7 @@ def show_loops(loops: Loops, console: Console) -> None:
     """Show what is measured of the major and of the minor loop."""
     both = loops.major, loops.minor
     columns = (f"{loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V" for loop in both)
-    table = Table("loop, 95 % interval", *columns, "unit")
+    table = _table("loop, 95 % interval", *columns, "unit")
     for name, (title, unit) in MEASURES.items():
         estimates = (loop.estimates[name] for loop in both)
         cells = ("-" if e is None else f"{e.lower:.4g} to {e.upper:.4g}" for e in estimates)
@@ -148,7 +154,9 @@ def score_texts(scores: Scores) -> tuple[str, ...]:
         f"{scores.max_error_um:.2f} um",
         f"{scores.crps_um:.3f} um",
         f"{scores.width_um[95]:.2f} um",
-        ", ".join(f"{level} %: {covered[level]:.1%} ± {error[level]:.1%}" for level in covered),
+        ",\n".join(
+            f"{level} %: {100 * covered[level]:.1f} ± {100 * error[level]:.1f}" for level in covered
+        ),
     )
 
 
@@ -158,14 +166,14 @@ def _held(verdict: Verdict) -> str:
 
 def show_calibration(calibration: Calibration, folder: CalibrationFolder, console: Console) -> None:
     """Show how even the ranks are, and what intervals and bands cover."""
-    table = Table("statistic", "p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS))
+    table = _table("statistic", "p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS))
     for name, one in calibration.statistics.items():
         ecdf = "leaves band" if one.outside else "inside"
         covered = (f"{one.covered[level]:.1%}" for level in LEVELS)
         table.add_row(name, f"{one.p:.2g}", f"{one.adjusted:.2g}", ecdf, *covered)
     console.print(table)
     if calibration.bands:
-        table = Table("band", "of", *(f"{level} %" for level in LEVELS))
+        table = _table("band", "of", *(f"{level} %" for level in LEVELS))
         for other, kind in product(calibration.predicted, KINDS):
             coverages = (calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS)
             covered = (f"{one.mean:.1%} ± {one.error:.1%}" for one in coverages)
@@ -188,7 +196,7 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
 def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Console) -> None:
     """Show the population and how many records ended in which way."""
     if campaign.population is not None:
-        table = Table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")
+        table = _table("parameter", "unit", "middle", "spread", "next specimen, 95 %", "off it")
         for one in campaign.population.parameters.values():
             low, high = np.quantile(one.new, [0.025, 0.975])
             spread = float(np.median(one.spread))
@@ -219,11 +227,11 @@ def show_comparison(comparison: Comparison, folder: Path | None, console: Consol
         console.print(escape(line), highlight=False, soft_wrap=True)
     for line in comparison.against:
         console.print(f"against it: {escape(line)}", highlight=False, soft_wrap=True)
-    table = Table(*(COMPARED[i] for i in ON_SCREEN))
+    table = _table(*(COMPARED[i] for i in ON_SCREEN))
     for row in compared(comparison):
         table.add_row(*(escape(row[i]) for i in ON_SCREEN))
     console.print(table)
-    table = Table(*DIFFERENCE_COLUMNS)
+    table = _table(*DIFFERENCE_COLUMNS)
     for row in differences(comparison):
         table.add_row(*map(escape, row))
     if table.row_count:
@@ -243,7 +251,7 @@ def show_priors(
     """
     quantiles = conflict.effective(prior, generator(0, "effective priors"))
     left = dict(zip(prior.free_names, quantiles.T, strict=True))
-    table = Table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
+    table = _table("parameter", "prior", *(["point fit"] if fitted else []), "unit")
     for parameter in prior.parameters:
         if parameter.prior is None:
             known = f"fixed at {parameter.fixed:g}"

@@ -18,7 +18,7 @@ from bwbayes.data.patterns import runs, scatter, spikes, turning_points
 from bwbayes.data.record import Record
 from bwbayes.data.stuck import SHORTEST_AT_END, Stuck, clipped, clipped_drive, held, repeated
 
-__all__ = ["Finding", "inspect"]
+__all__ = ["Finding", "inspect", "isolated_outliers"]
 
 # What the voltage and the displacement of piezo actuators may be, and their quotient.
 VOLTS = (0.05, 2000.0)
@@ -86,7 +86,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     if record.displacement is None:
         return tuple(findings)
     rows = np.flatnonzero(record.has_reading)
-    outliers = _outliers(record)
+    outliers = isolated_outliers(record)
     left_out = np.zeros(record.samples, dtype=np.bool_)
     left_out[outliers] = True
     if rows.size - outliers.size < 3:
@@ -161,8 +161,8 @@ def _amplitude(record: Record) -> Iterator[Finding]:
         yield _whole(record, "one amplitude", text, remedy)
 
 
-def _outliers(record: Record) -> IntArray:
-    """Return the samples whose readings are isolated outliers."""
+def isolated_outliers(record: Record) -> IntArray:
+    """Return the samples whose readings are isolated outliers; none if they are too many."""
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     voltage = record.voltage[rows]
     extent = _extent(displacement)

@@ -322,8 +322,7 @@ def _settled(r: Residuals) -> float:
 
 def _windows(r: Residuals) -> str:
     """Return the windows of the first spikes, as ``exclude`` takes them."""
-    half = r.interval / 2
-    windows = [f"[{t - half:.6g}, {t + half:.6g}]" for t in r.time[r.spikes][:NAMED]]
+    windows = [f"[{t:.6g}, {t + r.interval:.6g}]" for t in r.time[r.spikes][:NAMED]]
     return ", ".join(windows) + (", ..." if np.sum(r.spikes) > NAMED else "")
 
 

@@ -18,6 +18,7 @@ from bwbayes.app.fit import fitted
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands
 from bwbayes.results.prediction import Start
@@ -340,6 +341,29 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
         bw.fit(record, **wrong)
     assert line in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_the_columns_of_a_file_are_recognised(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def created(*arguments: Any) -> None:
+        raise InterruptedError(arguments[-2].record)
+
+    monkeypatch.setattr(RunFolder, "create", created)
+    rows = np.stack([1e3 * record.time, record.voltage, record.displacement], axis=1)  # type: ignore[arg-type]
+    np.savetxt(
+        tmp_path / "lab.csv",
+        rows,
+        fmt="%.9g",
+        delimiter=",",
+        header="t [ms],U [V],pos",
+        comments="",
+    )
+    with pytest.raises(bw.InputError, match="pos: no unit of the displacement in its name"):
+        bw.fit(tmp_path / "lab.csv")
+    with pytest.raises(InterruptedError) as seen:
+        bw.fit(tmp_path / "lab.csv", units={"displacement": "um"})
+    np.testing.assert_allclose(record.voltage, seen.value.args[0].voltage, atol=1e-6)
 
 
 @pytest.mark.usefixtures("_no_run")

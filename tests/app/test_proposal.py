@@ -196,6 +196,20 @@ def test_ten_outliers_are_set_aside(write: Write) -> None:
     assert any(text.startswith("10 readings set aside") for text in problem.remarks)
 
 
+def test_outliers_that_are_held_out_are_left_out(write: Write) -> None:
+    """A fit sets aside those it is fitted to alone."""
+    spikes = [100, 470, 555]
+
+    def spoil(displacement: FloatArray) -> None:
+        displacement[spikes] += 60.0
+
+    path = write(change=spoil)
+    made = proposed(path)
+    assert 2 == len(made.config.record.exclude or [])
+    problem = resolve(made.config, path.parent)
+    assert spikes == np.flatnonzero(~problem.record.has_reading).tolist()
+
+
 @pytest.mark.parametrize(
     ("written", "line"),
     [
@@ -268,7 +282,7 @@ def test_run_without_a_config_runs_the_proposed_one(
     path = write(FOREIGN.replace("pos", "pos_nm"), (1e3, 1e3, 1e3))
     ran: list[Path] = []
 
-    def finish(folder: Path, *_: object) -> int:
+    def finish(folder: Path, *_: object, **__: object) -> int:
         ran.append(folder)
         return 0
 
@@ -293,7 +307,7 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     header, *rows = path.read_text().splitlines()
     path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
     remark = "mine.csv:1: ignored columns: temperature_C"
-    monkeypatch.setattr(run, "finish", lambda *_: 0)
+    monkeypatch.setattr(run, "finish", lambda *_, **__: 0)
     name, _, config = command_line.partition(" ")
     if config:
         path = path.with_suffix(".toml")

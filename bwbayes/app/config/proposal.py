@@ -19,7 +19,7 @@ import numpy as np
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record, read_record
-from bwbayes.data.inspection import Finding, inspect
+from bwbayes.data.inspection import Finding, inspect, isolated_outliers
 from bwbayes.data.io.columns import UNITS, Naming, recognised, unit_in
 from bwbayes.data.io.formats import column_names
 from bwbayes.errors import InputError, InputWarning
@@ -183,6 +183,11 @@ def _text(
     held = _held_out(record)
     first, last = _span(record)
     train = [(first, last)] if held is None else _rest((first, last), held)
+    aside = [] if held is None else _spikes(record, held)
+    if aside and not any(line.startswith("exclude") for line in lines["record"]):
+        lines["record"].append(
+            f"exclude = {_windows(aside)}  # spikes in the part that is held out"
+        )
     file = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
     written = [
         *_facts(record),
@@ -293,6 +298,13 @@ def _held_out(record: Record) -> tuple[float, float] | None:
         if inside and moves:
             return edges[0], edges[1]
     return None
+
+
+def _spikes(record: Record, held: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return a window (s) around each spike that is held out, where no fit sets it aside."""
+    times = record.time[isolated_outliers(record)]
+    inside = times[(held[0] <= times) & (times < held[1])].tolist()
+    return [(time, time + record.interval) for time in inside]
 
 
 def _on_grid(record: Record, time: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bwbayes.app.fit.compared import Comparable, Compared, compared
+from bwbayes.app.fit.compared import Compared, Finished, compared
 from bwbayes.app.jobs.design import design_draws
 from bwbayes.arrays import ArrayLike
 from bwbayes.comparison.design import Promise
@@ -17,7 +17,7 @@ __all__ = ["Advice"]
 class Advice:
     """Comparison and design, for whatever has a problem, a chain and an outcome."""
 
-    def compare(self: Comparable, *others: Comparable, **options: Any) -> Compared:
+    def compare(self: Finished, *others: Finished, **options: Any) -> Compared:
         """Compare this fit with others of the same readings, to tell which model to take.
 
         ``options`` (future, workers) and errors are as of
@@ -25,7 +25,7 @@ class Advice:
         """
         return compared((self, *others), **options)
 
-    def design(self: Comparable, target: str | ArrayLike, **options: Any) -> list[Promise]:
+    def design(self: Finished, target: str | ArrayLike, **options: Any) -> list[Promise]:
         """Rank signals by what they would leave of an sd, or of a band's width; the best first.
 
         ``target`` is a parameter's name, or a drive in V whose band is to be narrow; ``options``

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.proposal import naming_of
 from bwbayes.app.fit.fitted import Fit, carried_on, to_know
 from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
@@ -38,10 +39,10 @@ def fit(
     Parameters
     ----------
     record
-        The training record, or its file. Several records of one actuator are fitted jointly: a list
-        of them, or a dict by name, in which a record may be a dict of the keys of [record.NAME],
-        with ``record`` the record itself: ``{"loops": loops, "step": {"record": step, "train":
-        (0, 3)}}``.
+        The training record, or its file, whose columns are recognised unless ``columns`` says them.
+        Several records of one actuator are fitted jointly: a list of them, or a dict by name, in
+        which a record may be a dict of the keys of [record.NAME], with ``record`` the record
+        itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
     folder
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
@@ -72,6 +73,9 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
+    if isinstance(record, str | Path) and "columns" not in keys:
+        naming = naming_of(Path(record), keys.get("units"))
+        keys |= {key: table for key, table in vars(naming).items() if table}
     config, records = config_of(record, keys)
     problem = resolve(config, Path(), records)
     warn(problem.remarks, 3)

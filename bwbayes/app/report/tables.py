@@ -160,8 +160,9 @@ def replicated(result: Result) -> list[Table]:
 
 
 def validation(result: Result, summary: Summary) -> Table:
-    """Return the scores: a column for each of the bands."""
+    """Return the scores: a column for each of the bands, held-out ones first."""
     judged = [bands for bands in result.bands if bands.name in result.scores]
+    judged.sort(key=lambda bands: bands.training)
     columns = [
         [("Holds", _held(result, bands.name)), *_scores(result.scores[bands.name])]
         for bands in judged
@@ -169,7 +170,7 @@ def validation(result: Result, summary: Summary) -> Table:
     rows = [[row[0][0], *(text for _, text in row)] for row in zip(*columns, strict=True)]
     kept = {bands.name: summary["validation"][bands.name] for bands in judged}
     titles = ["Quantity", *(title(bands) for bands in judged)]
-    return Table("validation", "Scores", titles, rows, records=_flat(kept))
+    return Table("validation", "How the bands did on readings", titles, rows, records=_flat(kept))
 
 
 def loops(result: Result, summary: Summary) -> Table | None:
