@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from bwbayes.app.commands import cli
-from bwbayes.app.config.config import load
+from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.config.models import models_of
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder
@@ -212,6 +212,7 @@ MODELS = (
 def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path) -> None:
     """NRMSE at most 0.42 %, bands at least 35 % narrower than plain Bouc-Wen's."""
     config = load(ROOT / "runs/measured_stack_parts.toml")
+    assert isinstance(config.record, RecordConfig)
     source = config.record.model_copy(update={"file": str(RECORD)})
     sampling = config.sampling.model_copy(update={"ess": 1000.0})
     config = config.model_copy(update={"record": source, "sampling": sampling})
