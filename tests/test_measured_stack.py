@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
+from rich.console import Console
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
+from bwbayes.app.config.config import RecordConfig, load
+from bwbayes.app.config.models import models_of
+from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
 from bwbayes.arrays import FloatArray
@@ -21,6 +26,7 @@ from bwbayes.model.inverse.chain import inverse
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record, thinned
 from bwbayes.sampling.sampler import draws
+from tests.measured import keep
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
@@ -227,3 +233,43 @@ def test_the_whole_file_is_fitted_in_spite_of_its_start(tmp_path: Path, honest: 
     assert whole["converged"]
     d, usual = whole["parameters"]["d"], honest["parameters"]["d"]
     assert abs(d["mean"] - usual["mean"]) < 2 * usual["sd"]
+
+
+# Six models, from none of the hysteresis to elements that slip.
+MODELS = (
+    "linear; bouc-wen; bouc-wen + quadratic; bouc-wen + quadratic + cubic; "
+    "prandtl-ishlinskii + quadratic + cubic; maxwell-slip(thresholds=4) + quadratic + cubic"
+)
+
+
+@pytest.mark.slow
+def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path) -> None:
+    """NRMSE at most 0.42 %, bands at least 35 % narrower than plain Bouc-Wen's."""
+    config = load(ROOT / "runs/measured_stack_parts.toml")
+    assert isinstance(config.record, RecordConfig)
+    source = config.record.model_copy(update={"file": str(RECORD)})
+    sampling = config.sampling.model_copy(update={"ess": 1000.0})
+    config = config.model_copy(update={"record": source, "sampling": sampling})
+    models = models_of(MODELS, config.model)
+    begun = time.monotonic()
+    made = compare_models(config, ROOT, models, tmp_path / "out", Console(quiet=True))
+    minutes = (time.monotonic() - begun) / 60
+    assert made.recommended is not None
+    chosen, plain = made[made.recommended].mean, made["bouc-wen"].mean
+    assert chosen is not None
+    assert plain is not None
+    narrower = 1 - chosen.width_um / plain.width_um
+    keep(
+        "models of the measured stack",
+        {
+            "recommended": made.recommended,
+            "alike": list(made.alike),
+            "nrmse_percent": round(100 * chosen.nrmse, 3),
+            "narrower_percent": round(100 * narrower),
+            "minutes": round(minutes, 1),
+        },
+    )
+    assert chosen.nrmse <= 0.0042
+    assert narrower >= 0.35
+    # Plain Bouc-Wen, and a model without hysteresis, are told apart from it.
+    assert not {"bouc-wen", "linear"} & set(made.alike)

@@ -29,6 +29,8 @@ COMMANDS = (
     "report",
     "calibrate",
     "compensate",
+    "compare",
+    "design",
     "export",
     "track",
     "config",

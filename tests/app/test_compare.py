@@ -108,7 +108,7 @@ def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
     fit, linear = fits
     time = np.arange(150) / 50
     wave = np.sin(2 * np.pi * time)
-    signals = {"steady": 100 * wave, "fading": 100 * wave * (1 - 0.3 * time), "far": 300 * wave}
+    signals = {"steady": 80 * wave, "fading": 80 * wave * (1 - 0.3 * time), "far": 300 * wave}
     best, second, last = fit.design("beta", candidates=signals)
     assert (best.name, second.name) == ("fading", "steady")
     assert last.refused.startswith("goes from")

@@ -55,7 +55,8 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     posterior = linear_posterior(("d", "offset"), "discrepancy")
     exact = closed_form(posterior)
     draws = np.random.default_rng(1).multivariate_normal(exact.mean, exact.covariance, 40_000)
-    voltage = decaying_sine(150)
+    # Not about zero, so that the offset counts.
+    voltage = 50 + 0.5 * decaying_sine(150)
     (promise,) = promised((posterior, draws), {"sine": voltage}, "d")
     # dx/dd is the lagged voltage, seen by two slopes.
     theta = posterior.prior.theta(exact.mean + np.array([[0.0, 0.0], [1e-3, 0.0]]))

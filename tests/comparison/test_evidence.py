@@ -162,6 +162,7 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     config, case = load(path), load_case(path)
     known = json.loads((FOLDER / "measured_evidence.json").read_text(encoding="utf-8"))
     assert known["digest"] == digest(case)
+    assert isinstance(config.record, RecordConfig)
     start = config.record.start
     assert start is not None
     write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")

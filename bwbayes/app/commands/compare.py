@@ -43,9 +43,10 @@ def compare(
 
     Scores on what was held out, on the training record's own future, log evidence; differences
     with paired errors; what is recommended, and what speaks against it. Of models the first word
-    is an operator; gain, creep, dynamics and noise follow after plus signs.
+    is an operator; gain, creep, dynamics and noise follow after plus signs:
+    --models "linear; bouc-wen + quadratic; maxwell-slip(thresholds=4) + creep".
 
-    Example: bwbayes compare runs/bender.toml --models "linear; bouc-wen; bouc-wen + quadratic"
+    Example: bwbayes compare results/bender results/bender_plays
     """
     from bwbayes.app.config.config import load
     from bwbayes.app.config.models import models_of
