@@ -13,9 +13,9 @@ from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.agreement import Agreement, agreements, numbers, remarks
-from tests.measured import keep
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
+from tests.measured import keep
 
 
 def pair(seed: int, gain: float = 1.0, noise: float = 0.0) -> Posterior:
