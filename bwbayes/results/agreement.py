@@ -50,7 +50,7 @@ ALARM, GROWN = 1e-4, 1.02
 
 # Ratio of its noise to that of all from which on a record's noise is called another one. The
 # discrepancy of a short record may be this much smaller or larger by chance.
-NOISIER = 1.5
+NOISIER = 1.25
 
 # Readings along which residuals are kept, for pictures.
 KEPT = 2000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_stretches_cover_all_samples_and_change_little_in_each() -> None:
     left = Carried(99, np.ones(1), np.ones(1), np.array([0.01]))
     parts = list(left.stretches(100, 5000))
     assert [0, 5000] == [parts[0].start, parts[-1].stop]
-    assert all(one.stop == other.start for one, other in zip(parts[:-1], parts[1:], strict=True))
+    assert all(one.stop == other.start for one, other in pairwise(parts))
     for part in parts:
         ends = [np.sqrt(1.5 - left.less(100 + at)[0]) for at in (part.start, part.stop - 1)]
         assert ends[1] / ends[0] - 1 < 0.02
@@ -112,7 +113,7 @@ def off(hits: FloatArray) -> float:
 
 
 def test_forecasts_cover_what_they_promise_at_every_distance() -> None:
-    """Of 100 records; fails by chance once in 2,000 times. It sees a coverage of 80 % in 9 of 10."""
+    """Of 100 records; fails by chance once in 2,000. It sees a coverage of 80 % in 9 of 10."""
     assert off(inside(RECORDS)) > 1e-4
 
 

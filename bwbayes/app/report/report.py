@@ -23,7 +23,7 @@ __all__ = ["render"]
 
 # Figures by where they stand; those of bands come with the evidence, held-out ones first.
 ANSWER = ("loop",)
-EVIDENCE = ("coverage", "innovations")
+EVIDENCE = ("agreement", "coverage", "innovations")
 
 LEVEL = 95  # %, of the bands that the answer speaks of
 
@@ -89,13 +89,19 @@ def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, by
 
 def _in_order(shown: Mapping[str, Picture], of_bands: list[str]) -> list[Picture]:
     """Return the pictures of the evidence: bands, then what is not in a place of its own."""
-    return [shown[name] for name in (*of_bands, *EVIDENCE) if name in shown]
+    # Of several records "innovations_NAME" is one of the innovations.
+    of_records = [name for kind in EVIDENCE for name in shown if name.partition("_")[0] == kind]
+    return [shown[name] for name in (*of_bands, *of_records) if name in shown]
 
 
 def _about(result: Result) -> str:
     """Return what was fitted to what, in a line."""
     known = result.facts
-    parts = [f"Record: {known['record']}"] if "record" in known else []
+    parts = [
+        f"{subject.capitalize()}: {fact}"
+        for subject, fact in known.items()
+        if subject.partition(" ")[0] == "record"
+    ]
     parts += [f"fitted {known['fitted']}"] if "fitted" in known else []
     held_out = [f"{one.name} ({_span(one)})" for one in result.bands if not one.training]
     parts += [f"predicted {', '.join(held_out)}"] if held_out else []
