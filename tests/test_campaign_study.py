@@ -132,7 +132,7 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
     assert SPECIMENS == len(fitted)
     found: dict[str, Any] = {"specimens": SPECIMENS, "minutes": round(minutes, 1)}
     known = truths()
-    for name in POPULATION:
+    for name, (median, spread) in POPULATION.items():
         own, shrunk, ratio = [], [], []
         for record, values in known.items():
             one, among = fitted[record].parameters[name], ended.among(record, name)
@@ -149,7 +149,6 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
         assert found[name]["width"] < 1.02
         assert ended.population is not None
         told = ended.population.parameters[name]
-        median, spread = POPULATION[name]
         for draws, truth in ((told.mean, median), (told.spread, spread)):
             # 99.9 %, for there is one population.
             assert np.quantile(draws, 0.0005) < truth < np.quantile(draws, 0.9995), name

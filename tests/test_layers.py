@@ -48,6 +48,7 @@ KEEPERS = {
         "bwbayes.app.running.predictions",
     ),
     "corner": ("bwbayes.app.figures*",),
+    "bokeh": ("bwbayes.app.figures.interactive",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),
     "jinja2": ("bwbayes.app.*", "bwbayes.control.exported"),

@@ -175,17 +175,17 @@ def _differences(
     one: Candidate, best: Candidate, generator: np.random.Generator
 ) -> dict[Measure, Difference]:
     """Return what a model has more than the best, by each measure that both have."""
-    found: dict[Measure, Difference] = {}
+    known: dict[Measure, Difference] = {}
     measures: tuple[Measure, ...] = ("held_out", "future")
     for measure in measures:
         ours, theirs = _series(one, measure), _series(best, measure)
         if ours is not None and theirs is not None:
-            found[measure] = paired(ours, theirs, generator)
+            known[measure] = paired(ours, theirs, generator)
     if one.evidence is not None and best.evidence is not None:
         error = 0.0 if one is best else float(np.hypot(one.evidence.error, best.evidence.error))
         value = 0.0 if one is best else _log_evidence(one) - _log_evidence(best)
-        found["evidence"] = Difference(value, error, total=value)
-    return found
+        known["evidence"] = Difference(value, error, total=value)
+    return known
 
 
 def _listed(names: Sequence[str]) -> str:

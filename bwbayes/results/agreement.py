@@ -1,11 +1,11 @@
 """Whether records that were fitted jointly agree: each under the joint fit, and under its own.
 
 A joint fit takes its records for those of one actuator. If one of them was measured with another
-gain, another mounting or another noise, the joint posterior lies between them and fits none. So
-each record is fitted alone, by a point fit, and two things are compared with the joint one: its
-residuals, and where the shared parameters are.
+gain or another mounting, the joint posterior lies between them and fits none. So each record is
+fitted alone, by a point fit with the joint fit's noise, and two things are compared with the joint
+one: its residuals, and where the shared parameters of the actuator are.
 
-With the unconstrained coordinates of the shared parameters, in which the prior is nearly a standard
+With the unconstrained coordinates of these parameters, in which the prior is nearly a standard
 normal, m and C mean and covariance given all records, m_r and C_r those given record r alone,
 
     m_r − m ~ N(0, C_r − C)
@@ -17,20 +17,25 @@ learnt from more is larger by what the posterior's is smaller (the law of total 
 
 has a χ² distribution, with as many degrees of freedom as there are directions that the record
 tells and that others tell more of. (Without a prior it is Hausman's test, Econometrica 46, 1978.)
+
+Another noise shows elsewhere: the innovations of a record at the joint mode have a root mean square
+of 1 if the noise that the records share is its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.results.innovations import innovations
 
 __all__ = ["Agreement", "agreements", "numbers", "remarks"]
 
@@ -42,6 +47,10 @@ TOLD, TAKEN = 0.5, 0.05
 # Probability of a false alarm for a record, and the residual's growth below which a disagreement
 # does not matter, however sure it is.
 ALARM, GROWN = 1e-4, 1.02
+
+# Ratio of its noise to that of all from which on a record's noise is called another one. The
+# discrepancy of a short record may be this much smaller or larger by chance.
+NOISIER = 1.5
 
 # Readings along which residuals are kept, for pictures.
 KEPT = 2000
@@ -60,6 +69,8 @@ class Agreement:
     moved
         The shared parameter that is farthest off, and by how many sds of the difference; empty if
         nothing can be compared.
+    size
+        Root mean square of its innovations at the joint mode, and ``readings`` how many there are.
     time, joint, own
         (readings,) in s and um: the residuals, thinned.
     """
@@ -69,6 +80,8 @@ class Agreement:
     distance: float
     degrees: int
     moved: tuple[str, float]
+    size: float
+    readings: int
     time: FloatArray
     joint: FloatArray
     own: FloatArray
@@ -82,6 +95,13 @@ class Agreement:
     def disagrees(self) -> bool:
         """Whether the record does not go with the others, beyond chance and so that it matters."""
         return self.p_value < ALARM and self.joint_um > GROWN * self.own_um
+
+    @property
+    def noisier(self) -> bool:
+        """Whether its noise is another one than the records share, beyond chance and by much."""
+        squares = self.readings * self.size**2
+        tails = stats.chi2.cdf(squares, self.readings), stats.chi2.sf(squares, self.readings)
+        return min(tails) < ALARM / 2 and not 1 / NOISIER < self.size < NOISIER
 
 
 def agreements(
@@ -108,24 +128,38 @@ def agreements(
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
     for name, alone, its in posterior.each(free):
-        own = pointfit.fit(alone, generator)
-        best, _ = alone.prior.constrain(own.mode[np.newaxis])
+        known = _with_noise(alone, its)
+        own = pointfit.fit(known, generator)
+        best, _ = known.prior.constrain(own.mode[np.newaxis])
         rows = alone.only.readings.rows
-        joint_missed, own_missed = (_residuals(alone, one) for one in (its, best))
-        distance, degrees, moved = _apart(posterior, point, name, own)
+        missed, own_missed = _residuals(alone, its), _residuals(known, best)
+        distance, degrees, moved = _apart(posterior, point, known, own)
+        white = innovations(alone, its[0]).white
         some = slice(None, None, -(-rows.size // KEPT))
         first = (begin or {}).get(name, 0.0)
         compared[name] = Agreement(
-            float(np.sqrt(np.mean(joint_missed**2))),
+            float(np.sqrt(np.mean(missed**2))),
             float(np.sqrt(np.mean(own_missed**2))),
             distance,
             degrees,
             moved,
+            float(np.sqrt(np.mean(white**2))),
+            rows.size,
             first + alone.only.actuator.interval * rows[some].astype(np.float64),
-            joint_missed[some],
+            missed[some],
             own_missed[some],
         )
     return compared
+
+
+def _with_noise(alone: Posterior, free: FloatArray) -> Posterior:
+    """Return the posterior of a record with the noise of some free parameters (1, free) known."""
+    theta, physical = alone.prior.theta(free)[0], alone.table.physical
+    parameters = (
+        p if p.name in physical else replace(p, prior=None, fixed=float(value))
+        for p, value in zip(alone.prior.parameters, theta, strict=True)
+    )
+    return replace(alone, prior=JointPrior(parameters, alone.prior.constraint))
 
 
 def _residuals(alone: Posterior, free: FloatArray) -> FloatArray:
@@ -136,16 +170,20 @@ def _residuals(alone: Posterior, free: FloatArray) -> FloatArray:
 
 
 def _apart(
-    posterior: Posterior, point: PointFit, record: str, own: PointFit
+    posterior: Posterior, point: PointFit, alone: Posterior, own: PointFit
 ) -> tuple[float, int, tuple[str, float]]:
     """Return H, its degrees of freedom, and the parameter that is farthest off."""
-    alone = posterior.alone(record)
     names = [name for name in posterior.names if name in alone.names]
-    here = [posterior.names.index(name) for name in names]
+    physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
+    here = [physical.index(posterior.names.index(name)) for name in names]
     there = [alone.names.index(name) for name in names]
-    moved = own.mode[there] - point.mode[here]
+    if not names:
+        return 0.0, 0, ("", 0.0)
+    moved = own.mode[there] - point.mode[physical][here]
     mine = own.covariance[np.ix_(there, there)]
-    both = point.covariance[np.ix_(here, here)]
+    # The covariance given the noise, as that of the record's own fit is.
+    precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
+    both = linalg.inv(precision)[np.ix_(here, here)]
     # Principal directions of what the record tells, in the prior's sds.
     prior = np.sqrt(np.diag(own.prior_covariance)[there])
     variance, directions = linalg.eigh(mine / np.outer(prior, prior))
@@ -175,6 +213,12 @@ def remarks(every: Mapping[str, Agreement]) -> list[str]:
         f'model.per_record = ["{one.moved[0]}"]'
         for name, one in every.items()
         if one.disagrees
+    ] + [
+        f"{name}: has another noise than the records share: its innovations are {one.size:.2g} "
+        "times as large as they should be; give it a noise of its own with model.per_record = "
+        '["sensor_sd", "discrepancy_sd"]'
+        for name, one in every.items()
+        if one.noisier
     ]
 
 
@@ -190,6 +234,7 @@ def numbers(every: Mapping[str, Agreement]) -> dict[str, object]:
             "farthest": one.moved[0],
             "farthest_sds": one.moved[1],
             "agrees": not one.disagrees,
+            "innovations_rms": one.size,
         }
         for name, one in every.items()
     }

@@ -23,7 +23,7 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 from bwbayes.sampling.diagnostics import pareto_k
 
-__all__ = ["Sway", "remarks", "spectrum", "sway", "undetermined"]
+__all__ = ["Sway", "remarks", "spectrum", "stretches_once", "sway", "undetermined"]
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -274,7 +274,7 @@ def _information(
     slopes = (plus - minus) / (2 * STEP)
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     sds = one.noise.marginal_sd(one.table.noise(posterior.table.of(theta, one.name)))
-    weights, duration = _stretches(one.voltage, rows)
+    weights, duration = stretches_once(one.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sds[1][0], DISCREPANCY * one.extent, duration / 2]])
@@ -285,7 +285,7 @@ def _information(
     return total
 
 
-def _stretches(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
+def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
     """Weight of each sample, one over how often ``rows`` have its stretch; mean samples a stretch.
 
     A stretch that ends early, as a record's last one, counts as a part.

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 
 import arviz_base
 import numpy as np
-from arviz_stats import psense
+from arviz_stats import psense  # type: ignore[attr-defined]  # not in an __all__
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
@@ -85,7 +85,7 @@ class Learned:
 def learned(
     prior: JointPrior,
     draws: FloatArray,
-    log_likelihood: FloatArray,
+    log_density: FloatArray,
     generator: np.random.Generator,
 ) -> Learned:
     """Hold the posterior against the prior.
@@ -96,8 +96,8 @@ def learned(
         The joint prior.
     draws
         (steps, ensembles, walkers, free), parameters in their own units.
-    log_likelihood
-        (steps, ensembles, walkers), nats.
+    log_density
+        (steps, ensembles, walkers), nats, as the chain has it: in its coordinates.
     generator
         Draws from the prior.
 
@@ -106,12 +106,13 @@ def learned(
     N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
-    flat = draws.reshape(-1, draws.shape[-1])
-    thin = flat[:: max(len(flat) // DRAWS, 1)]
+    every = max(log_density.size // DRAWS, 1)
+    thin = draws.reshape(-1, draws.shape[-1])[::every]
+    density = log_density.ravel()[::every] - prior.constrain(prior.unconstrain(thin))[1]
     after = _scores(prior, thin)
     before = _scores(prior, prior.draw(generator, PRIOR_DRAWS))
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
-    by_prior, by_likelihood = _sensitivities(prior, draws, log_likelihood)
+    by_prior, by_likelihood = _sensitivities(prior, thin, density)
     parameters = {
         name: Taught(float(contraction[i]), by_prior[name], by_likelihood[name])
         for i, name in enumerate(prior.free_names)
@@ -120,7 +121,7 @@ def learned(
     return Learned(parameters, combinations, tuple(_remarks(parameters, combinations)))
 
 
-def numbers(found: Learned) -> dict[str, object]:
+def numbers(taught: Learned) -> dict[str, object]:
     """Return it as ``identifiability`` in summary.json."""
     return {
         "parameters": {
@@ -130,10 +131,10 @@ def numbers(found: Learned) -> dict[str, object]:
                 "likelihood_sensitivity": one.likelihood,
                 "prior_decides": one.prior_decides,
             }
-            for name, one in found.parameters.items()
+            for name, one in taught.parameters.items()
         },
-        "combinations": [asdict(one) for one in found.combinations],
-        "remarks": list(found.remarks),
+        "combinations": [asdict(one) for one in taught.combinations],
+        "remarks": list(taught.remarks),
     }
 
 
@@ -150,28 +151,22 @@ def _scores(prior: JointPrior, free: FloatArray) -> FloatArray:
 def _sensitivities(
     prior: JointPrior, draws: FloatArray, log_likelihood: FloatArray
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Power-scaling sensitivities to prior and likelihood, by parameter."""
-    steps = draws[:: max(draws[..., 0].size // DRAWS, 1)]
-    density = log_likelihood[:: max(draws[..., 0].size // DRAWS, 1)]
+    """Return power-scaling sensitivities to prior and likelihood, by parameter.
 
-    def chains(values: FloatArray) -> FloatArray:
-        return values.reshape(1, -1, *values.shape[3:])
-
-    log_prior = prior.log_density(steps.reshape(-1, steps.shape[-1])).reshape(density.shape)
-    flat = chains(steps)
+    From draws (draws, free), taken as one chain: weights depend on no order.
+    """
     tree = arviz_base.from_dict(
         {
-            "posterior": {name: flat[..., i] for i, name in enumerate(prior.free_names)},
-            "log_prior": {"joint": chains(log_prior)},
-            "log_likelihood": {"joint": chains(density)},
-        },
-        check_conventions=False,
+            "posterior": {name: draws[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},
+            "log_prior": {"joint": prior.log_density(draws)[np.newaxis]},
+            "log_likelihood": {"joint": log_likelihood[np.newaxis]},
+        }
     )
-    found = []
+    taught = []
     for group in ("prior", "likelihood"):
         said = psense(tree, group=group)
-        found.append({name: float(said[name]) for name in prior.free_names})
-    return found[0], found[1]
+        taught.append({name: float(said[name]) for name in prior.free_names})
+    return taught[0], taught[1]
 
 
 def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -> list[Combination]:
@@ -182,7 +177,7 @@ def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -
     """
     prior, posterior = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (before, after))
     variances, directions = linalg.eigh(posterior, prior)
-    said = []
+    said: list[Combination] = []
     for i in range(len(variances) - 1, -1, -1):
         left = float(np.sqrt(max(variances[i], 0.0)))
         if left < LEFT or len(said) == COMBINATIONS:

@@ -2,9 +2,9 @@
 
 Every draw simulates the record from its first sample; given a draw, a reading is normal around its
 simulation, and the bands are quantiles of the mixture over all draws, to 2e-4 of its standard
-deviation. The record is walked through in pieces, so memory does not grow with its length. The
-discrepancy enters by its marginal distribution, on training windows too, where the smoothed one
-would promise more than a new record can keep.
+deviation. The record is walked through in pieces, so memory does not grow with its length. But for
+a forecast, the discrepancy enters by its marginal distribution, on training windows too, where the
+smoothed one would promise more than a new record can keep.
 
 Windows of the training record share its simulation and its offset. Another record has a start of
 its own, see :mod:`bwbayes.results.start`.
@@ -27,7 +27,7 @@ from bwbayes.model.actuator import State
 from bwbayes.results import mixture
 from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.results.start import Start, Started, fitted, started
+from bwbayes.results.start import Start, Started, fitted, going_on, started
 
 __all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "thinned"]
 
@@ -50,11 +50,13 @@ class _Draws:
     discrepancy: FloatArray
     sensor: FloatArray
 
-    def sds(self, kind: Kind) -> FloatArray:
-        """Sd of a band's quantity, given a draw, um."""
+    def sds(self, kind: Kind, sample: float) -> FloatArray:
+        """Sd of a band's quantity at a sample, given a draw, um."""
         variance = self.start.offset_sd**2
         if kind != "parameter":
             variance = variance + self.discrepancy**2
+            if self.start.carried is not None:
+                variance = np.maximum(variance - self.start.carried.less(sample), 0.0)
         if kind == "sensor":
             variance = variance + self.sensor**2
         return np.sqrt(variance)
@@ -111,9 +113,10 @@ def forecast(
     """Predict what follows on the training record: its last sample goes on into a planned voltage.
 
     Hysteresis, dynamics and creep start from where the record leaves them, and the sensor keeps its
-    offset. The discrepancy has its marginal distribution from the first sample on, so the band of
-    the first moments is wider than what the last readings would allow. Creep with a time longer
-    than the record is known by its prior alone: the model needs times up to the forecast's length.
+    offset. The discrepancy goes on from where the fitted readings leave it
+    (:mod:`bwbayes.results.carried`): the band is narrower at first, and as wide as ever later.
+    Creep with a time longer than the record is known by its prior alone: the model needs times up
+    to the forecast's length.
 
     Parameters
     ----------
@@ -137,7 +140,10 @@ def forecast(
     joined = np.concatenate([record.voltage, planned])
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     after = slice(record.samples, longer.samples)
-    return predict_windows(posterior, draws, longer, {name: after}, generator)[0]
+    theta = posterior.prior.theta(draws)
+    begun = fitted(posterior, theta, generator)
+    begun = going_on(begun, posterior.likelihood, theta, generator)
+    return _bands(name, _draws(posterior, theta, begun), longer, after)
 
 
 def predict_record(
@@ -231,12 +237,34 @@ def _summarised(
     mixed: _Draws, record: Record, first: int, simulated: FloatArray
 ) -> dict[str, FloatArray]:
     """Mean, band edges, and the judgement of the readings, each (samples,)."""
+    carried = mixed.start.carried
+    if carried is None:
+        return _stretch(mixed, record, first, simulated, simulated)
+    expected = simulated + carried.means(first, simulated.shape[1])
+    parts = [
+        _stretch(mixed, record, first + part.start, simulated[:, part], expected[:, part])
+        for part in carried.stretches(first, simulated.shape[1])
+    ]
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def _stretch(
+    mixed: _Draws, record: Record, first: int, simulated: FloatArray, expected: FloatArray
+) -> dict[str, FloatArray]:
+    """Do it along a stretch in which the sds do not change.
+
+    ``simulated`` (draws, samples) are the model's displacements, ``expected`` with what is known of
+    the discrepancy.
+    """
     tails = np.array([(100 - level) / 200 for level in LEVELS])
-    summarised = {"mean": np.mean(simulated, axis=0)}
+    middle = first + simulated.shape[1] / 2
+    summarised = {"mean": np.mean(expected, axis=0)}
     spread = {}
     for kind in KINDS:
         edges, spread[kind] = quantiles_and_spread(
-            simulated, mixed.sds(kind), np.concatenate([tails, 1 - tails])
+            simulated if kind == "parameter" else expected,
+            mixed.sds(kind, middle),
+            np.concatenate([tails, 1 - tails]),
         )
         for i, level in enumerate(LEVELS):
             summarised[f"{kind} {level} lower"] = edges[i]
@@ -246,7 +274,7 @@ def _summarised(
         seen = np.isfinite(reading)
         judged = np.full((3, reading.size), np.nan)
         if seen.any():
-            of = simulated[:, seen], mixed.sds("sensor"), reading[seen]
+            of = expected[:, seen], mixed.sds("sensor", middle), reading[seen]
             judged[:2, seen] = mixture.judged(*of)
             judged[2, seen] = mixture.log_density(*of)
         summarised["pit"] = judged[0]

@@ -118,10 +118,10 @@ def replicated(
     )
 
 
-def numbers(found: Replicated) -> dict[str, object]:
+def numbers(checked: Replicated) -> dict[str, object]:
     """Return it as ``replicated`` in summary.json."""
     return {
-        "records": found.records,
+        "records": checked.records,
         "statistics": {
             name: {
                 "observed": one.observed,
@@ -130,7 +130,7 @@ def numbers(found: Replicated) -> dict[str, object]:
                 "p": one.p,
                 "odd": one.odd,
             }
-            for name, one in found.statistics.items()
+            for name, one in checked.statistics.items()
         },
     }
 

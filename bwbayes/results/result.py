@@ -14,11 +14,13 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import agreement, innovations, loops, steps
+from bwbayes.results import agreement, innovations, learned, loops, replicated, steps
 from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
+from bwbayes.results.learned import Learned
 from bwbayes.results.loops import Loops
+from bwbayes.results.replicated import Replicated
 from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
@@ -62,6 +64,10 @@ class Result:
         converged.
     agreement
         Of several records, how each agrees with the others, by name; empty unless converged.
+    learned
+        What the record taught: prior against posterior; None unless converged.
+    replicated
+        Each fitted record among replicated ones, by name; empty unless converged.
     facts
         What was run, for people: one line each, by subject.
     remarks
@@ -83,6 +89,8 @@ class Result:
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
     agreement: Mapping[str, Agreement] = field(default_factory=dict)
+    learned: Learned | None = None
+    replicated: Mapping[str, Replicated] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -106,8 +114,9 @@ class Result:
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
-    ``parameters``, ``validation``, ``innovations``, ``loops`` and ``step_responses`` are
-    None unless the sampling has converged; ``agreement`` is there for several records alone.
+    ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
+    ``identifiability`` and ``replicated`` are None unless the sampling has converged;
+    ``agreement`` is there for several records alone.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -128,6 +137,8 @@ def summary(result: Result) -> dict[str, object]:
         "innovations": None,
         "loops": None,
         "step_responses": None,
+        "identifiability": None,
+        "replicated": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -143,6 +154,11 @@ def summary(result: Result) -> dict[str, object]:
             known["agreement"] = agreement.numbers(result.agreement)
         if result.loops is not None:
             known["loops"] = loops.numbers(result.loops)
+        if result.learned is not None:
+            known["identifiability"] = learned.numbers(result.learned)
+        known["replicated"] = {
+            name: replicated.numbers(one) for name, one in result.replicated.items()
+        } or None
         known["step_responses"] = steps.numbers(result.steps)
     return known
 

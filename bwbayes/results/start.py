@@ -27,9 +27,10 @@ from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
+from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
 
-__all__ = ["Start", "Started", "fitted", "started"]
+__all__ = ["Start", "Started", "fitted", "going_on", "started"]
 
 # Slow departures of a lead-in that are looked for, as polynomials of the time up to this degree, if
 # there are so many readings; and draws for which they are.
@@ -58,6 +59,9 @@ class Start:
         is simulated.
     hold
         What the voltage does between samples; by default what the record says of its voltage.
+    after
+        What comes after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
+        readings leave it (:mod:`bwbayes.results.carried`).
     """
 
     from_rest: bool = False
@@ -65,6 +69,7 @@ class Start:
     lead_in: float = 1.0
     lead_in_from: float | None = None
     hold: Hold | None = None
+    after: bool = False
 
     def window(self, record: Record) -> slice | None:
         """Return the samples of the lead-in, or None if nothing can be learned from one.
@@ -72,9 +77,17 @@ class Start:
         Raises
         ------
         InputError
-            It reaches outside the record, leaves nothing of it, or holds no reading.
+            It reaches outside the record, leaves nothing of it, or holds no reading; a forecast of
+            a record without any.
         """
-        if record.displacement is None or (self.from_rest and not self.own_offset):
+        if self.after and record.displacement is None:
+            raise InputError(
+                f"{record.origin}: has no readings after which a forecast could start; give a "
+                "record with a measured lead-in, or leave the forecast out"
+            )
+        if record.displacement is None:
+            return None
+        if self.from_rest and not self.own_offset and not self.after:
             return None
         begin = record.start if self.lead_in_from is None else self.lead_in_from
         first = round((begin - record.start) / record.interval)
@@ -101,7 +114,8 @@ class Started:
     of them it is; ``model`` (draws, parameters of the actuator) with initial state and offset;
     ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of
     the offset still; ``from_rest`` if the record starts so; ``lead_in`` says how that went, if
-    there is one, and ``judged_from`` is the first sample after it.
+    there is one, and ``judged_from`` is the first sample after it; ``carried`` is what its readings
+    leave of the discrepancy, for a forecast.
     """
 
     actuators: tuple[Actuator, ...]
@@ -112,6 +126,7 @@ class Started:
     from_rest: bool
     lead_in: LeadIn | None = None
     judged_from: int = 0
+    carried: Carried | None = None
 
     def advance(
         self, voltage: FloatArray, states: Sequence[State | None] = ()
@@ -163,7 +178,25 @@ def started(
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
     histories, begun = chosen(likelihoods, theta, generator)
-    return _informed(histories, begun, record, window, generator)
+    told = _informed(histories, begun, record, window, generator)
+    return going_on(told, likelihoods[0], theta, generator) if start.after else told
+
+
+def going_on(
+    start: Started, likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator
+) -> Started:
+    """Let the discrepancy go on from where the readings of a likelihood leave it.
+
+    What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
+    """
+    column = start.actuators[0].parameters.index("offset")
+    model = start.model.copy()
+    if start.offset_sd.any():
+        model[:, column] += start.offset_sd * ndtri(uniform(generator, len(model)))
+    begun = replace(start, model=model, offset_sd=np.zeros(len(model)))
+    rows = likelihood.readings.rows
+    simulated = begun.advance(likelihood.voltage[: likelihood.readings.samples])[0][:, rows]
+    return replace(begun, carried=carried(likelihood, theta, simulated))
 
 
 def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from scipy import fft
 from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -123,6 +124,26 @@ class Check:
             shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
             reasons.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
         return reasons
+
+
+class _Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
+    """arviz's statistics, with autocovariances that are averaged over chains at once.
+
+    That is all that arviz's effective draws look at. One transform back serves all chains.
+    """
+
+    def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
+        """Mean autocovariance (1, steps) of chains (chains, steps)."""
+        assert axis in (-1, 1)
+        steps = ary.shape[1]
+        padded = fft.next_fast_len(2 * steps, real=True)
+        spectrum = fft.rfft(ary - np.mean(ary, axis=1, keepdims=True), padded)
+        power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
+        covariance: FloatArray = fft.irfft(power, padded)[:, :steps] / steps
+        return covariance
+
+
+AVERAGED = _Averaged()
 
 
 def _told(value: float, limit: float, digits: int = 0) -> str:
@@ -268,11 +289,11 @@ def _effective_draws(
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = _ensemble_mean_ess(draws)
-        bulk = array_stats.ess(scores, method="mean")
+        bulk = AVERAGED.ess(scores, method="mean")
         # A comparison would take what is not a number for a draw beyond the tail.
         low, high = (np.where(np.isnan(scores), np.nan, scores <= ndtri(part)) for part in TAIL)
-        tails = [array_stats.ess(tail, method="mean") for tail in (low, high)]
-        mean = array_stats.ess(_series(draws), method="mean")
+        tails = [AVERAGED.ess(tail, method="mean") for tail in (low, high)]
+        mean = AVERAGED.ess(_series(draws), method="mean")
     every = bulk, np.min(tails, axis=0), mean
     bulk, tail, mean = (np.minimum(np.atleast_1d(ess), cap) for ess in every)
     return bulk, tail, mean

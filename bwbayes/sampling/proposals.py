@@ -22,7 +22,10 @@ __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 CUTS = (0.5, 0.85)
 COMPONENTS = len(CUTS) + 1
 
-ROUNDS = 50
+# Rounds of the fit: first with so many of the draws that its cost does not count, then with all.
+ROUGH_ROUNDS = 40
+ROUGH_DRAWS = 4096
+ROUNDS = 10
 
 # Part of the covariance of all components together that each keeps: the draws of a pilot are few.
 # That of all draws would be far too wide where components are modes apart.
@@ -150,19 +153,21 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
-        shape = np.asarray(skew(draws, axis=0))
-        most = int(np.argmax(np.abs(shape)))
-        # Ranks from the body of the distribution to its longer tail.
-        along = draws[:, most] * (1 if shape[most] >= 0 else -1)
-        start = np.searchsorted(np.quantile(along, CUTS), along)
-        share = _kept_alive(np.equal.outer(np.arange(COMPONENTS), start))
+        # An odd stride, or the same few walkers might be taken at every step.
+        some = draws[:: -(-len(draws) // ROUGH_DRAWS) | 1]
+        mixture = _first_cut(some)
+        for _ in range(ROUGH_ROUNDS):
+            mixture = mixture._fitted_on(some)
         for _ in range(ROUNDS):
-            mixture = cls(share.mean(axis=1), tuple(_components(draws, share)))
-            parts = [_gaussian(component, draws) for component in mixture.components]
-            logs = np.log(mixture.weights)[:, np.newaxis] + np.stack(parts)
-            density = np.exp(logs - np.max(logs, axis=0))
-            share = _kept_alive(density / np.sum(density, axis=0))
+            mixture = mixture._fitted_on(draws)
         return mixture
+
+    def _fitted_on(self, draws: FloatArray) -> StudentMixture:
+        """Take a round of expectation maximisation."""
+        parts = [_gaussian(component, draws) for component in self.components]
+        logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
+        density = np.exp(logs - np.max(logs, axis=0))
+        return _of_shares(draws, _kept_alive(density / np.sum(density, axis=0)))
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free), up to a constant."""
@@ -193,6 +198,21 @@ def _require_spread(draws: FloatArray) -> None:
     plane = np.column_stack([np.ones(len(draws)), draws])
     if np.linalg.matrix_rank(plane) < plane.shape[1]:
         raise np.linalg.LinAlgError("the draws do not span the space")
+
+
+def _first_cut(draws: FloatArray) -> StudentMixture:
+    """Cut draws (count, free) along their most skewed coordinate."""
+    shape = np.asarray(skew(draws, axis=0))
+    most = int(np.argmax(np.abs(shape)))
+    # Ranks from the body of the distribution to its longer tail.
+    along = draws[:, most] * (1 if shape[most] >= 0 else -1)
+    start = np.searchsorted(np.quantile(along, CUTS), along)
+    return _of_shares(draws, _kept_alive(np.equal.outer(np.arange(COMPONENTS), start)))
+
+
+def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:
+    """Return the mixture whose components have these shares (components, count) of draws."""
+    return StudentMixture(share.mean(axis=1), tuple(_components(draws, share)))
 
 
 def _kept_alive(share: FloatArray) -> FloatArray:

@@ -75,8 +75,9 @@ LEAST_STRETCH = 1.2
 APART = 1.2
 FIRST_PART = 0.5
 
-# Walkers times samples below which a step is mostly Python's work.
+# Walkers times samples below which a step is mostly Python's work, and below which half is.
 LIGHT = 1 << 16
+MEDIUM = 1 << 18
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -138,10 +139,11 @@ class Outcome:
 def best_together(ensembles: int, walkers: int, samples: int) -> int:
     """Return how many ensembles to move with one call, on a record of so many samples.
 
-    All where a step is light: threads would wait for each other's Python. Else each by itself, so
-    that threads can share the work.
+    All where a step is light: threads would wait for each other's Python. Half of them, for two
+    threads, where the models take as long as Python does. Else each by itself.
     """
-    return ensembles if walkers * samples <= LIGHT else 1
+    size = walkers * samples
+    return ensembles if size <= LIGHT else ensembles // 2 if size <= MEDIUM else 1
 
 
 def first_chain(

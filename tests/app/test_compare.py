@@ -7,6 +7,7 @@ import json
 import re
 import warnings
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -98,9 +99,22 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
         assert [row["name"] for row in csv.DictReader(file)] == ["bouc-wen", "linear"]
     page = (folder / "comparison.html").read_text(encoding="utf-8")
     for line in (*made.lines, *made.against):
-        assert line in page
+        assert escape(line) in page
     evidence = said["models"]["bouc-wen"]["log_evidence"]
     assert f"{evidence:.2f}" in page
+
+
+def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
+    fit, linear = fits
+    time = np.arange(150) / 50
+    wave = np.sin(2 * np.pi * time)
+    signals = {"steady": 100 * wave, "fading": 100 * wave * (1 - 0.3 * time), "far": 300 * wave}
+    best, second, last = fit.design("beta", candidates=signals)
+    assert (best.name, second.name) == ("fading", "steady")
+    assert last.refused.startswith("goes from")
+    assert linear.design(50 * wave, voltages=(-100, 100))[0].left < 1
+    with pytest.raises(InputError, match="is not a free parameter"):
+        linear.design("beta")
 
 
 def test_other_records_windows_and_held_out_parts_are_refused(

@@ -14,6 +14,7 @@ import bwbayes as bw
 from bwbayes.app.commands.export import export as command
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.jobs.export import export
+from bwbayes.app.jobs.track import Setup, track_run
 from bwbayes.errors import InputError, NotConvergedError
 from tests.app import small
 
@@ -86,7 +87,15 @@ def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
         NotConvergedError, match=r"run: not converged: .* go on with `bwbayes resume"
     ):
         export(made.path)
-    assert not (made.path / "export").exists()
+    with pytest.raises(NotConvergedError, match=r"run: not converged: .* go on with `bwb"):
+        track_run(made.path, None, Setup())
+    fit = bw.open_run(made.path)
+    with pytest.raises(NotConvergedError, match="not converged"):
+        fit.track()
+    with pytest.raises(NotConvergedError, match="not converged"):
+        fit.export(tmp_path / "out")
+    left = (made.path / "export", made.path / "track", tmp_path / "out")
+    assert not any(path.exists() for path in left)
 
 
 def test_the_command_says_what_it_wrote(

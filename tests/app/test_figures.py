@@ -21,7 +21,7 @@ from matplotlib.patches import StepPatch
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
-from bwbayes.app.figures.loop import _along, draw_loop
+from bwbayes.app.figures.loop import along, draw_loop
 from bwbayes.app.figures.series import _around_largest_error, draw_bands
 from bwbayes.app.figures.style import STYLE, envelope, zigzag
 from bwbayes.inference.parameters import Parameter
@@ -315,13 +315,13 @@ def test_thinned_band_holds_the_band_everywhere() -> None:
 def test_loop_keeps_the_samples_of_a_fast_signal_and_few_of_a_slow_one() -> None:
     time = np.arange(20_000) / 1000
     fast, slow = (np.sin(2 * np.pi * f * time) for f in (97.3, 0.05))
-    assert 19_900 < _along(fast, fast).size
-    assert 1_200 > _along(slow, slow).size > 600
+    assert 19_900 < along(fast, fast).size
+    assert 1_200 > along(slow, slow).size > 600
 
 
 def test_loop_is_drawn_to_its_last_sample() -> None:
     voltage = np.linspace(0, 1, 777)
-    kept = _along(voltage, voltage)
+    kept = along(voltage, voltage)
     assert (0, 776) == (kept[0], kept[-1])
 
 

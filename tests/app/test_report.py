@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from bwbayes.app.figures import interactive
 from bwbayes.app.report.report import render
 from bwbayes.app.report.words import digits, symbol
 from bwbayes.inference.parameters import Parameter
@@ -105,12 +106,12 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
     run = dataclasses.replace(run, scores={**run.scores, "held-out": example.scores(truth=False)})
     text = page(run)
     table = rows(text, "validation")
-    assert re.search(r"training \(fitted\)</th><th[^>]*>held-out \(not fitted\)</th>", text)
+    assert re.search(r"held-out \(not fitted\)</th><th[^>]*>training \(fitted\)</th>", text)
     assert ["1.23 %"] * 2 == table["NRMSE of the mean"]
     assert ["5.52 µm"] * 2 == table["Largest error of the mean"]
     assert ["0.817 µm"] * 2 == table["CRPS"]
     assert ["94.3 ± 1.3 %"] * 2 == table["95 % sensor band covers readings"]
-    assert ["91.5 ± 2.5 %", "–"] == table["90 % displacement band covers displacement"]
+    assert ["–", "91.5 ± 2.5 %"] == table["90 % displacement band covers displacement"]
     assert ["12.1 %"] * 2 == table["50 % sensor band: worst second"]
     assert ["6.13 µm"] * 2 == table["95 % sensor band: mean width"]
     assert ["8.22 µm"] * 2 == table["90 % sensor band: interval score"]
@@ -136,12 +137,13 @@ def test_draws_without_a_proposal_have_no_pareto_k() -> None:
 
 def test_bands_without_a_measurement_have_no_validation() -> None:
     text = page(example.run(every=(example.bands(measured=False),)))
-    assert "Validation" not in text
+    assert 'id="validation"' not in text
+    assert "There are no readings to check the bands against." in text
 
 
 def test_verdict_of_a_converged_run() -> None:
     text = page(example.run())
-    assert "<strong>Converged</strong>" in text
+    assert "<strong>Converged" in text
     assert "NOT CONVERGED" not in text
     assert "two good checks" in text
 
@@ -186,7 +188,7 @@ def test_chains_without_a_spread_can_be_reported(value: float) -> None:
 
 
 def test_pictures_are_inside_the_page_answer_before_evidence_before_details() -> None:
-    sources = re.findall(r'src="(.*?)"', page(example.run()))
+    sources = re.findall(r'<img [^>]*src="(.*?)"', page(example.run()))
     order = ("loop", "bands_held-out", "bands_training", "coverage", "corner", "trace", "ranks")
     expected = [b64encode(PICTURES[name]).decode() for name in order]
     assert [f"data:image/png;base64,{text}" for text in expected] == sources
@@ -194,11 +196,17 @@ def test_pictures_are_inside_the_page_answer_before_evidence_before_details() ->
 
 @pytest.mark.parametrize("converged", [True, False])
 def test_page_needs_nothing_from_elsewhere(converged: bool) -> None:
+    """Nor does it run any script but its own, which is there only if there are plots."""
     text = page(example.run(converged=converged))
     assert text.startswith("<!DOCTYPE html>")
+    own = [script.text for script in interactive.scripts()] if converged else []
+    assert own == re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    digests = re.findall(r"'(sha256-.*?)'", text[: text.index("<title>")])
+    assert [script.digest for script in interactive.scripts()][: len(own)] == digests
+    text = re.sub(r"<script( type=.application/json.)?>.*?</script>", "", text, flags=re.DOTALL)
     for outside in ("http:", "https:", "//", "<script", "<link", "@import", "url(", "srcset"):
         assert outside not in text.replace("base64,//", "")
-    assert all(s.startswith("data:") for s in re.findall(r'src\s*=\s*"(.*?)"', text))
+    assert all(s.startswith("data:") for s in re.findall(r'src="(.*?)"', text))
     assert all(s.startswith(("#", "data:text/csv")) for s in re.findall(r'href="(.*?)"', text))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.shared import finish
 from bwbayes.app.commands.track import track as command
 from bwbayes.app.jobs.track import Setup, track_run
 from bwbayes.control.tracking import CONTROLLERS
-from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.errors import InputError
 from tests.app import small
 
 FEW = ("--frequency", "2", "--frequency", "5", "--draws", "5")
@@ -27,14 +27,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small.finished(tmp_path_factory)
 
 
+@pytest.fixture(scope="module")
+def fit(run: Path) -> bw.Fit:
+    return bw.open_run(run)
+
+
 def test_numbers_table_and_picture_agree(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, fit: bw.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(run, tmp_path / "run")
     assert 0 == command.main([str(tmp_path / "run"), *FEW], standalone_mode=False)
     folder, said = tmp_path / "run/track", capsys.readouterr()
     assert "" == said.err
-    for kind in ("json", "csv", "png"):
+    for kind in ("json", "csv", "png", "html"):
         assert f"wrote {folder / f'track.{kind}'}\n" in said.out
     numbers = json.loads((folder / "track.json").read_text())
     with (folder / "track.csv").open(newline="") as file:
@@ -46,9 +51,15 @@ def test_numbers_table_and_picture_agree(
         assert 0 <= known["rms_um_low"] <= known["rms_um_high"] <= known["largest_um_high"]
     assert (5, True) == (numbers["draws"], numbers["robustness"]["stable"])
     assert (folder / "track.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "track.html").read_text(encoding="utf-8")
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
+    assert f"{numbers['table'][0]['rms_um']:.2f}</td>" in page
+    least = min(one["share"] for one in numbers["best_share"])
+    assert f"in at least {100 * least:.0f} % of the draws" in page
     # The same draws and noise in Python, and on the command line again.
-    again = bw.open_run(run).track(frequencies=(2.0, 5.0), draws=5)
+    again = fit.track(frequencies=(2.0, 5.0), draws=5)
     assert numbers["table"] == again.numbers()["table"]
+    assert 4 == len(fit.plot.tracking(again).axes)
     with pytest.raises(InputError, match=r"track\.json: exists; choose another folder, or give"):
         track_run(tmp_path / "run", None, Setup(draws=5))
 
@@ -68,25 +79,15 @@ def test_numbers_table_and_picture_agree(
     ],
 )
 def test_options_that_make_no_sense_are_one_line(
-    run: Path, options: dict[str, Any], line: str
+    fit: bw.Fit, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line) as error:
-        bw.open_run(run).track(**options)
+        fit.track(**options)
     assert "\n" not in str(error.value)
 
 
-def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
-    made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
-    assert 4 == finish(made.path, 1, quiet=True)
-    with pytest.raises(NotConvergedError, match=r"run: not converged: .* go on with `bwb"):
-        track_run(made.path, None, Setup())
-    with pytest.raises(NotConvergedError, match="not converged"):
-        bw.open_run(made.path).track()
-    assert not (made.path / "track").exists()
-
-
-def test_the_draws_that_are_simulated_are_some_of_those_that_must_be_stable(run: Path) -> None:
-    made = bw.open_run(run).track(frequencies=(5.0,), draws=4, rate=500.0, delay=2)
+def test_the_draws_that_are_simulated_are_some_of_those_that_must_be_stable(fit: bw.Fit) -> None:
+    made = fit.track(frequencies=(5.0,), draws=4, rate=500.0, delay=2)
     assert (4, 4) == made.rms.shape[2:]
     assert 200 < made.margins.gain.size <= 1000
     assert (2e-3, 2) == (made.gains.interval, made.stand.delay)

@@ -11,6 +11,7 @@ from rich.console import Console
 from bwbayes.app.running.workers import one_thread
 from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
+from tests.benchmarks.control import controller
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
 from tests.measured import keep
@@ -68,6 +69,7 @@ def _measured(effort: Effort) -> Iterator[Table]:
     yield likelihood.hysteresis_alone(posterior, effort)
     yield likelihood.threads(posterior, effort)
     yield from effective.sampling(effort)
+    yield controller(effort)
     yield startup(effort)
 
 

@@ -164,8 +164,8 @@ def share_beyond(block_factor: float = 1.0) -> float:
             series[i] = 0.7 * series[i - 1] + fresh[i]
         series = series[100:]
         common = source.normal(size=600)
-        found = paired(common + series, common, source)
-        beyond += abs(found.value) > 2 * block_factor * found.error
+        got = paired(common + series, common, source)
+        beyond += abs(got.value) > 2 * block_factor * got.error
     return beyond / 400
 
 

@@ -45,9 +45,9 @@ def posterior_of_rows(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     mean, sd = prior_moments(posterior)
     rows = posterior.only.readings.rows
     weighted = linalg.solve(noise[np.ix_(rows, rows)], design[rows], assume_a="pos")
-    found = linalg.inv(design[rows].T @ weighted + np.diag(sd**-2.0))
-    shift = found @ weighted.T @ (posterior.only.displacement - level)[rows]
-    return mean + shift, found
+    made = linalg.inv(design[rows].T @ weighted + np.diag(sd**-2.0))
+    shift = made @ weighted.T @ (posterior.only.displacement - level)[rows]
+    return mean + shift, made
 
 
 def parts(posterior: Posterior) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -71,11 +71,11 @@ def test_each_stretch_is_predicted_from_what_came_before(posterior: Posterior) -
     """Against the closed form of each reading's density, given the readings before its stretch."""
     record = Record(posterior.only.voltage, posterior.only.displacement, INTERVAL)
     with ThreadPoolExecutor(1) as pool, one_thread():
-        found = future(posterior, PLAN, record, np.random.default_rng(1), pool)
+        made = future(posterior, PLAN, record, np.random.default_rng(1), pool)
     rows = posterior.only.readings.rows
-    assert found.converged
+    assert made.converged
     half = rows.size // 2
-    np.testing.assert_array_equal(found.rows, rows[half:])
+    np.testing.assert_array_equal(made.rows, rows[half:])
     design, level, noise = parts(posterior)
     expected = []
     for first, last in ((half, round(0.75 * rows.size)), (round(0.75 * rows.size), rows.size)):
@@ -86,14 +86,14 @@ def test_each_stretch_is_predicted_from_what_came_before(posterior: Posterior) -
         spread = np.einsum("ri,ij,rj->r", design[some], known, design[some])
         sds = np.sqrt(spread + np.diag(noise)[some])
         expected.append(stats.norm.logpdf(posterior.only.displacement[some], middle, sds))
-    np.testing.assert_allclose(found.log_score, np.concatenate(expected), atol=0.01)
+    np.testing.assert_allclose(made.log_score, np.concatenate(expected), atol=0.01)
     # The twin: from all readings the scores are others, by more than that.
     mean, _ = posterior_of_rows(posterior)
     middle = level + design @ (mean - prior_moments(posterior)[0])
     fitted = stats.norm.logpdf(
         posterior.only.displacement[rows[half:]], middle[rows[half:]], np.sqrt(noise[0, 0])
     )
-    assert np.max(np.abs(fitted - found.log_score)) > 0.02
+    assert np.max(np.abs(fitted - made.log_score)) > 0.02
 
 
 def test_weighted_draws_are_those_of_the_later_posterior(posterior: Posterior) -> None:

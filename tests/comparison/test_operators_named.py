@@ -114,15 +114,15 @@ def compared(record: Record, operators: Iterable[str], *, say: bool = False) -> 
     return compare(runs, Console(quiet=True), workers=1, with_future=False)
 
 
-def right(operator: str, found: Comparison) -> bool:
+def right(operator: str, made: Comparison) -> bool:
     """Whether the truth is named, or left open with what is named."""
-    return operator == found.recommended or operator in found.alike
+    return operator == made.recommended or operator in made.alike
 
 
-def none_worse(found: Comparison) -> bool:
+def none_worse(made: Comparison) -> bool:
     """Whether what is recommended is not worse on the held-out readings by two errors."""
-    assert found.recommended is not None
-    return not found.differences[found.recommended]["held_out"].beyond
+    assert made.recommended is not None
+    return not made.differences[made.recommended]["held_out"].beyond
 
 
 @pytest.mark.slow
@@ -131,24 +131,24 @@ def test_the_right_operator_is_named_or_left_open() -> None:
     named = []
     for number in range(20):
         operator = NINE[number % len(NINE)]
-        found = compared(simulated(operator, number), NINE)
-        assert none_worse(found)
-        named.append(right(operator, found))
+        made = compared(simulated(operator, number), NINE)
+        assert none_worse(made)
+        named.append(right(operator, made))
     keep("operators named", {"right": int(np.sum(named)), "records": len(named)})
     assert np.sum(named) >= 18
 
 
 def test_a_bouc_wen_record_is_told_from_other_operators_and_from_none() -> None:
     """The quick twin, with three operators."""
-    found = compared(simulated("bouc-wen", 1), ("bouc-wen", "maxwell-slip", "linear"))
-    assert right("bouc-wen", found)
-    assert none_worse(found)
-    assert "linear" not in (found.recommended, *found.alike)
+    made = compared(simulated("bouc-wen", 1), ("bouc-wen", "maxwell-slip", "linear"))
+    assert right("bouc-wen", made)
+    assert none_worse(made)
+    assert "linear" not in (made.recommended, *made.alike)
 
 
 def test_a_record_without_hysteresis_is_said_to_have_none() -> None:
     record = simulated("linear", 1)
     assert isinstance(problem(record, "linear").posterior.only.actuator.hysteresis, NoHysteresis)
-    found = compared(record, ("bouc-wen", "linear"))
-    assert found.recommended == "linear"
-    assert any("no hysteresis" in line for line in found.lines)
+    made = compared(record, ("bouc-wen", "linear"))
+    assert made.recommended == "linear"
+    assert any("no hysteresis" in line for line in made.lines)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +19,11 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from tests.control import cases
+from tests.control.compiled import Compiled
 from tests.programs import needs
 
 every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
 every_hold = pytest.mark.parametrize("hold", cases.HOLDS)
-
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
-
-# Bytes for a state, whatever the model.
-STATE = 4096
 
 
 def of(name: str, hold: Hold, limits: Span = cases.SPAN) -> Exported:
@@ -42,34 +36,12 @@ def simulated(system: Any, drive: FloatArray) -> FloatArray:
     return np.asarray(dlsim(system, drive)[1])
 
 
-class Compiled:
-    """The C file as functions of arrays."""
-
-    def __init__(self, made: Exported, folder: Path) -> None:
-        (folder / "actuator.c").write_text(made.c_code(), encoding="ascii")
-        files = "actuator.c", "-o", "actuator.so", "-lm"
-        command = [needs("cc"), *STRICT, "-shared", "-fPIC", *files]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        assert (0, "") == (done.returncode, done.stderr)
-        self._library = ctypes.CDLL(str(folder / "actuator.so"))
-        for name in ("forward", "inverse"):
-            if hasattr(self._library, f"actuator_{name}"):
-                getattr(self._library, f"actuator_{name}").restype = ctypes.c_double
-
-    def run(self, function: str, begin: float, values: FloatArray) -> FloatArray:
-        """Return what a function makes of values (samples,), one call each."""
-        state = ctypes.create_string_buffer(STATE)
-        call: Any = getattr(self._library, f"actuator_{function}")
-        self._library.actuator_begin(state, ctypes.c_double(begin))
-        return np.array([call(state, ctypes.c_double(value)) for value in values.tolist()])
-
-
 @every_actuator
 @every_hold
 def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> None:
     """Sample by sample, forward to 1e-12 of the range, and its inverse leads back."""
     made, voltage = of(name, hold), cases.drive()
-    compiled = Compiled(made, tmp_path)
+    compiled = Compiled(made, tmp_path, needs("cc"))
     actuator = cases.actuator(name, hold)
     theta = cases.theta(actuator, 1, name)
     expected = actuator.displacement(theta, voltage, from_rest=True)[0]
@@ -84,7 +56,9 @@ def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> 
 
 
 def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
-    compiled = Compiled(of("bouc-wen, second-order", "zero", Span(-40.0, 50.0)), tmp_path)
+    compiled = Compiled(
+        of("bouc-wen, second-order", "zero", Span(-40.0, 50.0)), tmp_path, needs("cc")
+    )
     reference = np.repeat([1e3, -1e3, np.inf, 5.0], 40)
     command = compiled.run("inverse", 0.0, reference)
     assert [50.0, -40.0, 50.0] == command[39:120:40].tolist()
@@ -101,7 +75,7 @@ def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None
     assert "actuator_inverse" not in code
     assert "turns _ back" in code or "turns __ back" in code
     voltage = cases.drive(300)
-    displacement = Compiled(made, tmp_path).run("forward", voltage[0], voltage)
+    displacement = Compiled(made, tmp_path, needs("cc")).run("forward", voltage[0], voltage)
     expected = actuator.displacement(theta, voltage, from_rest=True)[0]
     np.testing.assert_allclose(displacement, expected, rtol=0, atol=1e-12 * np.ptp(expected))
 

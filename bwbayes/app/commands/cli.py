@@ -20,6 +20,7 @@ from bwbayes.app.commands.campaign import campaign
 from bwbayes.app.commands.check import check
 from bwbayes.app.commands.compare import compare
 from bwbayes.app.commands.compensate import compensate
+from bwbayes.app.commands.design import design
 from bwbayes.app.commands.export import export
 from bwbayes.app.commands.init import init
 from bwbayes.app.commands.predict import predict
@@ -58,6 +59,7 @@ for command in (
     export,
     track,
     compare,
+    design,
     config,
     models,
 ):

@@ -29,6 +29,13 @@ __all__ = ["predict"]
     "--window", type=(float, float), help="Judge and write this part alone: start and stop, s."
 )
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
+@click.option(
+    "--after",
+    is_flag=True,
+    help="A forecast: go on from where the lead-in's readings leave the discrepancy, or with "
+    "--signal from the end of the training record.",
+)
+@click.option("--of", "training", help="Of several training records, the one that is meant.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
 def predict(
@@ -40,6 +47,8 @@ def predict(
     lead_in_from: float | None,
     window: tuple[float, float] | None,
     same_offset: bool,
+    after: bool,
+    training: str | None,
     out: Path | None,
     overwrite: bool,
 ) -> int:
@@ -55,11 +64,24 @@ def predict(
 
     if (record is None) == (waveform is None):
         raise InputError("predict: give either --record or --signal")
+    if after and record is None and window is not None:
+        raise InputError(
+            "predict: --window is for a --record; what comes after the training record is "
+            "predicted whole"
+        )
     if not 0 < lead_in < math.inf:
         raise InputError(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
-    begin = Start(from_rest, not same_offset, lead_in, lead_in_from)
+    begin = Start(from_rest, not same_offset, lead_in, lead_in_from, after=after)
     return write(
-        folder, record, waveform, begin, out, Console(), window=window, overwrite=overwrite
+        folder,
+        record,
+        waveform,
+        begin,
+        out,
+        Console(),
+        window=window,
+        of=training,
+        overwrite=overwrite,
     )

@@ -22,7 +22,7 @@ from bwbayes.app.figures.style import (
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.bands import Bands, Kind
 
-__all__ = ["draw_loop"]
+__all__ = ["along", "draw_loop"]
 
 SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
 
@@ -63,7 +63,7 @@ def draw_loop(every: Sequence[Bands]) -> Figure:
 
 
 def _draw(panel: Axes, bands: Bands, dot: str) -> None:
-    kept = _along(bands.voltage, bands.mean)
+    kept = along(bands.voltage, bands.mean)
     voltage = bands.voltage[kept]
     for kind in SHOWN:
         lower, upper = bands.lower[kind, 95][kept], bands.upper[kind, 95][kept]
@@ -78,7 +78,7 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
     panel.autoscale_view()
 
 
-def _along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
+def along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
     """Return the samples to draw: one for each small step along the loop.
 
     A fast signal keeps its samples, a slow one loses those that fall on the same spot.

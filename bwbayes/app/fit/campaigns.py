@@ -54,7 +54,9 @@ class Campaign:
         """A pandas.DataFrame with a row for each record: status, reason, means, intervals."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        return pd.read_csv(self.folder.table, index_col="record")
+        words = ("record", "file", "status", "reason", "outlier_in")
+        table = pd.read_csv(self.folder.table, index_col="record", dtype=dict.fromkeys(words, str))
+        return table.fillna(dict.fromkeys(words[1:], ""))
 
     @property
     def population(self) -> Population:

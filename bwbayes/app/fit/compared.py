@@ -23,19 +23,19 @@ from bwbayes.comparison.table import table
 from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Comparable", "Compared", "compared"]
+__all__ = ["Compared", "Finished", "compared"]
 
 
-class Comparable(Protocol):
-    """A fit, as far as a comparison looks at it."""
+class Finished(Protocol):
+    """What a comparison needs of a fit."""
 
     @property
     def problem(self) -> Problem:
-        """Config, records and posterior."""
+        """What was fitted."""
 
     @property
     def chain(self) -> ChainFile:
-        """All draws, on disk."""
+        """The draws."""
 
     @property
     def outcome(self) -> Outcome:
@@ -94,7 +94,7 @@ class Compared:
 
 
 def compared(
-    fits: Sequence[Comparable], *, future: bool = True, workers: int | None = None
+    fits: Sequence[Finished], *, future: bool = True, workers: int | None = None
 ) -> Compared:
     """Compare fits, named as their configs are, or by number where that is not enough.
 

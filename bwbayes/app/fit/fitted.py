@@ -15,11 +15,10 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.proposal import read_recognised
-from bwbayes.app.fit.compared import Compared, compared
+from bwbayes.app.fit.advice import Advice
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.compensate import Compensated, compensate_draws
@@ -28,7 +27,7 @@ from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import Prediction, predict_another
+from bwbayes.app.running.predictions import Prediction, predict_another, residuals_along
 from bwbayes.app.running.run import (
     Run,
     assemble,
@@ -46,7 +45,7 @@ from bwbayes.app.screen import (
 from bwbayes.control.exported import Exported
 from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record
-from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
@@ -65,7 +64,7 @@ HELD = {True: "yes", False: "NO", None: "unknown"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(Advice):
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
     Parameters
@@ -183,15 +182,8 @@ class Fit:
         """
         import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
 
-        if len(self.problem.records) > 1:
-            raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
-        record = self.problem.record
-        values = np.full(record.samples, np.nan)
-        for name in self.problem.windows("record"):
-            bands = self.bands[name]
-            first = round((float(bands.time[0]) - record.start) / record.interval)
-            values[first : first + bands.time.size] = bands.residuals
-        time = ("time", record.time, {"units": "s"})
+        values = residuals_along(self.problem, self.bands)
+        time = ("time", self.problem.record.time, {"units": "s"})
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
         )
@@ -211,6 +203,8 @@ class Fit:
         own_offset: bool = True,
         lead_in: float = 1.0,
         lead_in_from: float | None = None,
+        after: bool = False,
+        of: str | None = None,
     ) -> Prediction:
         """Predict another record, or a planned voltage without a displacement.
 
@@ -222,9 +216,10 @@ class Fit:
             Name of the bands; by default the file's, or "prediction".
         window
             Start and stop in s of the part that is predicted and judged; by default all of it.
-        from_rest, own_offset, lead_in, lead_in_from
+        from_rest, own_offset, lead_in, lead_in_from, after, of
             What is known of its start, as of a config's [validation.NAME]; see
-            :class:`~bwbayes.results.start.Start`.
+            :class:`~bwbayes.results.start.Start`. With ``after`` what comes after the lead-in is a
+            forecast.
 
         Raises
         ------
@@ -244,23 +239,14 @@ class Fit:
             name = name or Path(other).stem
             other = read_recognised(Path(other))
         hold = self.problem.config.model.hold
-        start = Start(
-            from_rest, own_offset, lead_in, lead_in_from, None if hold == "auto" else hold
-        )
+        known = None if hold == "auto" else hold
+        start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
         name = name or "prediction"
-        made = predict_another(self.problem, result.flat_draws, other, start, name, window)
+        made = predict_another(self.problem, result.flat_draws, other, start, name, window, of)
         warn([f"{name}: {remark}" for remark in made.remarks], 3)
         if made.verdict is not None and made.verdict.holds is False:
             warn([made.verdict.line], 3)
         return made
-
-    def compare(self, *others: Fit, **options: Any) -> Compared:
-        """Compare this fit with others of the same readings, to tell which model to take.
-
-        ``options`` (future, workers) and errors are as of
-        :func:`bwbayes.app.fit.compared.compared`.
-        """
-        return compared((self, *others), **options)
 
     def compensate(self, reference: Any, **options: Any) -> Compensated:
         """Return the voltage for a displacement that is asked for, and what is promised of it.

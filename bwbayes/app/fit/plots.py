@@ -21,7 +21,9 @@ from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.record import draw_record
 from bwbayes.app.figures.style import STYLE
+from bwbayes.app.figures.tracking import draw_tracking
 from bwbayes.app.problem.problem import Problem
+from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -85,6 +87,10 @@ class Plots:
     def ranks(self) -> Figure:
         """Draw how the ranks of each ensemble's draws are spread."""
         return _drawn(draw_ranks, self.result)
+
+    def tracking(self, tracked: Tracking) -> Figure:
+        """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
+        return draw_tracking(tracked)
 
     def _record(self, name: str | None) -> str:
         """Return the name of a training record, by default of the first."""

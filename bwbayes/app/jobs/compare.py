@@ -134,10 +134,15 @@ def _with_model(config: Config, model: ModelConfig, name: str, plain: Problem) -
     actuator = actuator_of(model, plain.record)
     names = Table(actuator, noise_model(model.noise, plain.record.interval)).names
     changes = {
-        key: {p: given for p, given in getattr(config, key).items() if p in names}
+        key: {p: given for p, given in getattr(config, key).items() if _plain(p) in names}
         for key in ("parameters", "truth")
     }
     return config.model_copy(update={"model": model, "name": name, **changes})
+
+
+def _plain(name: str) -> str:
+    """Return a parameter's name without the record that it is of."""
+    return name.partition("[")[0]
 
 
 def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
@@ -169,12 +174,13 @@ def require_same(one: Fitted, other: Fitted) -> None:
     """
     ours, theirs = one.problem, other.problem
     pair = f"compare: {one.name} and {other.name}"
-    if ours.record.sha256 != theirs.record.sha256:
+    if ours.sha256 != theirs.sha256:
         raise InputError(
             f"{pair}: fitted to different records, or in different units; compare fits of one "
             "record, with the same readings left out"
         )
-    if ours.posterior.only.training != theirs.posterior.only.training:
+    windows = [[one.training for one in p.posterior.datasets] for p in (ours, theirs)]
+    if windows[0] != windows[1]:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
     held = [_held_out(problem) for problem in (ours, theirs)]
     if held[0] != held[1]:
@@ -193,6 +199,7 @@ def _held_out(problem: Problem) -> dict[str, object]:
             None if one.record is None else one.record.sha256,
             replace(one.start, hold=None),
             one.judged,
+            one.of,
         )
         for name, one in problem.validations.items()
     }
@@ -225,8 +232,8 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         run.outcome.converged,
         run.outcome.stop_reason,
         posterior.prior.dimensions,
-        posterior.only.readings.rows.size,
-        not isinstance(posterior.only.actuator.hysteresis, NoHysteresis),
+        sum(one.readings.rows.size for one in posterior.datasets),
+        not isinstance(posterior.datasets[0].actuator.hysteresis, NoHysteresis),
     )
     if not run.outcome.converged:
         return plain
@@ -234,6 +241,8 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
     flat = sampled.reshape(-1, sampled.shape[-1])
     bands = tuple(one for one in held_out(problem, flat) if one.measured is not None)
     windows = [v.window for v in problem.validations.values() if v.window is not None]
+    # Of several records, none is another's future.
+    alone = len(posterior.datasets) == 1
     log_prior = posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
     return replace(
         plain,
@@ -241,10 +250,10 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         scores={one.name: score(one, scoring(seed, one)) for one in bands},
         not_holding=_not_holding(problem, flat, bands),
         joint=joint_log_score(posterior, flat, windows, generator(seed, "joint"))
-        if windows
+        if windows and alone
         else None,
         future=future(posterior, problem.plan, problem.record, generator(seed, "future"), pool)
-        if with_future
+        if with_future and alone
         else None,
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
         log_likelihood=float(np.max(density.ravel() - log_prior)),
@@ -267,14 +276,19 @@ def held_out(problem: Problem, flat: FloatArray) -> list[Bands]:
     """Predict all that was held out, as a run does."""
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(flat, generator(seed, "draws"))
-    windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
-    source = generator(seed, f"predict {problem.record.sha256}")
-    bands = predict_windows(posterior, chosen, problem.record, windows, source) if windows else []
+    bands: list[Bands] = []
+    for name, alone, its in posterior.each(chosen):
+        every = problem.validations.items()
+        windows = {n: v.window for n, v in every if v.window is not None and v.of == name}
+        if windows:
+            record = problem.records[name]
+            source = generator(seed, f"predict {record.sha256}")
+            bands += predict_windows(alone, its, record, windows, source)
     for name, one in problem.validations.items():
         if one.record is not None:
             source = generator(seed, f"predict {one.record.sha256}")
-            of = posterior, chosen, one.record, one.start, source, name, one.judged
-            bands.append(predict_record(*of))
+            of = posterior.alone(one.of), posterior.its(chosen, one.of), one.record, one.start
+            bands.append(predict_record(*of, source, name, one.judged))
     return bands
 
 

@@ -15,7 +15,11 @@ from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures import save_one
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import predict_another
+from bwbayes.app.running.predictions import (
+    predict_after,
+    predict_another,
+    training_record,
+)
 from bwbayes.app.running.run import finished
 from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.data import Record
@@ -40,9 +44,12 @@ def predict(
     console: Console,
     *,
     window: tuple[float, float] | None = None,
+    of: str | None = None,
     overwrite: bool = False,
 ) -> int:
     """Predict a record or a signal, write and show what came of it; return the exit status.
+
+    A signal with ``start.after`` goes on from the end of the training record, ``of`` that name.
 
     Raises
     ------
@@ -64,9 +71,13 @@ def predict(
             f"NOT CONVERGED: {path} gives no interval; go on with `bwbayes resume {path}`", err=True
         )
         return NOT_CONVERGED
-    other = _record(problem, record, waveform)
+    of = training_record(problem, of)
+    other = _record(problem, of, record, waveform)
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
-    bands = predict_another(problem, flat, other, start, name, window)
+    if record is None and start.after:
+        bands = predict_after(problem, flat, other.voltage, name, of)
+    else:
+        bands = predict_another(problem, flat, other, start, name, window, of)
     scores, verdict = bands.scores, bands.verdict
     if verdict is not None:
         show_verdicts([verdict], console)
@@ -89,11 +100,11 @@ def predict(
     return 0
 
 
-def _record(problem: Problem, path: Path | None, waveform: str | None) -> Record:
+def _record(problem: Problem, of: str, path: Path | None, waveform: str | None) -> Record:
     """Read the record, or sample the signal as the training record was sampled."""
     if path is not None:
         return read_recognised(path)
     assert waveform is not None
-    interval = problem.record.interval
+    interval = problem.records[of].interval
     _, voltage = signal(waveform).sample(1 / interval)
     return Record(voltage, None, interval, origin=f"{waveform} signal")

@@ -19,6 +19,7 @@ from bwbayes.app.figures.tracking import draw_tracking
 from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
 from bwbayes.app.jobs.export import at_rate
 from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.report.track_report import render
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import Noise, Stand
@@ -132,16 +133,17 @@ def track_run(
         As :func:`track_draws`; or files exist, or cannot be written.
     """
     folder = out or path / "track"
-    files = [folder / f"track.{kind}" for kind in ("json", "csv", "png")]
+    files = [folder / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
     refuse_existing(files, overwrite)
     problem, flat = drawn(path)
     made = track_draws(problem, flat, setup)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        numbers = {"name": problem.config.name or problem.record.origin, **made.numbers()}
-        write_summary(files[0], numbers)
+        name = problem.config.name or problem.record.origin
+        write_summary(files[0], {"name": name, **made.numbers()})
         made.to_pandas().to_csv(files[1], index=False)
         save_one(draw_tracking(made), files[2])
+        files[3].write_text(render(name, made, files[2].read_bytes()), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; choose another place with --out") from None
     return made, files

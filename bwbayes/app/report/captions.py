@@ -53,7 +53,8 @@ CAPTIONS = {
         "Over time",
         "Voltage, displacement, and readings minus mean. Of all readings, 95 % should lie inside "
         "the sensor band; those of a lead-in, if any, served to estimate the sensor's offset and "
-        "are not judged.",
+        "are not judged. In the plot, the dots of a long record are the extremes of each short "
+        "stretch: more of them lie outside than of all readings.",
         "Voltage, displacement with its 95 % bands, and readings minus mean, against time",
     ),
     "coverage": Caption(

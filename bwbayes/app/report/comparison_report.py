@@ -6,30 +6,35 @@ One HTML file that needs nothing else, as the report of a run.
 from __future__ import annotations
 
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.report import template
+from bwbayes.app.report.page import Table, template
 from bwbayes.comparison.choice import Comparison
-from bwbayes.comparison.table import COLUMNS, DIFFERENCE_COLUMNS, differences, rows
+from bwbayes.comparison.table import COLUMNS, DIFFERENCE_COLUMNS, differences, rows, table
 
 __all__ = ["render"]
 
 
 def render(comparison: Comparison, problem: Problem) -> str:
     """Return the page of a comparison; ``problem`` is that of any of its runs."""
-    record = problem.record
-    held_out = [name for name, one in problem.validations.items()]
+    less = list(differences(comparison))
     return template("comparison.html.j2").render(
         recommended=comparison.recommended,
         lines=comparison.lines,
         against=comparison.against,
-        columns=COLUMNS,
-        rows=list(rows(comparison)),
-        difference_columns=DIFFERENCE_COLUMNS,
-        differences=list(differences(comparison)),
-        best=comparison.best,
-        models=[(one.name, one.model) for one in comparison.candidates],
+        models=Table(
+            "models", "Models", COLUMNS, list(rows(comparison)), records=table(comparison)
+        ),
+        differences=Table(
+            "differences", f"Differences to {comparison.best}", DIFFERENCE_COLUMNS, less
+        )
+        if less
+        else None,
         facts=[
-            ("record", f"{record.origin}: {record.samples} samples every {record.interval:g} s"),
-            ("readings fitted", str(problem.posterior.only.readings.rows.size)),
-            ("held out", ", ".join(held_out) or "nothing"),
+            *((one.name, one.model) for one in comparison.candidates),
+            *(
+                (name, f"{one.origin}: {one.samples} samples every {one.interval:g} s")
+                for name, one in problem.records.items()
+            ),
+            ("readings fitted", str(comparison.candidates[0].readings)),
+            ("held out", ", ".join(problem.validations) or "nothing"),
         ],
     )

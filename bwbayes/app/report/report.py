@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from bwbayes.app.figures import interactive
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
 from bwbayes.app.report.page import Picture, picture, template
@@ -43,8 +44,9 @@ def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, by
     """
     converged = result.outcome.converged
     check = result.outcome.check
+    plots = interactive.draw(result) if converged else {}
     shown = {
-        name: picture(png, name, *caption(name))
+        name: picture(png, name, *caption(name), plots.get(name, ""))
         for name, png in pictures.items()
         if converged or name in OF_THE_CHAIN
     }
@@ -70,12 +72,16 @@ def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, by
         moves=tables.moves(result),
         pareto_k=None if check.pareto_k is None else f"{check.pareto_k:.2f}",
         priors=tables.priors(result),
+        taught=tables.taught(result),
+        learned=result.learned.remarks if result.learned is not None else (),
+        replicated=tables.replicated(result),
         constraints=[
             parameter.declared.stated_bounds
             for parameter in result.parameters
             if parameter.declared is not None and parameter.declared.stated_bounds
         ],
         pictures=shown,
+        scripts=interactive.scripts() if any(one.plot for one in shown.values()) else [],
         evidence=_in_order(shown, [f"bands_{one.name}" for one in held_out_first]),
         facts=[*result.facts.items(), *_circumstances(summary)],
     )

@@ -21,11 +21,22 @@ from bwbayes.inference.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.loops import MEASURES, Estimate
+from bwbayes.results.replicated import STATISTICS
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores
 from bwbayes.results.steps import STEP_MEASURES
 
-__all__ = ["loops", "moves", "parameters", "priors", "sampling", "steps", "validation"]
+__all__ = [
+    "loops",
+    "moves",
+    "parameters",
+    "priors",
+    "replicated",
+    "sampling",
+    "steps",
+    "taught",
+    "validation",
+]
 
 Summary = Mapping[str, Any]
 
@@ -108,9 +119,50 @@ def priors(result: Result) -> Table:
     return Table("priors", "Priors and fixed values", titles, rows)
 
 
+def taught(result: Result) -> Table | None:
+    """Return how far the record narrowed each parameter, and what its posterior hangs on."""
+    if result.learned is None:
+        return None
+    rows = [
+        (
+            _words(parameter),
+            f"{one.contraction:.2f}",
+            f"{one.prior:.2f}",
+            f"{one.likelihood:.2f}",
+            "the prior" if one.prior_decides else "the readings",
+        )
+        for parameter in result.free
+        for one in (result.learned.parameters[parameter.name],)
+    ]
+    titles = ("Parameter", "Contraction", "To the prior", "To the readings", "Decided by")
+    return Table("taught", "What the record taught", titles, rows)
+
+
+def replicated(result: Result) -> list[Table]:
+    """Return the numbers of each fitted record among those of replicated records."""
+    titles = ("Number", "Observed", "95 % of replicated", "Unit", "p", "Odd")
+    tables = []
+    for name, checked in result.replicated.items():
+        rows = [
+            (
+                STATISTICS[which][0],
+                f"{one.observed:.4g}",
+                f"{one.lower:.4g} to {one.upper:.4g}",
+                unit_text(STATISTICS[which][1]),
+                f"{one.p:.3f}",
+                "odd" if one.odd else "",
+            )
+            for which, one in checked.statistics.items()
+        ]
+        of = f" of {name}" if len(result.replicated) > 1 else ""
+        tables.append(Table(f"replicated-{name}", f"Posterior predictive checks{of}", titles, rows))
+    return tables
+
+
 def validation(result: Result, summary: Summary) -> Table:
-    """Return the scores: a column for each of the bands."""
+    """Return the scores: a column for each of the bands, held-out ones first."""
     judged = [bands for bands in result.bands if bands.name in result.scores]
+    judged.sort(key=lambda bands: bands.training)
     columns = [
         [("Holds", _held(result, bands.name)), *_scores(result.scores[bands.name])]
         for bands in judged
@@ -118,7 +170,7 @@ def validation(result: Result, summary: Summary) -> Table:
     rows = [[row[0][0], *(text for _, text in row)] for row in zip(*columns, strict=True)]
     kept = {bands.name: summary["validation"][bands.name] for bands in judged}
     titles = ["Quantity", *(title(bands) for bands in judged)]
-    return Table("validation", "Scores", titles, rows, records=_flat(kept))
+    return Table("validation", "How the bands did on readings", titles, rows, records=_flat(kept))
 
 
 def loops(result: Result, summary: Summary) -> Table | None:

@@ -22,13 +22,20 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.screen import show_scores, show_verdicts
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
+from bwbayes.errors import InputError, suggestion
 from bwbayes.results import innovations
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.innovations import Innovations
-from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
+from bwbayes.results.prediction import (
+    Start,
+    forecast,
+    predict_record,
+    predict_windows,
+    thinned,
+)
 from bwbayes.results.refit import Moved
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores, as_summary, score
@@ -162,12 +169,60 @@ def predict_another(
     remarks = tuple(beyond_training(posterior, record.voltage, record.interval))
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"predict {record.sha256}")
-    of = next(iter(problem.records)) if of is None else of
+    of = training_record(problem, of)
     alone, its = posterior.alone(of), posterior.its(chosen, of)
     bands = predict_record(alone, its, record, start, source, name, window)
     verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
     scores = None if verdict is None else score(bands, scoring(seed, bands))
     return Prediction.of(bands, scores, verdict, remarks)
+
+
+def predict_after(
+    problem: Problem, flat: FloatArray, voltage: FloatArray, name: str, of: str | None = None
+) -> Prediction:
+    """Predict what follows on a training record whose last sample goes on into a planned voltage.
+
+    ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name, by default the
+    first. All else is as in :func:`predict_another`; see
+    :func:`~bwbayes.results.prediction.forecast`.
+    """
+    posterior, seed, of = problem.posterior, problem.config.seed, training_record(problem, of)
+    record = problem.records[of]
+    remarks = tuple(beyond_training(posterior, voltage, record.interval))
+    chosen = thinned(flat, generator(seed, "draws"))
+    source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
+    alone, its = posterior.alone(of), posterior.its(chosen, of)
+    return Prediction.of(forecast(alone, its, record, voltage, source, name), remarks=remarks)
+
+
+def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> FloatArray:
+    """Return readings less the mean of the bands along the training record, (samples,), um.
+
+    Raises
+    ------
+    InputError
+        Several records were fitted.
+    """
+    if len(problem.records) > 1:
+        raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
+    values = np.full(problem.record.samples, np.nan)
+    for name, window in problem.windows(*problem.records).items():
+        values[window] = bands[name].residuals
+    return values
+
+
+def training_record(problem: Problem, name: str | None) -> str:
+    """Return the name of a training record, by default of the first.
+
+    Raises
+    ------
+    InputError
+        No training record is called so.
+    """
+    if name is not None and name not in problem.records:
+        hint = suggestion(name, list(problem.records))
+        raise InputError(f"predict: no training record {name!r}; {hint}")
+    return name or next(iter(problem.records))
 
 
 def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:

@@ -38,10 +38,12 @@ from bwbayes.inference import conflict, pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import agreement, identifiability, innovations
+from bwbayes.results.learned import learned
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.results.prediction import thinned
 from bwbayes.results.refit import without_start
+from bwbayes.results.replicated import replicated
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
@@ -342,6 +344,10 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         loops=measure_loops(posterior, chosen),
         steps=measure_steps(posterior, chosen, stepped(problem)),
         agreement=compared,
+        learned=learned(posterior.prior, sampled, result.log_density, source),
+        replicated={
+            one.name: replicated(posterior, chosen, source, one.name) for one in posterior.datasets
+        },
         remarks=(*result.remarks, *agreement.remarks(compared), *odd),
     )
 

@@ -81,35 +81,44 @@ def assert_returned(
 
 
 def calm(actuator: Actuator, theta: FloatArray) -> None:
-    """Make draws' gains small, and hysteresis no more than half of the slope."""
+    """Make draws' displacement grow with the voltage, wherever it turned before."""
     column = {name: theta[:, i] for i, name in enumerate(actuator.parameters)}
-    column["quadratic"] *= 0.2
-    column["cubic"] *= 0.2
-    if {"d", "alpha", "beta"} <= column.keys():
-        column["alpha"][:] = np.minimum(column["alpha"], 0.4 * column["d"])
-        for name in ("gamma", "d2", "d3", "alpha1", "alpha2"):
+    for name in ("quadratic", "cubic"):
+        if name in column:
+            column[name] *= 0.2
+    if not {"d", "alpha", "beta"} <= column.keys():
+        return
+    column["alpha"][:] = np.minimum(column["alpha"], 0.4 * column["d"])
+    if "gamma" in column:
+        # Close to −β the ceiling is far away, and a turn there goes the wrong way.
+        half = 0.5 * column["beta"]
+        column["gamma"][:] = np.clip(column["gamma"], -half, half)
+        for name in ("b2", "b3", "b4", "b5", "b6"):
             if name in column:
-                column[name][:] = 0.0
+                column[name][:] = np.clip(column[name], -0.1, 0.1)
+    if "d3" in column:
+        column["d3"][:] = np.abs(column["d3"])
+        most = np.minimum(column["d3"], 3 * column["alpha"] * column["beta"] ** 2)
+        column["alpha2"][:] = np.minimum(column["alpha2"], most)
 
 
 @every_operator
-@pytest.mark.parametrize("from_rest", [True, False])
-@pytest.mark.parametrize("parts", [True, False])
+@pytest.mark.parametrize(("from_rest", "parts"), [(True, False), (False, False), (False, True)])
 def test_the_inverse_of_every_operator_gives_the_displacement_again(
     name: str, from_rest: bool, parts: bool
 ) -> None:
-    """Draws of the default priors; with a gain and creep beside it, which must not turn it back."""
+    """Draws of the default priors that rise with the voltage; with gain and creep too."""
     integrated = name in ("jiles-atherton", "domain-wall")
     of = posterior(name, parts=parts)
     actuator = of.likelihood.actuator
-    theta = of.only.table.actuator(drawn(of, 1 if integrated else 4))
+    theta = of.only.table.actuator(drawn(of, 1 if integrated or parts else 4))
     if parts:
         creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
         actuator = replace(actuator, gain=PolynomialGain(reference=SPAN), creep=creep)
         names = of.likelihood.actuator.parameters
         theta = theta[:, [i for i, n in enumerate(names) if n in actuator.parameters]]
-        calm(actuator, theta)
-    voltage = decaying_sine(120 if integrated else 300)
+    calm(actuator, theta)
+    voltage = decaying_sine(120 if integrated or parts else 300)
     reference = actuator.displacement(theta, voltage, from_rest=from_rest)
     assert_returned(actuator, theta, reference, from_rest=from_rest)
 

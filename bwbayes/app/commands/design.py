@@ -1,0 +1,73 @@
+"""``bwbayes design``: what to measure next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from bwbayes.app.commands.shared import FILE, NOT_CONVERGED, overwrite_option
+from bwbayes.errors import NotConvergedError
+
+__all__ = ["design"]
+
+
+@click.command()
+@click.argument("folder", type=FILE)
+@click.option("--parameter", help="The parameter to know better.")
+@click.option("--drive", help="Or the drive whose band is to be narrow: a record or a signal.")
+@click.option(
+    "--candidates",
+    default="standard",
+    show_default=True,
+    help="A TOML file with a table for each signal, or the preset.",
+)
+@click.option(
+    "--voltage",
+    "voltages",
+    type=(float, float),
+    help="Amplifier's range, V; default: the record's.",
+)
+@click.option("--rate", type=float, help="Its fastest change of the voltage, V/s.")
+@click.option("--current", type=float, help="Its largest current, A; with --capacitance.")
+@click.option("--capacitance", type=float, help="The actuator's capacitance, F.")
+@click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
+@overwrite_option
+def design(
+    folder: Path,
+    parameter: str | None,
+    drive: str | None,
+    candidates: str,
+    voltages: tuple[float, float] | None,
+    rate: float | None,
+    current: float | None,
+    capacitance: float | None,
+    out: Path | None,
+    overwrite: bool,
+) -> int:
+    """Rank signals by what they would teach, from the run in FOLDER.
+
+    What would be left of a parameter's standard deviation, or of a band's width along a drive,
+    after one more record; the best signal within the amplifier's limits goes into best.csv.
+
+    Example: bwbayes design results/ring_bender --parameter beta --rate 2000
+    """
+    from bwbayes.app.jobs.design import design as rank
+
+    try:
+        rank(
+            folder,
+            out or folder / "design",
+            Console(),
+            candidates=candidates,
+            parameter=parameter,
+            drive=drive,
+            limits={"rate": rate, "current": current, "capacitance": capacitance},
+            voltages=voltages,
+            overwrite=overwrite,
+        )
+    except NotConvergedError as error:
+        click.echo(f"NOT CONVERGED: {error}", err=True)
+        return NOT_CONVERGED
+    return 0

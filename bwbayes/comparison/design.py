@@ -1,0 +1,291 @@
+"""What to measure next: which drive would teach most about a parameter, or narrow a band most.
+
+Each candidate is a voltage that the amplifier can make. At some posterior draws the model is made
+linear in its parameters: the Fisher information of the readings that the candidate would bring,
+with the noise of that draw and an offset of the new record's own, adds to what is known already.
+What would be left of a standard deviation, averaged over the draws, is the promise; how far the
+draws scatter is its Monte Carlo error.
+
+What the model is wrong about returns whenever the voltage takes the same way again, so a stretch
+that is driven several times counts once: a hundred periods of one sine show one loop, not a
+hundred. A fit, which trusts the noise model, may look surer than was promised of a steady drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError, suggestion
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.identifiability import stretches_once
+
+__all__ = ["Amplifier", "Promise", "promises", "ranked"]
+
+# Draws that the promise is averaged over, and those that say what is known already.
+DRAWS, KNOWN = 40, 4000
+
+# Step of the derivatives, in posterior sds of a coordinate.
+STEP = 0.01
+
+# Limits are kept to within rounding.
+SLACK = 1e-9
+
+
+@dataclass(frozen=True)
+class Amplifier:
+    """What an amplifier can do.
+
+    Parameters
+    ----------
+    low, high
+        Its voltages, V.
+    rate
+        Its fastest change of the voltage, V/s.
+    current, capacitance
+        Its largest current, A, into the actuator's capacitance, F: I = C dU/dt.
+
+    Raises
+    ------
+    InputError
+        Limits that leave nothing, or a current without a capacitance.
+    """
+
+    low: float
+    high: float
+    rate: float = np.inf
+    current: float | None = None
+    capacitance: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise InputError(f"design: voltages from {self.low:g} to {self.high:g} V leave nothing")
+        if (self.current is None) != (self.capacitance is None):
+            raise InputError("design: a current's limit needs the capacitance too; give both")
+        for name in ("rate", "current", "capacitance"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"design: {name} {value:g}; must be above zero")
+
+    @property
+    def fastest(self) -> float:
+        """The fastest change of the voltage that both rate and current allow, V/s."""
+        if self.current is None or self.capacitance is None:
+            return self.rate
+        return min(self.rate, self.current / self.capacitance)
+
+    def refuses(self, voltage: FloatArray, interval: float) -> str:
+        """Say why it cannot make a voltage (samples,), V; empty if it can."""
+        low, high = float(np.min(voltage)), float(np.max(voltage))
+        slack = SLACK * (self.high - self.low)
+        if low < self.low - slack or high > self.high + slack:
+            return f"goes from {low:.4g} to {high:.4g} V, beyond {self.low:g} to {self.high:g} V"
+        fastest = float(np.max(np.abs(np.diff(voltage)), initial=0.0)) / interval
+        if fastest > self.fastest * (1 + SLACK):
+            return f"changes by {fastest:.4g} V/s, more than {self.fastest:.4g} V/s"
+        return ""
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a candidate promises.
+
+    Attributes
+    ----------
+    name
+        The candidate's name.
+    left
+        The part of the standard deviation that would be left: of the parameter, or of the
+        parameter band's mean width along the chosen drive; nan if it is refused.
+    error
+        Its Monte Carlo error.
+    refused
+        Why the amplifier cannot make it; empty if it can.
+    """
+
+    name: str
+    left: float
+    error: float
+    refused: str = ""
+
+
+def ranked(every: Sequence[Promise]) -> list[Promise]:
+    """Return promises, the best first, what is refused last."""
+    return sorted(every, key=lambda one: (bool(one.refused), one.left, one.name))
+
+
+def promises(
+    posterior: Posterior,
+    draws: FloatArray,
+    candidates: Mapping[str, FloatArray],
+    target: str | FloatArray,
+    amplifier: Amplifier,
+    generator: np.random.Generator,
+) -> list[Promise]:
+    """Work out what candidates would teach.
+
+    With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
+    sampling, J the derivatives of the candidate's displacements there and C the noise's covariance,
+
+        Σ' = (Σ⁻¹ + Jᵀ C⁻¹ J)⁻¹,
+
+    the new record's offset integrated out, and each sample weighted by one over how often its
+    stretch is driven. A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its
+    gradient; along a drive the mean over its samples counts.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units.
+    candidates
+        Voltages (samples,) by name, V, at the interval of the fitted record, from a demagnetised
+        actuator at rest.
+    target
+        The name of a free parameter of the actuator, or a drive (samples,), V, whose parameter band
+        is to be narrow.
+    amplifier
+        What can be driven.
+    generator
+        Chooses draws.
+
+    Raises
+    ------
+    InputError
+        The target is not a free parameter of the actuator.
+
+    Notes
+    -----
+    K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10
+    (1995) 273-304: c-optimality, averaged over the posterior.
+    """
+    asker = _Asker.of(posterior, draws, generator)
+    if isinstance(target, str) and target not in asker.names:
+        hint = suggestion(target, asker.names)
+        raise InputError(f"design: {target!r} is not a free parameter of the actuator; {hint}")
+    before, gradients = asker.known(target)
+    made = []
+    for name, voltage in candidates.items():
+        why = amplifier.refuses(voltage, posterior.only.actuator.interval)
+        if why:
+            made.append(Promise(name, np.nan, np.nan, why))
+            continue
+        left = np.array(
+            [
+                _spread(gradient, asker.after(information)) / known
+                for gradient, information, known in zip(
+                    gradients, asker.information(voltage), before, strict=True
+                )
+            ]
+        )
+        error = float(np.std(left, ddof=1) / np.sqrt(left.size)) if left.size > 1 else np.inf
+        made.append(Promise(name, float(np.mean(left)), error))
+    return made
+
+
+def _spread(gradient: FloatArray, covariance: FloatArray) -> float:
+    """Mean over columns g of √(gᵀ Σ g), for gradients (coordinates, targets)."""
+    variances = np.einsum("it,ij,jt->t", gradient, covariance, gradient)
+    return float(np.mean(np.sqrt(np.maximum(variances, 0))))
+
+
+@dataclass(frozen=True)
+class _Asker:
+    """A posterior made linear at some draws.
+
+    ``places`` (draws, free) are their coordinates, ``columns`` those of the actuator's parameters
+    among them, ``names`` their names, ``covariance`` what is known of them, ``steps`` those of
+    their derivatives, ``offset_sd`` the prior sd of the new record's offset, um.
+    """
+
+    posterior: Posterior
+    places: FloatArray
+    columns: tuple[int, ...]
+    names: tuple[str, ...]
+    covariance: FloatArray
+    steps: FloatArray
+    offset_sd: float
+
+    @classmethod
+    def of(cls, posterior: Posterior, draws: FloatArray, generator: np.random.Generator) -> _Asker:
+        """Choose the draws, and see what is known."""
+        one, prior = posterior.only, posterior.prior
+        own = [
+            d.name
+            for d in one.actuator.declarations
+            if d.scope == "actuator" and d.name in prior.free_names
+        ]
+        columns = tuple(prior.free_names.index(name) for name in own)
+        known = prior.unconstrain(draws[:: max(len(draws) // KNOWN, 1)])
+        covariance = np.atleast_2d(np.cov(known[:, columns], rowvar=False))
+        chosen = generator.choice(len(known), min(DRAWS, len(known)), replace=False)
+        offset_sd = 0.0
+        for parameter in prior.free:
+            if parameter.name == "offset" and parameter.prior is not None:
+                offset_sd = float(parameter.prior.frozen.std())
+        steps = STEP * np.sqrt(np.diag(covariance))
+        return cls(posterior, known[chosen], columns, tuple(own), covariance, steps, offset_sd)
+
+    def _theta(self, place: FloatArray) -> FloatArray:
+        """Return θ (2 coordinates, parameters), steps to either side of a place (free,)."""
+        count = len(self.columns)
+        moved = np.repeat(place[np.newaxis], 2 * count, axis=0)
+        rows = np.arange(count)
+        moved[rows, self.columns] += self.steps
+        moved[count + rows, self.columns] -= self.steps
+        prior, table = self.posterior.prior, self.posterior.only.table
+        theta = prior.theta(prior.constrain(moved)[0])
+        return table.replaced(theta, "initial", np.zeros(len(theta)))
+
+    def _slopes(self, values: FloatArray) -> FloatArray:
+        """Return derivatives (coordinates, ...) from values (2 coordinates, ...) at either side."""
+        plus, minus = np.split(values, 2)
+        slopes: FloatArray = ((plus - minus).T / (2 * self.steps)).T
+        return slopes
+
+    def _displacement(self, place: FloatArray, voltage: FloatArray) -> FloatArray:
+        """Return derivatives (coordinates, samples) of the displacement along a voltage."""
+        one = self.posterior.only
+        model = one.table.actuator(self._theta(place))
+        actuator = self.posterior.likelihood.actuator
+        return self._slopes(actuator.displacement(model, voltage, from_rest=True))
+
+    def known(self, target: str | FloatArray) -> tuple[list[float], list[FloatArray]]:
+        """Return the spread before, and the target's gradients, at each draw."""
+        if isinstance(target, str):
+            column = self.posterior.only.table.names.index(target)
+            gradients = [self._slopes(self._theta(place)[:, [column]]) for place in self.places]
+        else:
+            gradients = [self._displacement(place, target) for place in self.places]
+        return [_spread(gradient, self.covariance) for gradient in gradients], gradients
+
+    def information(self, voltage: FloatArray) -> list[FloatArray]:
+        """Return the Fisher information (coordinates, coordinates) of a candidate, at each draw."""
+        one, prior = self.posterior.only, self.posterior.prior
+        noise = one.table.noise(prior.theta(prior.constrain(self.places)[0]))
+        once, _ = stretches_once(voltage, np.arange(voltage.size))
+        every = []
+        for place, own in zip(self.places, noise, strict=True):
+            slopes = self._displacement(place, voltage)
+            series = np.concatenate([slopes, np.ones((1, voltage.size))])
+            (white,), _ = one.noise.whiten(own[np.newaxis], series[np.newaxis])
+            products = (white * once) @ white.T
+            if self.offset_sd:
+                told, level = products[:-1, -1], products[-1, -1] + self.offset_sd**-2
+                every.append(products[:-1, :-1] - np.outer(told, told) / level)
+            else:
+                every.append(products[:-1, :-1])
+        return every
+
+    def after(self, information: FloatArray) -> FloatArray:
+        """Return the covariance that would be left."""
+        # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
+        factor = np.linalg.cholesky(self.covariance)
+        inner = np.eye(len(factor)) + factor.T @ information @ factor
+        left: FloatArray = factor @ linalg.solve(inner, factor.T, assume_a="pos")
+        return left

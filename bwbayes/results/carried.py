@@ -1,0 +1,95 @@
+"""The discrepancy that readings leave behind, carried on to what comes after them.
+
+Where readings end, a part of the model discrepancy x is known: by the filter of the noise its mean
+is m and its variance P, given a draw. A process of sd σ and correlation time τ goes on from there:
+a time t later, with k = exp(−t/τ), it is normal with
+
+    mean k m,   variance σ² − k² (σ² − P).
+
+So a forecast is narrower than any other prediction at first, and after a few correlation times as
+wide as ever. (An Ornstein-Uhlenbeck process; the filter is that of
+:class:`~bwbayes.inference.noise.DiscrepancyNoise`.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.likelihood import Likelihood
+
+__all__ = ["Carried", "carried"]
+
+# A stretch for which one variance stands in is this part of the time since the last reading: k²
+# changes by so little in it that an sd is right to half a percent.
+PART = 0.02
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What readings leave of the discrepancy, for each draw.
+
+    Parameters
+    ----------
+    last
+        Sample of the last reading.
+    mean, gained
+        (draws,) its mean there, um, and by how much its variance is less than σ², um².
+    rate
+        (draws,) 1/τ per sample.
+    """
+
+    last: int
+    mean: FloatArray
+    gained: FloatArray
+    rate: FloatArray
+
+    def means(self, first: int, samples: int) -> FloatArray:
+        """Mean (draws, samples) from a sample on, um; before the last reading that there."""
+        after = np.maximum(first + np.arange(samples) - self.last, 0)
+        known: FloatArray = self.mean[:, np.newaxis] * np.exp(-np.outer(self.rate, after))
+        return known
+
+    def less(self, sample: float) -> FloatArray:
+        """By how much the variance (draws,) at a sample is less than σ², um²."""
+        kept = np.exp(-self.rate * max(sample - self.last, 0.0))
+        return kept**2 * self.gained
+
+    def stretches(self, first: int, samples: int) -> Iterator[slice]:
+        """Cut samples from one on into stretches in which the variance hardly changes."""
+        begin = 0
+        while begin < samples:
+            since = max(first + begin - self.last, 0)
+            # Of what is forgotten nothing changes any more.
+            forgotten = bool((self.rate * since > -np.log(np.finfo(float).eps)).all())
+            length = samples if forgotten else max(int(PART * since), 1)
+            yield slice(begin, min(begin + length, samples))
+            begin += length
+
+
+def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) -> Carried:
+    """Return what the readings of a record leave at θ (draws, parameters).
+
+    ``simulated`` (draws, readings), um, is the model's displacement at the readings. The filter
+    goes through them, with the discrepancy's mean m̂ and variance V before each and the gain
+    g = V/(V + s²) of the sensor's sd s: m̂ + g (r − m̂) and V s²/(V + s²) are those after it.
+    """
+    readings, steady = (
+        likelihood.readings,
+        likelihood.spaced.steady_state(likelihood.table.noise(theta)),
+    )
+    own, sensor = steady.predicted + steady.surplus, steady.variance - steady.predicted
+    mean, unsure = np.zeros(len(theta)), own.copy()
+    residual = readings.values - simulated
+    for t, missing in enumerate(readings.skipped.tolist()):
+        if t:
+            kept = np.exp(-(1 + missing) * steady.rate)
+            mean, unsure = kept * mean, own - kept**2 * (own - unsure)
+        total = unsure + sensor
+        gain = np.divide(unsure, total, out=np.zeros_like(total), where=total > 0)
+        mean, unsure = mean + gain * (residual[:, t] - mean), gain * sensor
+    last = int(readings.rows[-1])
+    return Carried(last, mean, np.maximum(own - unsure, 0.0), steady.rate / readings.stride)

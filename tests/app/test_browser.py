@@ -1,0 +1,281 @@
+"""The pages in a real browser: whole, readable, alone, to zoom and to hover.
+
+Chromium opens each page as a reader does, on a telephone and on a screen, light and dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from bwbayes.app.jobs.check import check
+from bwbayes.app.report.report import render
+from bwbayes.results.result import summary
+from tests.app import example, small
+from tests.programs import needs
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+WIDTHS = (400, 1400)
+PAGES = ("run", "unconverged", "check")
+FIGURES = ("loop", "bands_training", "bands_held-out", "coverage", "corner", "trace", "ranks")
+
+# WCAG 2.2, level AA, for text of ordinary size.
+LEAST_CONTRAST = 4.5
+
+TIME_RANGES = """() => Bokeh.documents
+  .map(d => Array.from(d._all_models.values()))
+  .map(models => models.find(m => m.type === "Figure" && m.x_range && m.below
+    .some(a => a.axis_label === "time (s)")))
+  .filter(plot => plot !== undefined)
+  .map(plot => plot.x_range.end - plot.x_range.start)"""
+
+# The least contrast of any text with what is behind it, and that text.
+CONTRAST = """() => {
+  const parts = text => text.match(/[\\d.]+/g).map(Number);
+  const light = ([r, g, b]) => {
+    const [x, y, z] = [r, g, b].map(c => c / 255)
+      .map(c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * x + 0.7152 * y + 0.0722 * z;
+  };
+  const behind = element => {
+    for (let at = element; at; at = at.parentElement) {
+      const colour = parts(getComputedStyle(at).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  let least = [Infinity, ""];
+  for (const element of document.querySelectorAll("body *")) {
+    if (element.closest(".plot, script, style")) continue;
+    const own = [...element.childNodes].filter(n => n.nodeType === 3).map(n => n.textContent);
+    if (!own.join("").trim()) continue;
+    const [a, b] = [parts(getComputedStyle(element).color), behind(element)].map(light);
+    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    if (ratio < least[0]) least = [ratio, element.tagName + " " + own.join("").trim()];
+  }
+  return least;
+}"""
+
+
+def png() -> bytes:
+    """Draw a picture of the size that the report's have."""
+    figure = Figure(figsize=(11, 5))
+    figure.subplots().plot([0, 1])
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=150)
+    return buffer.getvalue()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Write the pages that are looked at."""
+    folder = tmp_path_factory.mktemp("pages")
+    picture = png()
+    paths = {name: folder / f"{name}.html" for name in PAGES}
+    for name in ("run", "unconverged"):
+        run = example.run(converged=name == "run")
+        page = render(run, summary(run), dict.fromkeys(FIGURES, picture))
+        paths[name].write_text(page, encoding="utf-8")
+    check(small.config(), folder, folder, small.quiet())
+    return paths
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    path = needs("chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Opened:
+    """A page that was opened, and what went wrong with it and beyond it."""
+
+    def __init__(self, browser: Any, path: Path, width: int = 1400, **options: Any) -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": 900}, **options)
+        self.wrong: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", self._hear)
+        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+        if options.get("java_script_enabled", True) and "Bokeh" in path.read_text("utf-8"):
+            self.page.wait_for_function("Bokeh.documents.every(d => d.is_idle)")
+
+    def _hear(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.wrong.append(message.text)
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_whole_alone_and_readable(
+    chromium: Any, pages: dict[str, Path], name: str, width: int, scheme: str
+) -> None:
+    """No error, no missing picture, no request, no sideways scrolling, enough contrast."""
+    with Opened(chromium, pages[name], width, color_scheme=scheme) as opened:
+        page = opened.page
+        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        sizes = page.evaluate("[...document.images].map(i => i.naturalWidth)")
+        assert sizes
+        assert all(sizes)
+        assert width >= page.evaluate("document.documentElement.scrollWidth")
+        ratio, text = page.evaluate(CONTRAST)
+        assert ratio >= LEAST_CONTRAST, text
+        dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (scheme == "light") == (dark == "rgb(255, 255, 255)")
+        outside = [u for u in opened.requests if not u.startswith(("data:", pages[name].as_uri()))]
+        assert ([], []) == (opened.wrong, outside)
+
+
+def test_low_contrast_would_be_noticed(chromium: Any, pages: dict[str, Path]) -> None:
+    with Opened(chromium, pages["run"]) as opened:
+        opened.page.add_style_tag(content=":root { --quiet: #8a8a8a; }")
+        assert opened.page.evaluate(CONTRAST)[0] < LEAST_CONTRAST
+
+
+def test_what_is_cut_off_says_so_and_scrolls(chromium: Any, pages: dict[str, Path]) -> None:
+    """A table that is wider than a telephone has a shadow at its edge, and scrolls by itself."""
+    with Opened(chromium, pages["run"], 400) as opened:
+        table = opened.page.locator("#validation").locator("..")
+        assert table.evaluate("e => e.scrollWidth > e.clientWidth")
+        assert "radial-gradient" in table.evaluate("e => getComputedStyle(e).backgroundImage")
+        table.evaluate("e => { e.scrollLeft = 1e4; }")
+        assert table.evaluate("e => e.scrollLeft > 0")
+
+
+def middle_of(page: Any, name: str) -> tuple[float, float, float]:
+    """Return the middle of a plot's displacement panel, and its width."""
+    plot = page.locator(f"#{name} .plot")
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + 0.5 * box["height"], box["width"]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_dragging_zooms_in_and_reset_goes_back(
+    chromium: Any, pages: dict[str, Path], width: int
+) -> None:
+    with Opened(chromium, pages["run"], width) as opened:
+        page = opened.page
+        before = sorted(page.evaluate(TIME_RANGES))
+        for name in ("bands_training", "bands_held-out"):
+            x, y, wide = middle_of(page, name)
+            page.mouse.move(x, y)
+            page.mouse.down()
+            page.mouse.move(x + 0.2 * wide, y + 30, steps=5)
+            page.mouse.up()
+        for old, new in zip(before, sorted(page.evaluate(TIME_RANGES)), strict=True):
+            assert 0.1 < new / old < 0.5
+        for button in page.locator("[title=Reset]:visible").all():
+            button.click()
+        assert before == pytest.approx(sorted(page.evaluate(TIME_RANGES)))
+        assert [] == opened.wrong
+
+
+def test_the_wheel_zooms_once_it_is_asked_to(chromium: Any, pages: dict[str, Path]) -> None:
+    """Until then it scrolls the page, whatever is below the pointer."""
+    with Opened(chromium, pages["run"]) as opened:
+        page = opened.page
+        before = page.evaluate(TIME_RANGES)
+        x, y, _ = middle_of(page, "bands_held-out")
+        page.mouse.move(x, y)
+        page.mouse.wheel(0, -120)
+        assert before == page.evaluate(TIME_RANGES)
+        page.locator("#bands_held-out [title^='Wheel Zoom']").first.click()
+        x, y, _ = middle_of(page, "bands_held-out")
+        page.mouse.move(x, y)
+        page.mouse.wheel(0, -120)
+        page.wait_for_timeout(300)
+        assert sum(page.evaluate(TIME_RANGES)) < 0.99 * sum(before)
+
+
+def test_hovering_shows_the_sample_below_the_pointer(chromium: Any, pages: dict[str, Path]) -> None:
+    bands = example.bands()
+    with Opened(chromium, pages["run"]) as opened:
+        page = opened.page
+        x, y, _ = middle_of(page, "bands_held-out")
+        page.mouse.move(x, y)
+        page.mouse.move(x + 2, y, steps=3)
+        tips = page.locator(".bk-Tooltip div:has(> b):visible")
+        tips.first.wait_for()
+        lines = [text.replace("\N{MINUS SIGN}", "-") for text in tips.all_inner_texts()]
+    texts = dict(line.split(": ") for line in lines)
+    numbers = {what: float(text.split()[0]) for what, text in texts.items()}
+    at = int(np.argmin(np.abs(bands.time - numbers["time"])))
+    assert bands.measured is not None
+    assert bands.voltage[at] == pytest.approx(numbers["voltage"], abs=0.006)
+    assert bands.mean[at] == pytest.approx(numbers["mean"], abs=6e-4)
+    assert bands.measured[at] == pytest.approx(numbers["measured"], abs=6e-4)
+
+
+@pytest.mark.parametrize("table", ["parameters", "validation"])
+def test_csv_of_a_table_is_the_summary(chromium: Any, pages: dict[str, Path], table: str) -> None:
+    kept: Any = summary(example.run())[table]
+    with Opened(chromium, pages["run"]) as opened:
+        with opened.page.expect_download() as started:
+            opened.page.locator(f"a.csv[download='{table}.csv']").click()
+        text = Path(started.value.path()).read_text(encoding="utf-8")
+    assert f"{table}.csv" == started.value.suggested_filename
+    frame = pd.read_csv(StringIO(text), index_col=0)
+    if table == "parameters":
+        assert list(kept) == list(frame.index)
+        for name, numbers in kept.items():
+            for key, value in numbers.items():
+                assert value == frame.loc[name, key]
+    else:
+        for name, scores in kept.items():
+            assert scores["nrmse"] == float(frame.loc["nrmse", name])
+            assert scores["coverage"]["sensor"]["95"] == float(
+                frame.loc["coverage sensor 95", name]
+            )
+
+
+def test_on_paper_all_is_open_and_still(chromium: Any, pages: dict[str, Path]) -> None:
+    """What was closed is printed, pictures stand for plots, and there are no buttons."""
+    with Opened(chromium, pages["run"]) as opened:
+        page = opened.page
+        page.emulate_media(media="print")
+        seen = "e => e.getBoundingClientRect().height > 0"
+        assert all(page.locator("details table").evaluate_all(f"a => a.map({seen})"))
+        assert all(page.locator("img").evaluate_all(f"a => a.map({seen})"))
+        for hidden in (".csv", ".plot"):
+            assert not any(page.locator(hidden).evaluate_all(f"a => a.map({seen})"))
+
+
+def test_without_scripts_there_are_the_pictures(chromium: Any, pages: dict[str, Path]) -> None:
+    with Opened(chromium, pages["run"], java_script_enabled=False) as opened:
+        assert opened.page.locator("#loop img").is_visible()
+        assert not opened.page.locator("#loop .plot").is_visible()
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_can_be_read_aloud(chromium: Any, pages: dict[str, Path], name: str) -> None:
+    """Language, landmarks, one heading at the top, words for pictures, headers for tables."""
+    with Opened(chromium, pages[name]) as opened:
+
+        def number(selector: str) -> int:
+            found: int = opened.page.locator(selector).count()
+            return found
+
+        assert [1, 1, 1] == [number(s) for s in ("html[lang=en]", "main", "h1")]
+        assert 0 == number("img:not([alt]), img[alt='']")
+        assert 0 == number("th:not([scope])")
+        assert 0 == number("table:not([aria-label]):not([aria-labelledby])")
+        assert 0 == number("table:not(:has(th[scope=row]))")

@@ -1,0 +1,311 @@
+"""Several records in one config: what is read, refused, run, continued and predicted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bwbayes
+from bwbayes.app.config.config import Config, dump, parse
+from bwbayes.app.figures import draw_all
+from bwbayes.app.jobs.calibrate import experiment
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.running.fingerprint import fingerprint
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import carry_on, load_run, start
+from bwbayes.data import Record, write_record
+from bwbayes.errors import InputError
+from bwbayes.results.replicates import replicate
+from tests.app import small
+
+# A loop and a step at another rate than its readings', on one stand.
+TEXT = """\
+seed = 3
+
+[record.loops]
+signal = { amplitude = 100.0, frequency = 1.0, duration = 4.0, decay = 0.2, decay_from = 0.5 }
+from_rest = true
+train = [[0.0, 3.0]]
+
+[record.step]
+signal = { shape = "steps", levels = [60.0], dwell = 2.0, start = 0.5, duration = 2.0 }
+from_rest = true
+decimate = 2
+
+[stand]
+sample_rate = 50.0
+
+[model]
+dynamics = "none"
+
+[parameters]
+gamma = { fixed = 0.0172 }
+
+[sampling]
+ess = 150
+block = 25
+walkers = 20
+
+[validation.later]
+of = "loops"
+window = [3.0, 4.0]
+
+[validation.sine]
+signal = { amplitude = 60.0, frequency = 0.5, duration = 3.0 }
+from_rest = true
+"""
+
+
+def config(*changes: tuple[str, str]) -> Config:
+    """Return the config with parts of its text replaced."""
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return parse(text, "joint.toml")
+
+
+def problem(*changes: tuple[str, str]) -> Problem:
+    return resolve(config(*changes), Path())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """Return the folder of the run, made once; it is for reading."""
+    path = tmp_path_factory.mktemp("joint") / "run"
+    folder = start(config(), path.parent, path)
+    carry_on(folder, small.quiet(), workers=1)
+    return folder
+
+
+def test_records_have_names_starts_and_truths_of_their_own() -> None:
+    made = problem()
+    assert ["loops", "step"] == [*made.records]
+    fixed = {p.name: p.fixed for p in made.parameters if p.fixed is not None}
+    assert {"initial[loops]": 0.0, "initial[step]": 0.0, "exponent": 1.0, "gamma": 0.0172} == fixed
+    truth = made.config.truth
+    assert truth["offset[loops]"] == truth["offset[step]"] == 0.0
+    (label,) = {p.label for p in made.parameters if p.name == "offset[step]"}
+    assert label == r"y_0^{\mathrm{step}}"
+    assert made.windows("loops") == {"loops": slice(0, 150), "later": slice(150, 200)}
+    assert made.windows("step") == {"step": slice(0, 99)}
+
+
+def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
+    """The loop has the widest range and turns; an offset's prior is from its own record."""
+    changes = ('dynamics = "none"', 'dynamics = "none"\ngain = ["quadratic"]')
+    both = problem(changes, ("ess = 150", "ess = 151"))
+    lone = TEXT[: TEXT.index("[record.step]")] + TEXT[TEXT.index("[stand]") :]
+    lone = lone.replace("[record.loops]", "[record]").replace('of = "loops"\n', "")
+    _, head, tail = lone.replace(*changes).partition("[record]\n")
+    text = f'{head}file = "loops.h5"\n{tail.partition(chr(10))[2]}'
+    alone = resolve(parse(text, ""), Path(), {"record": both.records["loops"]})
+    shared = [name for name in alone.defaults if name in both.defaults]
+    assert {"d", "alpha", "sensor_sd"} <= {*shared}
+    assert {n: alone.defaults[n] for n in shared} == {n: both.defaults[n] for n in shared}
+    assert both.defaults["offset[step]"] != both.defaults["offset[loops]"]
+    spans = {one.actuator.span for one in both.posterior.datasets}
+    assert len(spans) == 1
+    assert next(iter(spans)).low < -50  # type: ignore[union-attr]
+
+
+def test_a_resolved_config_is_the_same_problem(tmp_path: Path) -> None:
+    first = problem()
+    folder = RunFolder.create(tmp_path / "run", first, overwrite=False)
+    again = load_run(folder)
+    assert fingerprint(first.config) == fingerprint(again.config)
+    assert first.sha256 == again.sha256
+    z = np.random.default_rng(0).standard_normal((3, len(first.posterior.names)))
+    np.testing.assert_allclose(
+        first.posterior.log_density(z), again.posterior.log_density(z), rtol=1e-12
+    )
+    assert dump(again.config) == dump(resolve(again.config, folder.path).config)
+
+
+def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
+    numbers = json.loads(finished.summary.read_text())
+    assert {"loops", "step", "later", "sine"} == numbers["validation"].keys()
+    assert {"loops", "step"} == numbers["innovations"].keys() == numbers["agreement"].keys()
+    assert all(one["agrees"] for one in numbers["agreement"].values())
+    made = bwbayes.open_run(finished.path)
+    assert {"step"} <= made.result.steps.keys()
+    pictures = {path.stem for path in (finished.path / "figures").glob("*.png")}
+    assert pictures == draw_all(made.result).keys()
+    assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= pictures
+    page = (finished.path / "report.html").read_text()
+    assert "Do the records agree?" in page
+    assert "offset[step]" in page
+    tree = made.posterior
+    assert {"displacement_loops", "displacement_step"} == {*tree["observed_data"].data_vars}
+    assert tree["observed_data"]["time_step"].size == 100
+    step = made.plot.record(name="step")
+    assert len(step.axes) >= 2
+    with pytest.raises(InputError, match=r"residuals: of several records; take fit\.bands"):
+        _ = made.residuals
+
+
+def test_a_chain_of_several_records_goes_on_and_knows_its_own(
+    finished: RunFolder, tmp_path: Path
+) -> None:
+    import shutil  # noqa: PLC0415
+
+    copy = tmp_path / "run"
+    shutil.copytree(finished.path, copy)
+    carry_on(RunFolder(copy), small.quiet(), workers=1)
+    small.assert_same_end(finished.path, copy)
+    text = (copy / "config.toml").read_text()
+    (copy / "config.toml").write_text(text.replace("train = [[0.0, 3.0]]", "train = [[0.0, 2.9]]"))
+    with pytest.raises(InputError, match=r"record\.loops\.train was"):
+        carry_on(RunFolder(copy), small.quiet(), workers=1)
+    (copy / "config.toml").write_text(text)
+    (copy / "records/step.h5").replace(copy / "records/loops.h5")
+    with pytest.raises(InputError):
+        carry_on(RunFolder(copy), small.quiet(), workers=1)
+
+
+def test_any_other_record_is_predicted(finished: RunFolder) -> None:
+    made = bwbayes.open_run(finished.path)
+    other = made.problem.validations["sine"].record
+    assert other is not None
+    predicted = made.predict(other, from_rest=True)
+    np.testing.assert_array_equal(predicted.mean, made.bands["sine"].mean)
+
+
+def test_replicates_make_all_records_anew() -> None:
+    """Each with its own readings; the loop is measured in the record that has one."""
+    common = experiment(problem(("ess = 150", "ess = 100")))
+    assert common.looped == "loops"
+    assert {"later": "loops"} == common.belongs
+    made = replicate(common, 1, 0)
+    assert made.converged
+    assert {"offset[loops]", "offset[step]", "opening", "d"} <= {*made.names}
+    assert {"sensor 95", "sine sensor 95"} <= made.covered.keys()
+
+
+def measured(seed: int, gain: float = 0.6) -> Record:
+    """Return a short measured record."""
+    time = np.arange(100) / 50
+    voltage = 80 * np.sin(2 * np.pi * time)
+    noise = np.random.default_rng(seed).standard_normal(100)
+    return Record.from_arrays(voltage, gain * voltage + 0.3 * noise, interval=0.02)
+
+
+def test_python_takes_a_list_or_a_dict_of_records(tmp_path: Path) -> None:
+    from bwbayes.app.config.keywords import config_of  # noqa: PLC0415
+
+    one, two = measured(1), measured(2)
+    made, records = config_of([one, two], {"train": (0, 1), "dynamics": "none"})
+    assert ["record_1", "record_2"] == [*made.records] == [*records]
+    assert [[0.0, 1.0]] == made.records["record_2"].train
+    write_record(two, tmp_path / "later.h5")
+    table = {"first": one, "second": {"record": tmp_path / "later.h5", "train": (0.5, 1.5)}}
+    made, records = config_of(table, {"train": (0, 1)})
+    assert ["first"] == [*records]
+    assert [[[0.0, 1.0]], [[0.5, 1.5]]] == [given.train for given in made.records.values()]
+    assert 2 == len(resolve(made, Path(), records).records)
+    with pytest.raises(InputError, match="two records are called 'later'; give a dict"):
+        config_of([tmp_path / "later.h5", tmp_path / "later.h5"], {})
+    nothing: list[Any] = [[], {}, 3, [3]]
+    for given in nothing:
+        with pytest.raises(InputError, match="make one with Record"):
+            config_of(given, {})
+
+
+LONE = '[record.a]\nfile = "a.h5"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LONE + '[record]\nfile = "b.h5"', "Cannot declare|train|file is a key of one record"),
+        (LONE + LONE, "invalid TOML: Cannot declare"),
+        (LONE + "trian = [0.0, 1.0]", "record.a.trian: unknown key; did you mean train"),
+        ("[record.a]\ntrain = [0.0, 1.0]", "record.a: give either file or signal"),
+        (LONE + '[record.training]\nfile = "b.h5"', "the name 'training' of a record is taken"),
+        (LONE + '[record.b]\nfile = "b.h5"\n[validation.a]\nfile = "c.h5"', "'a' is taken by a"),
+        (
+            LONE + '[record.b]\nfile = "b.h5"\n[validation.v]\nwindow = [0.0, 1.0]',
+            'its window is of one of several records; say of which, of = "a" for instance',
+        ),
+        (
+            LONE + '[validation.v]\nof = "b"\nwindow = [0.0, 1.0]',
+            "validation.v.of: no training record 'b'",
+        ),
+    ],
+)
+def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
+    text: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        parse(text, "joint.toml")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"), r"record\.loops\.train|window 9"),
+        (
+            ("decimate = 2", "decimate = 2\nstart = 1.0\ntrain = [[0.0, 0.8]]"),
+            r"record\.step\.train: no readings from 0 to 0\.78 s; .* in \[record\.step\]",
+        ),
+        (
+            ('dynamics = "none"', 'dynamics = "none"\nper_record = ["creep_1"]'),
+            r"model\.per_record: no part here has 'creep_1'",
+        ),
+        (
+            ("gamma = { fixed = 0.0172 }", '"offset[stp]" = { fixed = 0.0 }'),
+            r"parameters\.offset\[stp\]: no such parameter here; did you mean offset\[step\]",
+        ),
+        (
+            ('dynamics = "none"', 'dynamics = "none"\nshared = ["initial"]'),
+            None,
+        ),
+        (
+            ("from_rest = true\ndecimate", "decimate"),
+            None,
+        ),
+    ],
+)
+def test_what_several_records_cannot_be_is_refused(
+    change: tuple[str, str], message: str | None
+) -> None:
+    """Sharing initial is possible, and so is one record at rest beside another that is not."""
+    if message is None:
+        assert problem(change).posterior.names
+        return
+    with pytest.raises(InputError, match=message):
+        problem(change)
+
+
+def test_an_initial_state_cannot_be_shared_from_rest_and_not() -> None:
+    with pytest.raises(InputError, match="initial cannot be shared by records of which some"):
+        problem(
+            ("from_rest = true\ndecimate", "decimate"),
+            ('dynamics = "none"', 'dynamics = "none"\nshared = ["initial"]'),
+        )
+
+
+def test_files_in_another_unit_and_of_another_interval(tmp_path: Path) -> None:
+    """Intervals may differ; what is not displacement is refused in one line, with status 2."""
+    write_record(measured(1), tmp_path / "a.h5")
+    other = measured(2)
+    later = Record(np.repeat(other.voltage, 2), np.repeat(other.displacement, 2), 0.01)  # type: ignore[arg-type]
+    write_record(later, tmp_path / "b.h5")
+    text = '[record.a]\nfile = "a.h5"\n[record.b]\nfile = "b.h5"\n'
+    made = resolve(parse(text, ""), tmp_path)
+    assert [0.02, 0.01] == [one.actuator.interval for one in made.posterior.datasets]
+    (tmp_path / "c.csv").write_text("time_s,voltage_V,displacement_V\n0,1,2\n0.1,2,3\n0.2,3,4\n")
+    bad = tmp_path / "bad.toml"
+    bad.write_text(text + '[record.c]\nfile = "c.csv"\n')
+    with pytest.raises(InputError, match=r"c\.csv"):
+        resolve(parse(bad.read_text(), ""), tmp_path)
+
+
+def test_another_record_cannot_stand_for_several(tmp_path: Path) -> None:
+    write_record(measured(1), tmp_path / "a.h5")
+    with pytest.raises(InputError, match="the config has several \\(loops, step\\)"):
+        config().with_record(tmp_path / "a.h5")

@@ -1,0 +1,74 @@
+"""The exported C file, compiled with warnings as errors, as functions of arrays."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+from numpy.ctypeslib import ndpointer
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import Exported
+
+__all__ = ["Compiled"]
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+
+# One call for each sample, as in a controller.
+DRIVER = """
+void run_FUNCTION(double begin, const double *values, double *result, size_t count);
+void run_FUNCTION(double begin, const double *values, double *result, size_t count)
+{
+    actuator_state state;
+    size_t i;
+    actuator_begin(&state, begin);
+    for (i = 0; i < count; i++) {
+        result[i] = actuator_FUNCTION(&state, values[i]);
+    }
+}
+"""
+BEGINNING = """
+#include <stddef.h>
+#include "actuator.c"
+size_t state_bytes(void);
+size_t state_bytes(void) { return sizeof(actuator_state); }
+"""
+
+
+class Compiled:
+    """A model in C, in a folder; ``compiler`` is its path."""
+
+    def __init__(self, made: Exported, folder: Path, compiler: str) -> None:
+        (folder / "actuator.c").write_text(made.c_code(), encoding="ascii")
+        # By itself, as an engineer would compile it; then with a loop around it.
+        self._compile(compiler, folder, "-c", "actuator.c", "-o", "actuator.o")
+        functions = ["forward", *(["inverse"] if made.without_inverse is None else [])]
+        loops = [DRIVER.replace("FUNCTION", one) for one in functions]
+        (folder / "driver.c").write_text("".join([BEGINNING, *loops]), encoding="ascii")
+        self._compile(compiler, folder, "-shared", "-fPIC", "driver.c", "-o", "actuator.so", "-lm")
+        self._library = ctypes.CDLL(str(folder / "actuator.so"))
+        self._library.state_bytes.restype = ctypes.c_size_t
+
+    @staticmethod
+    def _compile(compiler: str, folder: Path, *arguments: str) -> None:
+        done = subprocess.run(
+            [compiler, *STRICT, *arguments], cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert (0, "") == (done.returncode, done.stderr)
+
+    @property
+    def bytes(self) -> int:
+        """Size of the state."""
+        return int(self._library.state_bytes())
+
+    def run(self, function: str, begin: float, values: FloatArray) -> FloatArray:
+        """Return what ``forward`` or ``inverse`` makes of values (samples,), one call each."""
+        array = ndpointer(np.float64, flags="C")
+        call = getattr(self._library, f"run_{function}")
+        call.argtypes = [ctypes.c_double, array, array, ctypes.c_size_t]
+        call.restype = None
+        result = np.empty(values.size)
+        call(begin, np.ascontiguousarray(values), result, values.size)
+        return result
