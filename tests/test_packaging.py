@@ -19,6 +19,7 @@ from zipfile import ZipFile
 import pytest
 
 from tests.app import small
+from tests.oldest import constraints
 
 ROOT = Path(__file__).parents[1]
 LONGEST = 900  # s
@@ -110,6 +111,17 @@ def test_the_metadata_says_what_is_needed() -> None:
     assert any(one.startswith("numba") for one in project["dependencies"])
     assert project["authors"]
     assert project["license"] == "MIT"
+
+
+def test_every_dependency_says_its_oldest_version() -> None:
+    """Which CONTRIBUTING.md's command installs; newer ones are not excluded."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    pinned = constraints(project["dependencies"])
+    assert len(pinned) == len(project["dependencies"])
+    assert "emcee==3.1.6" in pinned
+    assert any(line.startswith("numba==") for line in pinned)
+    with pytest.raises(ValueError, match="write a lower bound"):
+        constraints(["numpy<3"])
 
 
 def test_the_wheel_works_in_an_empty_environment(installed: Path) -> None:

@@ -350,7 +350,8 @@ def test_the_columns_of_a_file_are_recognised(
         raise InterruptedError(arguments[-2].record)
 
     monkeypatch.setattr(RunFolder, "create", created)
-    rows = np.stack([1e3 * record.time, record.voltage, record.displacement], axis=1)  # type: ignore[arg-type]
+    assert record.displacement is not None
+    rows = np.stack([1e3 * record.time, record.voltage, record.displacement], axis=1)
     np.savetxt(
         tmp_path / "lab.csv",
         rows,
