@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter1d
 from rich.console import Console
+from scipy.ndimage import gaussian_filter1d
 
 import bwbayes as bw
 from bwbayes.app.commands import cli

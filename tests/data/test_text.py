@@ -236,7 +236,11 @@ def test_a_gap_in_an_output_says_what_to_do(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("late", "problem"),
-    [(0.0025, "not a whole number of"), (0.0013, "not a whole number of"), (1e9, "makes the record too")],
+    [
+        (0.0025, "not a whole number of"),
+        (0.0013, "not a whole number of"),
+        (1e9, "makes the record too"),
+    ],
 )
 def test_a_gap_that_is_no_whole_number_of_intervals_is_refused(
     tmp_path: Path, late: float, problem: str
