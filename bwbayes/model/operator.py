@@ -84,7 +84,8 @@ class Operator(ABC):
         """
 
         def along(voltage: FloatArray) -> FloatArray:
-            return self.advance(column, voltage, memory)[0][0]
+            path: FloatArray = self.advance(column, voltage, memory)[0][0]
+            return path
 
         slope = abs(float(self.gain(column, Span(min(start, edge), max(start, edge)))[0]))
         asked = float(np.max(np.abs(displacement - along(np.array([start]))[0])))

@@ -78,10 +78,10 @@ def scaling() -> dict[str, Any]:
 
     found: dict[str, Any] = {}
     with (
-        distributed.LocalCluster(
+        distributed.LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=2, threads_per_worker=WORKERS[-1] // 2, dashboard_address=None
         ) as local,
-        distributed.Client(local) as client,
+        distributed.Client(local) as client,  # type: ignore[no-untyped-call]
         Cluster(client) as pool,
     ):
         busiest(pool, 50)  # the first calls fetch the posterior

@@ -73,7 +73,8 @@ def reached(asked: Reference, voltage: FloatArray, discrepancy: Any, seed: int) 
     stand = VirtualTestStand(discrepancy, 1 / asked.interval)
     truth = stand.run(voltage, np.random.default_rng(seed)).truth
     assert truth is not None
-    return truth - np.asarray(asked.displacement)
+    error: FloatArray = truth - np.asarray(asked.displacement)
+    return error
 
 
 def rms(error: FloatArray) -> float:

@@ -58,6 +58,10 @@ class Scaled:
         """Return the right density."""
         return self.right.log_density(coordinates)
 
+    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
+        """Draw from the right distribution."""
+        return self.right.draw(random, count)
+
     def __call__(
         self, coordinates: FloatArray, random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:

@@ -117,6 +117,7 @@ class RemembersExtrema(Operator):
         written down.
         """
         del column
+        return None
 
     def inverse(
         self, column: Values, displacement: FloatArray, memory: Memory, start: float, edge: float

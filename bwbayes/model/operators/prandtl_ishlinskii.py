@@ -287,6 +287,7 @@ def lines_travels(lines: Lines) -> Callable[[FloatArray], FloatArray]:
         # Where a line is level, which is only at a turn, any rise lies beyond it.
         above = rise - level[passed]
         steep = steepness[passed]
-        return np.divide(above, steep, out=np.zeros_like(above), where=steep > 0)
+        far: FloatArray = np.divide(above, steep, out=np.zeros_like(above), where=steep > 0)
+        return far
 
     return travels
