@@ -73,8 +73,7 @@ def reached(asked: Reference, voltage: FloatArray, discrepancy: Any, seed: int) 
     stand = VirtualTestStand(discrepancy, 1 / asked.interval)
     truth = stand.run(voltage, np.random.default_rng(seed)).truth
     assert truth is not None
-    error: FloatArray = truth - np.asarray(asked.displacement)
-    return error
+    return np.asarray(truth - np.asarray(asked.displacement))
 
 
 def rms(error: FloatArray) -> float:
