@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def written(folder: Path) -> None:
         (folder / f"bad_{name}.csv").write_text(content)
 
 
-def assert_covers(inside: list[float], level: float, what: str) -> float:
+def assert_covers(inside: Sequence[float], level: float, what: str) -> float:
     """Within three standard errors of the level, from the spread between specimens or binomial."""
     mean = float(np.mean(inside))
     error = max(np.std(inside), np.sqrt(level * (1 - level))) / np.sqrt(len(inside))

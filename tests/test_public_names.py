@@ -97,6 +97,21 @@ def test_importing_the_package_loads_no_library() -> None:
     assert not loaded & {"numpy", "scipy", "emcee", "h5py", "matplotlib", "pydantic"}
 
 
+def test_asking_for_help_loads_no_library() -> None:
+    """Nothing but what reads a command line: help is there at once."""
+    code = (
+        "import sys; from bwbayes.app.commands.cli import cli; "
+        "cli(['--help'], standalone_mode=False); cli(['run', '--help'], standalone_mode=False); "
+        "print(*{name.split('.')[0] for name in sys.modules})"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.splitlines()[-1].split())
+    assert not loaded & {
+        "arviz", "emcee", "h5py", "matplotlib", "numba", "numpy", "pandas", "pydantic", "scipy",
+        "xarray",
+    }  # fmt: skip
+
+
 def test_the_docstrings_example_runs() -> None:
     assert bwbayes.__doc__ is not None
     example = bwbayes.__doc__.split("::\n\n")[1].split("\n\nThe names")[0]

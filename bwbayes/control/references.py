@@ -87,7 +87,7 @@ def reference(
         ]
     )
     swung = middle + amplitude * swung
-    if abs(middle) < 1e-3 * amplitude:
+    if middle == 0:
         return swung, 0
     lead = np.arange(round(APPROACH / interval)) * interval / APPROACH
     risen = middle * (1 - np.cos(np.pi * lead)) / 2

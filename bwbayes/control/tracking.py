@@ -42,6 +42,9 @@ LEFT = math.sqrt(0.5)
 # Samples that a period must have.
 PER_PERIOD = 10
 
+# A middle that is nearer to zero than this part of the amplitude is zero.
+ROUND = 1e-3
+
 # Most samples of a signal.
 MOST_SAMPLES = 1_000_000
 
@@ -212,16 +215,24 @@ def track(
     frequencies = _frequencies(mean, wishes.frequencies)
     ends = _reach(mean, limits)
     amplitude = _amplitude(wishes.amplitude, ends)
-    middle, rise = ends.middle, _rise(mean)
+    # A range about zero needs no way to its middle.
+    middle = ends.middle if abs(ends.middle) > ROUND * amplitude else 0.0
+    rise = _rise(mean)
     gains, kept = design(mean, draws, limits, stand.delay, wishes.robustness)
 
     names = tuple(SHAPES)
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(names), 1)))
-    models = SampledModel.of(actuator, np.tile(every.mean(axis=0), (len(names), 1)))
+    references = [
+        reference(frequency, actuator.interval, middle, amplitude, rise)
+        for frequency in frequencies
+    ]
+    models = SampledModel.of(
+        actuator, np.tile(every.mean(axis=0), (len(frequencies) * len(names), 1))
+    )
+    fed = _fed(models, [wanted for wanted, _ in references], stand)
     followed: list[Followed] = []
-    for frequency in frequencies:
-        wanted, begins = reference(frequency, actuator.interval, middle, amplitude, rise)
-        plan = _plan(models, wanted, begins, ends, stand)
+    for (wanted, begins), (command, reached) in zip(references, fed, strict=True):
+        plan = _plan(wanted, begins, command, reached, ends, limits)
         followed.append(follow(plan, gains, rows, noise, stand, generator))
     rms, largest, limited = (np.stack(part, axis=1) for part in zip(*followed, strict=True))
     return Tracking(
@@ -240,24 +251,44 @@ def track(
     )
 
 
-def _plan(model: SampledModel, wanted: FloatArray, begins: int, ends: Span, stand: Stand) -> Plan:
-    """Return what the four controllers do to follow references (signals, samples)."""
-    limits = stand.limits
-    slope = ends.half / limits.half
-    linear = limits.middle + (wanted - ends.middle) / slope
+def _fed(
+    model: SampledModel, references: Sequence[FloatArray], stand: Stand
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the voltage for each reference (signals, samples), and where the model goes with it.
+
+    All at once, in the time that the longest takes: it is a step's own cost that counts, not how
+    many models do it. Of that length the others rest where they end.
+    """
+    longest = max(one.shape[1] for one in references)
+    wanted = np.vstack(
+        [np.pad(one, ((0, 0), (0, longest - one.shape[1])), mode="edge") for one in references]
+    )
     command, reached = np.zeros_like(wanted), np.zeros_like(wanted)
     state = model.begin(np.zeros(model.models))
-    last = np.zeros(model.models)
-    close = CLOSE * stand.amplifier.step
-    for t in range(wanted.shape[1] - 1):
+    last, close = np.zeros(model.models), CLOSE * stand.amplifier.step
+    for t in range(longest - 1):
         reached[:, t] = model.displacement(state)
         guess = 2 * state.voltage - last
         last = state.voltage
-        command[:, t], state = model.inverse(state, wanted[:, t + 1], limits, guess, close)
+        command[:, t], state = model.inverse(state, wanted[:, t + 1], stand.limits, guess, close)
     reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
+    ends = np.cumsum([one.shape[0] for one in references])[:-1]
+    parts = zip(references, np.split(command, ends), np.split(reached, ends), strict=True)
+    return [(fed[:, : one.shape[1]], gone[:, : one.shape[1]]) for one, fed, gone in parts]
+
+
+def _plan(
+    wanted: FloatArray,
+    begins: int,
+    command: FloatArray,
+    reached: FloatArray,
+    ends: Span,
+    limits: Span,
+) -> Plan:
+    """Return what the four controllers do to follow references (signals, samples)."""
+    slope = ends.half / limits.half
+    linear = np.clip(limits.middle + (wanted - ends.middle) / slope, *limits)
     nothing = np.zeros_like(wanted)
-    # What a linear command takes for no displacement may be another voltage than that of the rest.
-    linear = np.clip(linear, *limits)
     return Plan(
         np.stack([linear, command, nothing, command]),
         np.stack([nothing, nothing, wanted, reached]),

@@ -319,10 +319,9 @@ class JointPrior:
         known = {name: values[name] for name in self._known[parameter.name]}
         least, most = self._between(parameter, known)
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
-        cut = np.any(np.greater(least, low)), np.any(np.less(most, high))
         return (
-            np.maximum(low, least) if cut[0] else np.asarray(low),
-            np.minimum(high, most) if cut[1] else np.asarray(high),
+            np.asarray(low) if least.ndim == 0 and least <= low else np.maximum(low, least),
+            np.asarray(high) if most.ndim == 0 and most >= high else np.minimum(high, most),
         )
 
     def seen(self, values: Values, record: str) -> Values:

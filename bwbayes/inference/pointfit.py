@@ -157,13 +157,13 @@ class _LeastSquares:
         def residuals(values: FloatArray) -> FloatArray:
             # With what the slopes need, in one call: they are asked for at most of these places.
             here, plus, minus = np.split(self.residuals(place(values + star)), [1, 1 + steps.size])
-            last[:] = values.copy(), ((plus - minus) / (2 * steps[:, np.newaxis])).T
-            return here[0]
+            last[:] = here[0], values.copy(), ((plus - minus) / (2 * steps[:, np.newaxis])).T
+            return last[0]
 
         def jacobian(values: FloatArray) -> FloatArray:
-            if not np.array_equal(values, last[0]):
+            if not np.array_equal(values, last[1]):
                 residuals(values)
-            return last[1]
+            return last[2]
 
         solution = optimize.least_squares(
             residuals,

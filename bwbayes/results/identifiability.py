@@ -177,8 +177,9 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
             f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
-        f"the prior does not decide there (one twice as wide moves nothing by more than "
-        f"{swayed.moved:.1f} of its sd) but the noise model, which may be too sure"
+        f"the prior does not decide there (one twice as wide moves {swayed.name} by "
+        f"{swayed.moved:.2f} of its sd, and nothing by more) but the noise model, which may be "
+        "too sure"
     )
 
 

@@ -162,6 +162,12 @@ class StudentMixture:
             mixture = mixture._fitted_on(draws)
         return mixture
 
+    @cached_property
+    def _ends(self) -> FloatArray:
+        """Where each component's part of the numbers from 0 to 1 ends."""
+        ends = np.cumsum(self.weights)
+        return np.asarray(ends / ends[-1])
+
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
         """Take a round of expectation maximisation."""
         parts = [_gaussian(component, draws) for component in self.components]
@@ -178,7 +184,8 @@ class StudentMixture:
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
-        chosen = random.choice(len(self.components), size=count, p=self.weights)
+        # As ``random.choice`` does with these weights, without its checks of them.
+        chosen = self._ends.searchsorted(random.random_sample(count), side="right")
         drawn = np.stack([component.draw(random, count) for component in self.components])
         picked: FloatArray = drawn[chosen, np.arange(count)]
         return picked

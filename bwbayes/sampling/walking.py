@@ -90,9 +90,9 @@ def walk(
             yield from _independent_steps(move.get_proposal, kind, chosen, place, density, made)
         else:
             proposed, factor = move.get_proposal(place, random)
-            there = yield proposed
-            accepted = np.log(random.rand(walkers)) < there - density + factor
-            _go(place, density, accepted, proposed, there)
+            offered = yield proposed
+            accepted = np.log(random.rand(walkers)) < offered - density + factor
+            _go(place, density, accepted, proposed, offered)
             made.add(kind, place, density, accepted)
     return made
 
@@ -137,10 +137,10 @@ def _split_step(
     for split, mine in enumerate(rows):
         others = [place[rows[other]] for other in range(move.nsplits) if other != split]
         proposed, factor = move.get_proposal(place[mine], others, random)
-        there = yield proposed
-        moved = factor + there - density[mine] > np.log(random.rand(mine.size))
+        offered = yield proposed
+        moved = factor + offered - density[mine] > np.log(random.rand(mine.size))
         goers = mine[moved]
-        place[goers], density[goers] = proposed[moved], there[moved]
+        place[goers], density[goers] = proposed[moved], offered[moved]
         accepted[goers] = True
     return accepted
 
@@ -163,13 +163,13 @@ def _independent_steps(
             break
     every = np.stack(proposed)
     weight = proposal.log_density(every)
-    there = yield every[1:].reshape(-1, every.shape[2])
-    there = there.reshape(-1, walkers)
+    offered = yield every[1:].reshape(-1, every.shape[2])
+    offered = offered.reshape(-1, walkers)
     logs, here = np.log(chances), weight[0].copy()
     for step, chance in enumerate(logs):
         # As emcee adds them up, so that these are its very bits.
-        accepted = chance < there[step] - density + (here - weight[step + 1])
-        _go(place, density, accepted, every[step + 1], there[step])
+        accepted = chance < offered[step] - density + (here - weight[step + 1])
+        _go(place, density, accepted, every[step + 1], offered[step])
         np.copyto(here, weight[step + 1], where=accepted)
         made.add(kind, place, density, accepted)
 
@@ -179,8 +179,8 @@ def _go(
     density: FloatArray,
     accepted: BoolArray | NDArray[np.bool_],
     proposed: FloatArray,
-    there: FloatArray,
+    offered: FloatArray,
 ) -> None:
     """Let those who accepted go where it was proposed."""
     np.copyto(place, proposed, where=accepted[:, np.newaxis])
-    np.copyto(density, there, where=accepted)
+    np.copyto(density, offered, where=accepted)

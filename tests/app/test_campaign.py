@@ -19,6 +19,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import carry_on, config_text, start
+from bwbayes.app.report.campaign_report import render
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.run import go_on
@@ -252,12 +253,18 @@ def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     for text in ("broken.csv:2", "1 refused", '<th scope="row">alpha</th>', "Taken for normal"):
         assert text in page
     row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
-    assert "<b>x" not in module.render("x", CampaignResult((row,), None, "few"), {})
+    assert "<b>x" not in render("x", CampaignResult((row,), None, "few"), {})
 
 
 def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> None:
     records = {f"r{i}": record(i) for i in range(3)}
-    keys = {"dynamics": "none", "noise": "white", "seed": 3, "ess": 200, "walkers": 12}
+    keys: dict[str, Any] = {
+        "dynamics": "none",
+        "noise": "white",
+        "seed": 3,
+        "ess": 200,
+        "walkers": 12,
+    }
     keys |= {"block": 20, "pilot_steps": 60, "parameters": tomllib.loads(CONFIG)["parameters"]}
     made = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
     assert ["r0", "r1", "r2"] == list(made.table.index)

@@ -28,6 +28,7 @@ COMMANDS = (
     "predict",
     "report",
     "calibrate",
+    "compensate",
     "export",
     "track",
     "config",

@@ -141,7 +141,7 @@ def test_a_worker_killed_within_a_block_costs_no_bit(
 ) -> None:
     """After the first block; the scheduler gives what it was at to the other."""
     _, _, workers = cluster
-    killed = []
+    killed: list[int] = []
 
     def watcher(*_: object) -> None:
         if not killed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,11 +15,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 
-from bwbayes.app.figures import draw_all, save
+from bwbayes.app.figures import draw_all, interactive, save
 from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.loop import along, draw_loop
@@ -329,3 +331,47 @@ def test_dimensionless_parameter_has_no_empty_brackets() -> None:
     free = Parameter("exponent", "-", "n", "s", example.PARAMETERS[0].prior)
     run = example.run(converged=False, parameters=(free,), values=example.draws()[..., :1])
     assert "$n$" == draw_trace(run).axes[0].get_ylabel()
+
+
+def test_tick_labels_of_the_corner_picture_do_not_collide() -> None:
+    """Along the bottom row and the left column, whose panels touch each other."""
+    figure = draw_corner(example.run())
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    panels = figure.axes
+    free = 4
+    for axes, along_x in ((panels[-free:], True), (panels[::free], False)):
+        labels = [
+            label.get_window_extent(renderer)
+            for panel in axes
+            for label in (panel.get_xticklabels() if along_x else panel.get_yticklabels())
+            if label.get_text() and label.get_visible()
+        ]
+        assert len(labels) >= free - 1
+        for one, two in itertools.combinations(labels, 2):
+            assert not one.overlaps(two)
+
+
+def test_plots_keep_the_extremes_and_few_samples() -> None:
+    """Of voltage, mean and residual, wherever they are; and the ends."""
+    bands = example.bands(samples=60_000)
+    assert bands.measured is not None
+    bands.measured[12_345] += 30.0
+    bands.measured[54_321] = np.nan
+    at = interactive.kept(bands)
+    assert at.size < 5_000
+    assert {0, 12_345, 59_999} <= set(at)
+    for values in (bands.voltage, bands.mean, bands.measured - bands.mean):
+        assert (np.nanmin(values), np.nanmax(values)) == (
+            np.nanmin(values[at]),
+            np.nanmax(values[at]),
+        )
+
+
+def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None:
+    odd = dataclasses.replace(example.bands(), name="</script><b>")
+    run = example.run(every=(odd,))
+    plots = interactive.draw(run)
+    assert plots == interactive.draw(run)
+    assert ["bands_</script><b>", "loop"] == list(plots)
+    assert not any("<" in text for text in plots.values())
+    assert {} == interactive.draw(example.run(converged=False))

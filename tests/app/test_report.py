@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import re
 from base64 import b64encode
+from io import StringIO
 from typing import Any
+from urllib.parse import unquote
 
 import hypothesis.strategies as st
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 
@@ -17,7 +20,9 @@ from bwbayes.app.report.report import render
 from bwbayes.app.report.words import digits, symbol
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
+from bwbayes.results.causes import Cause
 from bwbayes.results.result import Result, summary
+from bwbayes.results.verdict import Verdict
 from tests.app import example
 
 PICTURES = {
@@ -139,6 +144,53 @@ def test_bands_without_a_measurement_have_no_validation() -> None:
     text = page(example.run(every=(example.bands(measured=False),)))
     assert 'id="validation"' not in text
     assert "There are no readings to check the bands against." in text
+
+
+def test_answer_is_of_held_out_readings_if_there_are_any() -> None:
+    """Coverage with its error, width, and how far the mean misses, before anything else."""
+    text = page(example.run())
+    first = re.sub(r"<.*?>|&nbsp;", " ", text[: text.index("Parameters")].split("</style>")[1])
+    for said in ("held-out (0 to 2.999 s, not fitted)", "94.3 ± 1.3 %", "6.13 µm", "5.52 µm"):
+        assert said in first
+    assert "training" not in first
+    fitted = page(example.run(every=(example.bands("training", 2500, 0, training=True),)))
+    assert "training (0 to 2.499 s, fitted)" in fitted
+
+
+def test_bands_that_do_not_hold_come_before_the_answer_with_the_remedy() -> None:
+    cause = Cause("noise", "the noise is not like that", "try another noise")
+    failed = Verdict("held-out", False, False, ("covers 60 %",), cause)
+    held = Verdict("training", True, True)
+    run = dataclasses.replace(example.run(), verdicts={"training": held, "held-out": failed})
+    text = page(run)
+    places = [text.index(said) for said in ("DOES NOT HOLD", "try another noise", "94.3 ± 1.3")]
+    assert sorted(places) == places
+    assert "Converged, and" not in text
+    assert ["NO", "yes"] == rows(text, "validation")["Holds"]
+
+
+@pytest.mark.parametrize("table", ["parameters", "validation"])
+def test_csv_has_the_numbers_as_they_are(table: str) -> None:
+    run = example.run()
+    kept: Any = summary(run)[table]
+    link = re.findall(
+        rf'download="{table}.csv" href="data:text/csv;charset=utf-8,(.*?)"', page(run)
+    )
+    frame = pd.read_csv(StringIO(unquote(link[0])), index_col=0)
+    if table == "parameters":
+        assert [one["mean"] for one in kept.values()] == list(frame["mean"])
+        assert list(kept) == list(frame.index)
+    else:
+        assert kept["held-out"]["nrmse"] == float(frame["held-out"]["nrmse"])
+        error = float(frame["training"]["coverage_error sensor 90"])
+        assert kept["training"]["coverage_error"]["sensor"]["90"] == error
+
+
+def test_constraints_are_those_of_the_model() -> None:
+    assert '<span id="constraints">0 &lt; alpha &lt; d</span>' in page(example.run())
+    without = tuple(p for p in example.PARAMETERS if p.name != "alpha")
+    run = example.run(parameters=without, values=example.draws()[..., :3])
+    assert 'id="constraints"' not in page(dataclasses.replace(run, truth={}))
 
 
 def test_verdict_of_a_converged_run() -> None:

@@ -55,7 +55,8 @@ def test_numbers_table_and_picture_agree(
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert f"{numbers['table'][0]['rms_um']:.2f}</td>" in page
     least = min(one["share"] for one in numbers["best_share"])
-    assert f"in at least {100 * least:.0f} % of the draws" in page
+    share = "all" if least == 1 else f"at least {100 * least:.0f} % of the"
+    assert f"in {share} draws, on every signal" in page
     # The same draws and noise in Python, and on the command line again.
     again = fit.track(frequencies=(2.0, 5.0), draws=5)
     assert numbers["table"] == again.numbers()["table"]

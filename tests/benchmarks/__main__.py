@@ -12,6 +12,7 @@ from bwbayes.app.running.workers import one_thread
 from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
 from tests.benchmarks.control import controller
+from tests.benchmarks.replicates import replicates
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
 from tests.measured import keep
@@ -26,6 +27,7 @@ TARGETS: tuple[tuple[str, str, float], ...] = (
     ("speed-up of ensembles in two threads", ">=", 1.8),
     ("s from the point fit to convergence with an ESS of 4,000", "<=", 10),
     ("part of the time to convergence spent on checks", "<=", 0.05),
+    ("CPU s of a calibration replicate of 300 samples", "<=", 0.8),
 )
 
 # Columns of the screen that the widest table takes.
@@ -71,6 +73,7 @@ def _measured(effort: Effort) -> Iterator[Table]:
     yield from effective.sampling(effort)
     yield controller(effort)
     yield startup(effort)
+    yield replicates(effort)
 
 
 def _targets(tables: dict[str, Table]) -> Table:
@@ -96,6 +99,7 @@ def _found(tables: dict[str, Table]) -> Iterator[float]:
     run = next(row for row in _rows(tables, "runs") if row["engine"] == "numba")
     yield _number(run["s"])
     yield _number(run["checks"]) / sum(_number(run[part]) for part in effective.PARTS)
+    yield _number(_rows(tables, "replicates")[0]["core s"])
 
 
 def _rows(tables: dict[str, Table], name: str) -> list[dict[str, Cell]]:

@@ -25,8 +25,8 @@ from bwbayes.app.jobs import calibrate
 from bwbayes.app.running.cluster import Cluster
 from bwbayes.app.running.workers import executor
 from bwbayes.results.replicates import as_done
-from tests.measured import keep
 from tests.inference.problems import short_posterior
+from tests.measured import keep
 
 __all__ = ["main", "on_paper", "overhead", "scaling"]
 

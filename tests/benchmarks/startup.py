@@ -32,6 +32,7 @@ kernels.sums(record, record, 0 * record, one, stages.BOUC_WEN, own, np.empty((0,
 
 STARTS: Mapping[str, list[str]] = {
     "python alone": ["-c", ""],
+    "import numpy": ["-c", "import numpy"],
     "import numpy, scipy.signal, emcee": ["-c", "import numpy, scipy.signal, emcee"],
     "import bwbayes": ["-c", "import bwbayes"],
     "bwbayes --help": ["-c", MAIN, "--help"],

@@ -34,7 +34,7 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.prediction import thinned
 from bwbayes.sampling.sampler import draws, first_chain, sample
-from tests.found import keep
+from tests.measured import keep
 
 CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
 LIMITS = Limits(-100.0, 100.0)

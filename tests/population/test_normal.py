@@ -60,10 +60,10 @@ def test_a_record_given_a_population_is_a_convolution(
 
 
 def test_a_shrunk_specimen_is_the_conjugate_normal() -> None:
-    mean, spread = np.full(100_000, 0.5), np.full(100_000, 0.2)
+    mean, spread = np.full(100_000, 0.5), np.full(100_000, 0.1)
     drawn = MEASURED.shrunk(1, mean, spread, np.random.default_rng(2))
-    precision = 25 + 1 / 0.2**2
-    expected = (0.4 * 25 + 0.5 / 0.2**2) / precision
+    precision = 25 + 1 / 0.1**2
+    expected = (0.4 * 25 + 0.5 / 0.1**2) / precision
     # Five standard errors.
     assert np.mean(drawn) == pytest.approx(expected, abs=5 * precision**-0.5 / 316)
     assert np.std(drawn) == pytest.approx(precision**-0.5, rel=5 / 447)

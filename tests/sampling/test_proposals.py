@@ -307,3 +307,12 @@ def test_another_number_of_degrees_of_freedom_is_another_density() -> None:
     x = np.array([[3.0, -2.0]])
     usual = MIXTURE.components[0]
     assert usual.log_density(x) != replace(usual, freedom=30.0).log_density(x)
+
+
+def test_components_are_chosen_as_numpy_chooses() -> None:
+    """From the same random numbers: the same places as with ``RandomState.choice``."""
+    parts = tuple(StudentProposal(np.full(2, centre), np.eye(2)) for centre in (-100.0, 0.0, 100.0))
+    mixture = StudentMixture(np.array([0.2, 0.5, 0.3]), parts)
+    drawn = mixture.draw(np.random.RandomState(3), 500)
+    chosen = np.random.RandomState(3).choice(3, size=500, p=mixture.weights)
+    np.testing.assert_array_equal(chosen, np.round(drawn[:, 0] / 100) + 1)

@@ -10,6 +10,7 @@ from rich.console import Console
 from bwbayes.app.commands.shared import (
     FILE,
     NOT_CONVERGED,
+    executor_option,
     overwrite_option,
     quiet_option,
     workers_option,
@@ -26,6 +27,7 @@ __all__ = ["compare"]
 @click.option("--future/--no-future", default=True, help="Whether to leave out the future, too.")
 @overwrite_option
 @workers_option
+@executor_option
 @quiet_option
 def compare(
     paths: tuple[Path, ...],
@@ -34,6 +36,7 @@ def compare(
     future: bool,
     overwrite: bool,
     workers: int | None,
+    how: str | None,
     quiet: bool,
 ) -> int:
     """Compare the runs in folders PATHS, or the --models that a config is run with.
@@ -55,7 +58,7 @@ def compare(
             raise InputError("compare: give two runs or more, or a CONFIG and --models")
         where = out or Path("results") / "comparison"
         made = compare_runs(
-            paths, where, console, workers=workers, with_future=future, overwrite=overwrite
+            paths, where, console, workers=workers, how=how, with_future=future, overwrite=overwrite
         )
     else:
         if len(paths) > 1:
@@ -70,6 +73,7 @@ def compare(
             where,
             console,
             workers=workers,
+            how=how,
             with_future=future,
             overwrite=overwrite,
         )

@@ -8,6 +8,7 @@ import corner
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, MaxNLocator
 from scipy.stats import rankdata
 
 from bwbayes.app.figures.style import COLOURS, TRUTH_COLOUR, axis_label, hide_unused, starts
@@ -22,9 +23,12 @@ TRACE_STRETCHES = 50
 RANKED_DRAWS = 100_000
 RANK_BINS = 20
 
-# Inches of one panel of the corner picture, and of its margin for labels.
+# Inches of one panel of the corner picture and of its margin for labels, and the size of its text,
+# which the page shows smaller the more panels there are.
 CORNER_PANEL = 1.25
-CORNER_MARGIN = 1.0
+CORNER_MARGIN = 1.3
+CORNER_FONT = 11
+CORNER_TICKS = 4
 
 
 def draw_corner(result: Result) -> Figure:
@@ -42,7 +46,7 @@ def draw_corner(result: Result) -> Figure:
         flat,
         fig=figure,
         labels=[axis_label(p) for p in result.free],
-        labelpad=0.35,
+        labelpad=0.45,
         range=[_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)],
         levels=(0.5, 0.9),
         color=COLOURS[0],
@@ -50,17 +54,31 @@ def draw_corner(result: Result) -> Figure:
         plot_density=False,
         fill_contours=True,
         data_kwargs={"alpha": 0.3, "ms": 1.2},
-        label_kwargs={"fontsize": 12},
-        max_n_ticks=3,
+        label_kwargs={"fontsize": CORNER_FONT + 2},
+        max_n_ticks=CORNER_TICKS,
         quiet=True,
     )
     for panel in figure.axes[::free]:
         panel.tick_params(axis="y", labelrotation=0)
+    for panel in figure.axes:
+        panel.tick_params(labelsize=CORNER_FONT)
+        for axis in (panel.xaxis, panel.yaxis):
+            if isinstance(axis.get_major_locator(), MaxNLocator):
+                axis.set_major_locator(FixedLocator(list(_inner_ticks(*axis.get_view_interval()))))
+    for panel in figure.axes[-free:]:
+        panel.tick_params(axis="x", labelrotation=90)
     margin = CORNER_MARGIN / side
     far = 1 - 0.2 / side
     figure.subplots_adjust(left=margin, bottom=margin, right=far, top=far)
     _mark_truths(figure.axes, truths)
     return figure
+
+
+def _inner_ticks(low: float, high: float) -> FloatArray:
+    """Return ticks that keep away from the ends, where they would meet the next panel's."""
+    ticks = np.asarray(MaxNLocator(CORNER_TICKS).tick_values(low, high), dtype=np.float64)
+    inner: FloatArray = ticks[np.abs(ticks - (low + high) / 2) < 0.4 * (high - low)]
+    return inner
 
 
 def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:

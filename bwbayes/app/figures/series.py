@@ -113,8 +113,10 @@ def _draw_ribbons(panel: Axes, bands: Bands, part: slice, about: FloatArray) -> 
         upper = (bands.upper[kind, 95] - about)[part]
         drawn = envelope(bands.time[part], lower, upper)
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
-        edge = 0.8 if kind == "sensor" else 0.0
-        panel.fill_between(*drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, label=BAND_NAMES[kind])
+        edge = 1.0 if kind == "sensor" else 0.0
+        panel.fill_between(
+            *drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, ls="--", label=BAND_NAMES[kind]
+        )
 
 
 def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:

@@ -74,7 +74,7 @@ BAND_COLOURS: Mapping[Kind, str] = {
     "displacement": "#ACD0E8",
     "parameter": "#6FAAD6",
 }
-EDGE_COLOUR = "#4C7FA6"
+EDGE_COLOUR = "#12344D"
 BAND_NAMES: Mapping[Kind, str] = {
     "sensor": "95 % sensor reading",
     "displacement": "95 % displacement",

@@ -64,6 +64,7 @@ def compare_runs(
     console: Console,
     *,
     workers: int | None = None,
+    how: str | Executor | None = None,
     with_future: bool = True,
     overwrite: bool = False,
 ) -> Comparison:
@@ -84,7 +85,7 @@ def compare_runs(
     for name, path in zip(names, folders, strict=True):
         runs.append(Fitted(name, *finished(RunFolder.open(path))))
         require_same(runs[0], runs[-1])
-    made = compare(runs, console, workers=workers, with_future=with_future)
+    made = compare(runs, console, workers=workers, how=how, with_future=with_future)
     write(made, runs, out)
     return made
 
@@ -97,6 +98,7 @@ def compare_models(
     console: Console,
     *,
     workers: int | None = None,
+    how: str | Executor | None = None,
     with_future: bool = True,
     overwrite: bool = False,
 ) -> Comparison:
@@ -121,10 +123,10 @@ def compare_models(
         folder = _folder(out / slug(name), problem, overwrite)
         console.print(f"{name} ...", highlight=False)
         if not folder.summary.is_file():
-            go_on(folder, console, workers=workers)
+            go_on(folder, console, workers=workers, how=how)
         runs.append(Fitted(name, *finished(folder)))
         require_same(runs[0], runs[-1])
-    made = compare(runs, console, workers=workers, with_future=with_future)
+    made = compare(runs, console, workers=workers, how=how, with_future=with_future)
     write(made, runs, out)
     return made
 
@@ -210,6 +212,7 @@ def compare(
     console: Console,
     *,
     workers: int | None = None,
+    how: str | Executor | None = None,
     with_future: bool = True,
 ) -> Comparison:
     """Compare runs of the same readings."""
@@ -218,7 +221,7 @@ def compare(
     for run in runs:
         if not console.quiet:
             console.print(f"judging {run.name} ...", highlight=False)
-        with one_thread(), executor(workers, run.problem.posterior.engine) as pool:
+        with one_thread(), executor(workers, run.problem.posterior.engine, how) as pool:
             candidates.append(candidate(run, pool, with_future=with_future))
     return choose(candidates, generator(seed, "comparison"))
 

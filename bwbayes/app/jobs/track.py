@@ -23,12 +23,15 @@ from bwbayes.app.report.track_report import render
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import Noise, Stand
-from bwbayes.control.tracking import CONTROLLERS, Tracking, Wishes, track
+from bwbayes.control.tracking import Tracking, Wishes, track
 from bwbayes.errors import InputError
 from bwbayes.results.outputs import write_summary
 from bwbayes.results.prediction import thinned
 
 __all__ = ["Setup", "show", "track_draws", "track_run"]
+
+# The controllers on a narrow screen.
+SHORT = ("linear", "feed-forward", "PID", "both")
 
 # Longest delay, samples.
 LONGEST_DELAY = 100
@@ -161,8 +164,10 @@ def show(tracking: Tracking, console: Console) -> None:
     ]
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)
-    table = Table(title="rms error, um, mean over the draws (their spread is in the table)")
-    for title in ("signal", "Hz", *CONTROLLERS, "both best, %"):
+    table = Table(
+        title="rms error, um, mean over the draws; and in how many both together are best"
+    )
+    for title in ("signal", "Hz", *SHORT, "best, %"):
         table.add_column(title, justify="left" if title == "signal" else "right")
     mean = tracking.rms.mean(axis=-1)
     for s, signal in enumerate(tracking.signals):

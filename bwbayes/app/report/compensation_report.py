@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bwbayes.app.report.report import picture, template
+from bwbayes.app.report.page import Table, picture, template
 from bwbayes.results.bands import LEVELS
 
 if TYPE_CHECKING:
@@ -38,22 +38,22 @@ def render(made: Compensation, pictures: Mapping[str, bytes]) -> str:
     """Return the page; ``pictures`` are PNG files by the name of their figure."""
     summary = made.summary
     both = ("compensated", "uncompensated")
-    rows = [("Voltage", "V", [_span(summary[one]["voltage_V"]) for one in both])]
+    rows = [("Voltage", *(_span(summary[one]["voltage_V"]) for one in both), "V")]
     for key, title in (("rms_um", "Rms of the error"), ("largest_um", "Largest error")):
         values = [summary[one][key] for one in both]
-        rows.append((f"{title}, mean", "µm", [f"{one['mean']:.3g}" for one in values]))
+        rows.append((f"{title}, mean", *(f"{one['mean']:.3g}" for one in values), "µm"))
         rows += [
-            (f"{title}, {level} % interval", "µm", [_span(one[str(level)]) for one in values])
+            (f"{title}, {level} % interval", *(_span(one[str(level)]) for one in values), "µm")
             for level in LEVELS
         ]
     if made.limit is not None:
         texts = [f"{summary[one]['probability_below_limit']:.3f}" for one in both]
-        rows.append((f"Probability that the error stays below {made.limit:g} µm", "", texts))
+        rows.append((f"Probability that the error stays below {made.limit:g} µm", *texts, ""))
     return template("compensation.html.j2").render(
         name=made.reference.name,
         summary=summary,
-        rows=rows,
-        facts=_facts(made, summary),
+        error=Table("error", "Error", ("Quantity", "Compensated", "Uncompensated", "Unit"), rows),
+        known=_facts(made, summary),
         remarks=made.remarks,
         pictures=[picture(png, name, *CAPTIONS[name]) for name, png in pictures.items()],
     )

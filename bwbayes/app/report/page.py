@@ -107,11 +107,10 @@ class Table:
     @property
     def csv(self) -> str:
         """The table as CSV, as a data URI."""
-        plain = [[Markup(escape(text)).striptags() for text in row] for row in self.rows]
-        shown = pd.DataFrame(
-            plain, columns=[Markup(escape(one)).striptags() for one in self.titles]
+        titles, *rows = (
+            [Markup(escape(text)).striptags() for text in row] for row in (self.titles, *self.rows)
         )
-        frame = pd.DataFrame.from_records(list(self.records)) if self.records else shown
+        frame = pd.DataFrame(self.records) if self.records else pd.DataFrame(rows, columns=titles)
         return "data:text/csv;charset=utf-8," + quote(frame.to_csv(index=False))
 
 

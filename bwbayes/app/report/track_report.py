@@ -56,9 +56,10 @@ def render(name: str, tracking: Tracking, png: bytes) -> str:
 def _compared(least: float | None) -> str:
     if least is None:
         return f"No frequency up to {JUDGED_TO:g} Hz was looked at."
+    share = "all" if least == 1 else f"at least {100 * least:.0f} % of the"
     return (
-        f"PID with feed-forward has less rms error than PID alone and feed-forward alone in at "
-        f"least {100 * least:.0f} % of the draws, on every signal up to {JUDGED_TO:g} Hz."
+        "PID with feed-forward has less rms error than PID alone and feed-forward alone in "
+        f"{share} draws, on every signal up to {JUDGED_TO:g} Hz."
     )
 
 

@@ -25,6 +25,7 @@ from importlib.metadata import version
 from typing import Any
 
 import cloudpickle
+from threadpoolctl import threadpool_limits
 
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
@@ -225,11 +226,8 @@ def _version() -> str:
 
 def _called(call: bytes, places: list[int], shared: list[object]) -> Any:
     """Make a call on a worker, with one thread for linear algebra as everywhere."""
-    # Here, because it loads the linear algebra that it limits.
-    from bwbayes.app.running.workers import one_thread  # noqa: PLC0415
-
     fn, arguments, named = pickle.loads(call)
     for place, argument in zip(places, shared, strict=True):
         arguments[place] = argument
-    with one_thread():
+    with threadpool_limits(1, user_api="blas"):
         return fn(*arguments, **named)

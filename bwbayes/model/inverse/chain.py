@@ -36,7 +36,7 @@ LONGEST = 2048
 QUANTUM = 1e-13
 
 # A voltage beyond so many times what a straight line would need is not looked for.
-FARTHEST = 1e3
+FARTHEST = 30.0
 
 # Rounds in which creep and drive are made to agree, and the part of the range to which they do.
 ROUNDS, AGREED = 200, 1e-14

@@ -1,0 +1,108 @@
+"""`bwbayes compensate` and `fit.compensate`: a command with its promised error, or one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bwbayes as bw
+from bwbayes.app.commands.shared import finish
+from bwbayes.app.jobs.compensate import FILES, compensate_run
+from bwbayes.control.wished import shaped
+from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.model.inverse.limits import Limits
+from tests.app import small
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+def asked_file(folder: Path, values: Any, interval: float = 0.02) -> Path:
+    path = folder / "asked.csv"
+    time = interval * np.arange(len(values))
+    rows = [f"{t:.9g},{x}" for t, x in zip(time, values, strict=True)]
+    path.write_text("\n".join(["time_s,displacement_nm", *rows, ""]), encoding="utf-8")
+    return path
+
+
+def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Path) -> None:
+    """What is written: a record that the package reads again, numbers, a table, a page."""
+    made = compensate_run(run, shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
+    files = made.save(tmp_path / "new")
+    assert list(FILES) == [path.name for path in files]
+    record = bw.read_record(files[0], need_displacement=False)
+    np.testing.assert_allclose(record.voltage, made.voltage)
+    assert (made.reference.interval, "command") == (record.interval, record.voltage_is)
+    numbers = json.loads(files[1].read_text())
+    assert made.summary == numbers
+    assert numbers["compensated"]["rms_um"]["mean"] < numbers["uncompensated"]["rms_um"]["mean"]
+    table = np.genfromtxt(files[2], delimiter=",", names=True)
+    np.testing.assert_allclose(table["reference_um"], made.asked, atol=1e-6)
+    error = made.compensated.bands.upper["displacement", 95] - made.asked
+    np.testing.assert_allclose(table["error_upper_95_um"], error, atol=1e-6)
+    page = files[3].read_text(encoding="utf-8")
+    assert f"{numbers['compensated']['rms_um']['mean']:.3g} µm" in page
+    assert 3 == page.count("<img ")
+    with pytest.raises(InputError, match="exists"):
+        made.save(tmp_path / "new")
+    assert made.save(tmp_path / "new", overwrite=True) == files
+
+
+def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -> None:
+    """Units of a file's columns are converted; the same seed gives the same bits."""
+    values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
+    path = asked_file(tmp_path, [repr(float(1e3 * value)) for value in values])
+    by_file = compensate_run(run, path, from_rest=True)
+    fit = bw.open_run(run)
+    by_array = fit.compensate(values, from_rest=True)
+    np.testing.assert_allclose(by_file.asked, values, rtol=1e-12)
+    np.testing.assert_allclose(by_file.voltage, by_array.voltage, atol=1e-9)
+    assert "rms error" in repr(by_array)
+    assert len(by_array.to_pandas()) == 200
+    assert len(by_array.plot().axes) == 3
+    again = fit.compensate(values, from_rest=True)
+    np.testing.assert_array_equal(by_array.compensated.rms, again.compensated.rms)
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        ([0.0, 1.0, 2.0], "give one row of 10 samples or more"),
+        ([5000.0] * 50, "is 5 um all along"),
+        (["nan", *range(49)], "not a number; give one at every sample"),
+        ([0.0, *[9e5] * 49], r"needs .* V, and from .* s on it is beyond the amplifier's"),
+        ([], "no samples below the header"),
+    ],
+)
+def test_references_that_cannot_be_used_are_one_line(
+    run: Path, tmp_path: Path, values: list[Any], line: str
+) -> None:
+    path = asked_file(tmp_path, values)
+    with pytest.raises(InputError, match=line) as refused:
+        compensate_run(run, path, from_rest=True, limits=bw_limits())
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_too_fast_says_where_and_how_fast(run: Path) -> None:
+    fast = shaped("sine", 0.02, 40.0, 10.0)
+    with pytest.raises(InputError, match=r"V/s, and from .* it is faster than the amplifier's"):
+        compensate_run(run, fast, from_rest=True, limits=bw_limits(slew=500.0))
+
+
+def bw_limits(**others: float) -> Limits:
+
+    return Limits(**{"low": -100.0, "high": 100.0, **others})
+
+
+def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
+    made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
+
+    assert 4 == finish(made.path, 1, quiet=True)
+    with pytest.raises(NotConvergedError, match=r"run: not converged: .* `bwbayes resume"):
+        compensate_run(made.path, shaped("sine", 0.02, 30.0, 0.5))
