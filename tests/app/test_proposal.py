@@ -205,7 +205,7 @@ def test_outliers_that_are_held_out_are_left_out(write: Write) -> None:
 
     path = write(change=spoil)
     made = proposed(path)
-    assert 2 == len(made.config.record.exclude or [])
+    assert 2 == len(made.config.records["record"].exclude or [])
     problem = resolve(made.config, path.parent)
     assert spikes == np.flatnonzero(~problem.record.has_reading).tolist()
 

@@ -162,10 +162,10 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     config, case = load(path), load_case(path)
     known = json.loads((FOLDER / "measured_evidence.json").read_text(encoding="utf-8"))
     assert known["digest"] == digest(case)
-    start = config.record.start
+    start = config.records["record"].start
     assert start is not None
     write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")
-    source = RecordConfig(file="t.h5", train=config.record.train)
+    source = RecordConfig(file="t.h5", train=config.records["record"].train)
     problem = resolve(config.model_copy(update={"record": source}), tmp_path)
     made = evidence(
         problem.posterior, *sampled(problem.posterior, problem.plan), generator(1, "evidence")
