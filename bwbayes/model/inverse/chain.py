@@ -6,31 +6,40 @@ one way: the drive turns where the voltage does, so that each stretch is one sea
 form, for all of its samples (:meth:`bwbayes.model.operator.Operator.inverse`).
 
 What is done to each model is done to it alone: the models of a batch have voltages of their own.
+Many n = 1 Bouc-Wen models go sample by sample instead, which is faster for them
+(:mod:`bwbayes.model.inverse.together`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.inverse.dynamics import undone
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.stretch import reached
+from bwbayes.model.inverse.together import able, voltages
+from bwbayes.model.linear import Recursion
 from bwbayes.model.operator import UNIT
+from bwbayes.model.operators.backlash_like import BacklashLike
+from bwbayes.model.operators.bouc_wen import BoucWen
 
 __all__ = ["inverse"]
 
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
+
+# From so many models on they go side by side, and so many of them at a time.
+MANY, BATCH = 50, 1000
 
 # Steps of the drive below this part of its range are rounding: they turn nothing.
 QUANTUM = 1e-13
@@ -102,13 +111,42 @@ def inverse(
     """
     models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
     asked = _checked(displacement, len(models))
-    result = np.empty((len(models), asked.shape[1]))
+    ones = []
     for row, model in enumerate(models):
         column = actuator.columns(model[np.newaxis])
         actuator.check(column)
-        one = _One(actuator, column, from_rest, _row(state, row))
-        result[row] = one.voltage(asked[min(row, len(asked) - 1)], limits or Limits(), nearest)
+        ones.append(_One(actuator, column, from_rest, _row(state, row)))
+    asked = np.broadcast_to(asked, (len(models), asked.shape[1]))
+    result = np.empty(asked.shape)
+    known = _together(ones, actuator.columns(models), asked, result)
+    for row, one in enumerate(ones):
+        made = result[row] if known[row] else None
+        result[row] = one.voltage(asked[row], limits or Limits(), nearest, made)
     return result
+
+
+def _together(
+    ones: Sequence[_One], columns: Mapping[str, FloatArray], asked: FloatArray, result: FloatArray
+) -> BoolArray:
+    """Write the voltages without limits of models that go side by side; tell which do."""
+    actuator, state, from_rest = ones[0].actuator, ones[0].state, ones[0].from_rest
+    kind = isinstance(actuator.hysteresis, BoucWen | BacklashLike)
+    if not kind or actuator.gain is not None or actuator.creep is not None or len(ones) < MANY:
+        return np.zeros(len(ones), dtype=bool)
+    memory, start = columns["initial"], 0.0 if from_rest else None
+    if state is not None:
+        memory = np.array([one.state.hysteresis.state[0] for one in ones if one.state])
+        start = float(state.hysteresis.voltage)
+    known = able(columns, memory)
+    rows = np.flatnonzero(known)
+    for part in (rows[i : i + BATCH] for i in range(0, rows.size, BATCH)):
+        here = {name: values[part] for name, values in columns.items()}
+        dynamics = actuator.sections(here).recursions[0]
+        for place, row in enumerate(part):
+            its = _of_row(dynamics, place)
+            result[row] = ones[row].drive(asked[row] - columns["offset"][row], its)
+        result[part] = voltages(here, result[part], memory[part], start)
+    return known
 
 
 def _checked(displacement: ArrayLike, models: int) -> FloatArray:
@@ -164,11 +202,13 @@ class _One:
         self.from_rest = from_rest
         self.slope = float(np.abs(actuator.hysteresis.gain(column, self.span)[0]))
 
-    def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
-        """Return the voltage (samples,) for a displacement (samples,)."""
+    def voltage(
+        self, displacement: FloatArray, limits: Limits, nearest: bool, made: FloatArray | None
+    ) -> FloatArray:
+        """Return the voltage (samples,) for a displacement; without limits it may be known."""
         drive = displacement - self.column["offset"][0]
         anything = self._anywhere(drive)
-        voltage = self._undone(drive, anything)
+        voltage = self._undone(drive, anything) if made is None else made
         edges = (voltage <= anything.low) | (voltage >= anything.high)
         if edges.any() and not nearest:
             sample = int(np.argmax(edges))
@@ -193,21 +233,21 @@ class _One:
         most = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
         return _Path(-most, most)
 
+    def drive(self, displacement: FloatArray, dynamics: Recursion) -> FloatArray:
+        """Return the drive (samples,) with which the dynamics make a displacement."""
+        if self.state is None:
+            return np.asarray(displacement[0] + undone(dynamics, displacement - displacement[0]))
+        rest = self.state.rest[0][0]
+        return np.asarray(rest + undone(dynamics, displacement - rest, self.state.filter[0]))
+
     def _undone(self, displacement: FloatArray, path: _Path) -> FloatArray:
         """Undo dynamics and creep, then what is left."""
         sections = self.actuator.sections(self.column)
         dynamics, *lags = sections.recursions
         states = sections.begin(None) if self.state is None else self.state.filter
-
-        def drive_of(what: FloatArray) -> FloatArray:
-            if self.state is None:
-                return np.asarray(what[0] + undone(dynamics, what - what[0]))
-            rest = self.state.rest[0][0]
-            return np.asarray(rest + undone(dynamics, what - rest, states[0]))
-
         creep = self.actuator.creep
         if creep is None:
-            return self._static(drive_of(displacement), path)
+            return self._static(self.drive(displacement, dynamics), path)
         strengths = [float(gain[0]) for gain in sections.gains[1:]]
         drive = displacement / (1 + sum(strengths))
         close = AGREED * float(np.max(np.abs(displacement)))
@@ -220,7 +260,7 @@ class _One:
                 rest = crept[0, 0] if self.state is None else self.state.rest[number][0]
                 moved = lag.run(crept - rest, states[number].copy())[0]
                 left -= strength * (rest + moved)
-            before, drive = drive, drive_of(left)
+            before, drive = drive, self.drive(left, dynamics)
             change = float(np.max(np.abs(drive - before)))
             if change <= close:
                 return self._static(drive, path)

@@ -1,0 +1,128 @@
+"""Many models side by side have the voltages that each has alone, and these make the reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.inverse.chain import MANY, inverse
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.inverse.together import able, voltages
+from bwbayes.model.linear import Hold
+from bwbayes.model.operators.backlash_like import BacklashLike
+from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
+
+
+def scattered(actuator: Actuator, models: int = MANY, seed: int = 1) -> FloatArray:
+    """Return θ (models, parameters) of Table 1, each parameter some per cent off, n = 1."""
+    source = np.random.default_rng(seed)
+    theta = np.array([[TABLE_1[name] for name in actuator.parameters]]).repeat(models, axis=0)
+    for place, name in enumerate(actuator.parameters):
+        if name == "initial":
+            theta[:, place] = source.normal(0.0, 3.0, models)
+        elif name != "exponent":
+            theta[:, place] *= np.exp(0.1 * source.standard_normal(models))
+    columns = dict(zip(actuator.parameters, theta.T, strict=True))
+    columns["alpha"][:] = np.minimum(columns["alpha"], 0.55 * columns["d"])
+    return theta
+
+
+@pytest.mark.parametrize("hold", ["first", "zero"])
+@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
+@pytest.mark.parametrize("from_rest", [True, False])
+def test_side_by_side_as_alone(hold: Hold, dynamics: str, from_rest: bool) -> None:
+    """Both to 1e-9 of the range, from any state, and what they make is the reference."""
+    actuator = Actuator(dynamics, hold, 1e-3, span=SPAN)
+    theta, asked = scattered(actuator), smooth()
+    columns = actuator.columns(theta)
+    assert able(columns, columns["initial"]).all()
+    together = inverse(actuator, theta, asked, from_rest=from_rest)
+    alone = np.stack([inverse(actuator, one, asked, from_rest=from_rest)[0] for one in theta])
+    assert np.max(np.abs(together - alone)) < CLOSE * np.ptp(alone)
+    for model, voltage in zip(theta[:10], together, strict=False):
+        made = actuator.displacement(model, voltage, from_rest=from_rest)[0]
+        # A held voltage acts one sample later; the second sample cannot be chosen.
+        late = 2 if not from_rest or dynamics != "none" else 0
+        assert np.max(np.abs(made - asked)[late:]) < CLOSE * np.ptp(asked)
+
+
+def test_backlash_like_and_a_piece_that_goes_on() -> None:
+    """Another operator of the kind, and a state with as many models, on references of their own."""
+    actuator = Actuator("lag", "first", 1e-3, BacklashLike(), span=SPAN)
+    theta = scattered(actuator)
+    asked = smooth() * np.linspace(0.5, 1.0, len(theta))[:, np.newaxis]
+    _, state = actuator.advance(theta, np.linspace(0.0, 20.0, 50), from_rest=True)
+    together = inverse(actuator, theta, asked, state)
+    for row, one in enumerate(theta[:5]):
+        _, its = actuator.advance(one, np.linspace(0.0, 20.0, 50), from_rest=True)
+        alone = inverse(actuator, one, asked[row], its)[0]
+        np.testing.assert_allclose(together[row], alone, atol=CLOSE * np.ptp(alone))
+
+
+def test_steps_as_large_as_the_range_against_a_search() -> None:
+    """Zero is crossed within a step, with β near 0, γ = β and states beyond the ceiling too."""
+    column = {
+        "d": np.array([0.7, 0.7, 0.7, 0.7]),
+        "alpha": np.array([0.3, 0.3, 0.3, 0.2]),
+        "beta": np.array([0.027, 0.02, 0.03, 1e-9]),
+        "gamma": np.array([0.017, 0.02, 0.0, 0.0]),
+    }
+    state = np.array([-5.0, 3.0, 12.0, 0.0])
+    drive = np.array([[30.0, -25.0, 10.0, 10.0, 12.0, -30.0]]).repeat(4, axis=0)
+    assert able(column, state).all()
+    made = voltages(column, drive, state, 0.0)
+    for row in range(4):
+        d = float(column["d"][row])
+        shape = [float(column[name][row]) for name in ("alpha", "beta", "gamma")]
+        u, h = 0.0, float(state[row])
+        for t, goal in enumerate(drive[row]):
+
+            def moved(v: float, u: float = u, h: float = h, shape: list[float] = shape) -> float:
+                return float(hysteresis([u, v], *shape, 1.0, h)[0, -1])
+
+            v = brentq(
+                lambda v, d=d, goal=goal, moved=moved: d * v - moved(v) - goal,
+                -300.0,
+                300.0,
+                xtol=1e-12,
+                rtol=1e-14,
+            )
+            u, h = v, moved(v)
+            assert made[row, t] == pytest.approx(u, abs=1e-9)
+
+
+def test_models_that_cannot_go_side_by_side_go_alone() -> None:
+    """Another exponent, γ > β, and slopes below zero after a turn; the others are not disturbed."""
+    actuator = Actuator("lag", "first", 1e-3, span=SPAN)
+    theta = scattered(actuator, MANY + 2)
+    columns = actuator.columns(theta)
+    columns["exponent"][1] = 1.3
+    columns["initial"][:] = 0.0
+    columns["gamma"][2] = 1.1 * columns["beta"][2]
+    steep = {name: values.copy() for name, values in columns.items()}
+    steep["alpha"][0] = 0.99 * steep["d"][0]
+    steep["gamma"][0] = -0.9 * steep["beta"][0]
+    assert [False, False, False, True] == able(steep, steep["initial"])[:4].tolist()
+    far = np.full(len(theta), 1000.0)
+    assert not able(steep, far).any()
+    together = inverse(actuator, theta, smooth())
+    for row in range(4):
+        alone = inverse(actuator, theta[row], smooth())[0]
+        np.testing.assert_allclose(together[row], alone, atol=CLOSE * np.ptp(alone))
+
+
+def test_limits_hold_for_all_of_them() -> None:
+    """What is beyond them is refused, or the nearest command is what each gets alone."""
+    actuator = Actuator("lag", "first", 1e-3, span=SPAN)
+    theta, limits = scattered(actuator), Limits(-40.0, 40.0)
+    with pytest.raises(InputError, match="beyond the amplifier's -40 to 40 V"):
+        inverse(actuator, theta, smooth(), limits=limits)
+    nearest = inverse(actuator, theta, smooth(), limits=limits, nearest=True)
+    assert np.max(np.abs(nearest)) <= 40.0
+    alone = inverse(actuator, theta[7], smooth(), limits=limits, nearest=True)[0]
+    np.testing.assert_allclose(nearest[7], alone, atol=CLOSE * 80)
