@@ -74,7 +74,7 @@ def test_feedback_with_feed_forward_is_best_up_to_20_hz() -> None:
     draws, runs, ratios = [], [], []
     for seed in range(1, SEEDS + 1):
         fit = fitted(seed)
-        made = fit.track(frequencies=FREQUENCIES, limits=LIMITS, draws=DRAWS)
+        made = fit.track(frequencies=FREQUENCIES, voltage=LIMITS, draws=DRAWS)
         assert made.margins.stable
         assert made.margins.gain.min() >= made.robustness.gain
         real = on_the_stand(fit)

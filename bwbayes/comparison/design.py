@@ -44,7 +44,7 @@ class Amplifier:
     ----------
     low, high
         Its voltages, V.
-    rate
+    slew
         Its fastest change of the voltage, V/s.
     current, capacitance
         Its largest current, A, into the actuator's capacitance, F: I = C dU/dt.
@@ -57,7 +57,7 @@ class Amplifier:
 
     low: float
     high: float
-    rate: float = np.inf
+    slew: float = np.inf
     current: float | None = None
     capacitance: float | None = None
 
@@ -66,17 +66,17 @@ class Amplifier:
             raise InputError(f"design: voltages from {self.low:g} to {self.high:g} V leave nothing")
         if (self.current is None) != (self.capacitance is None):
             raise InputError("design: a current's limit needs the capacitance too; give both")
-        for name in ("rate", "current", "capacitance"):
+        for name in ("slew", "current", "capacitance"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"design: {name} {value:g}; must be above zero")
 
     @property
     def fastest(self) -> float:
-        """The fastest change of the voltage that both rate and current allow, V/s."""
+        """The fastest change of the voltage that both slew and current allow, V/s."""
         if self.current is None or self.capacitance is None:
-            return self.rate
-        return min(self.rate, self.current / self.capacitance)
+            return self.slew
+        return min(self.slew, self.current / self.capacitance)
 
     def refuses(self, voltage: FloatArray, interval: float) -> str:
         """Say why it cannot make a voltage (samples,), V; empty if it can."""

@@ -98,6 +98,17 @@ def test_help_has_an_example_that_the_command_takes(bwbayes: Type, command: str)
     assert parsed.params
 
 
+@pytest.mark.parametrize("command", ["compensate", "design", "export", "track"])
+def test_the_amplifier_is_told_in_the_same_words_everywhere(command: str) -> None:
+    """Its voltages, fastest change, current and capacitance; --rate is samples a second alone."""
+    options = {o.opts[0]: o for o in cli.cli.commands[command].params if o.opts[0][0] == "-"}
+    assert (2, "LOW HIGH") == (options["--voltage"].nargs, options["--voltage"].metavar)
+    amplifier = {"--slew", "--current", "--capacitance"} & set(options)
+    assert amplifier in (set(), {"--slew", "--current", "--capacitance"})
+    assert (command in ("export", "track")) == ("--rate" in options)
+    assert not {"--voltages", "--limits"} & set(options)
+
+
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
 def test_help_names_every_command(bwbayes: Type, arguments: tuple[str, ...]) -> None:
     said = bwbayes(*arguments)

@@ -14,8 +14,9 @@ from bwbayes.app.commands.shared import finish
 from bwbayes.app.jobs.compensate import FILES, compensate_run
 from bwbayes.control.wished import shaped
 from bwbayes.errors import InputError, NotConvergedError
-from bwbayes.model.inverse.limits import Limits
 from tests.app import small
+
+VOLTAGE = (-100.0, 100.0)
 
 
 @pytest.fixture(scope="module")
@@ -85,19 +86,14 @@ def test_references_that_cannot_be_used_are_one_line(
 ) -> None:
     path = asked_file(tmp_path, values)
     with pytest.raises(InputError, match=line) as refused:
-        compensate_run(run, path, from_rest=True, limits=bw_limits())
+        compensate_run(run, path, from_rest=True, voltage=VOLTAGE)
     assert "\n" not in str(refused.value)
 
 
 def test_what_is_too_fast_says_where_and_how_fast(run: Path) -> None:
     fast = shaped("sine", 0.02, 40.0, 10.0)
     with pytest.raises(InputError, match=r"V/s, and from .* it is faster than the amplifier's"):
-        compensate_run(run, fast, from_rest=True, limits=bw_limits(slew=500.0))
-
-
-def bw_limits(**others: float) -> Limits:
-
-    return Limits(**{"low": -100.0, "high": 100.0, **others})
+        compensate_run(run, fast, from_rest=True, voltage=VOLTAGE, slew=500.0)
 
 
 def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:

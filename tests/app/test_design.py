@@ -73,8 +73,9 @@ def test_the_preset_keeps_to_the_amplifiers_limits(run: Path, tmp_path: Path) ->
         tmp_path,
         Console(quiet=True),
         drive="verification",
-        voltages=(0.0, 150.0),
-        limits={"current": 2e-3, "capacitance": 5e-6},
+        voltage=(0.0, 150.0),
+        current=2e-3,
+        capacitance=5e-6,
     )
     assert not any(one.refused for one in made if "sine" in one.name)
     best = read_record(tmp_path / "best.csv", need_displacement=False)

@@ -44,7 +44,7 @@ def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
 
 def test_the_controllers_pace_is_an_option(run: Path, tmp_path: Path) -> None:
     fit = bw.open_run(run)
-    made = fit.export(tmp_path, limits=(-20, 80), rate=1e4, hold="first")
+    made = fit.export(tmp_path, voltage=(-20, 80), rate=1e4, hold="first")
     numbers = json.loads((tmp_path / "model.json").read_text())
     assert (1e-4, "first", [-20, 80]) == tuple(
         numbers[name] for name in ("interval_s", "hold", "limits_V")
@@ -59,8 +59,8 @@ def test_the_controllers_pace_is_an_option(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({"limits": (5.0, -5.0)}, "give two voltages, the lower one first"),
-        ({"limits": (np.nan, 5.0)}, "give two voltages, the lower one first"),
+        ({"voltage": (5.0, -5.0)}, "give two voltages, the lower one first"),
+        ({"voltage": (np.nan, 5.0)}, "give two voltages, the lower one first"),
         ({"rate": 0.0}, "rate: 0 Hz; give a number above 0"),
         ({"rate": np.nan}, "rate: nan Hz; give a number above 0"),
         ({"rate": 1e9}, r"rate: 1e\+09 Hz; give a number above 0 and up to 1e\+07"),

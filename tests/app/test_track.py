@@ -74,7 +74,7 @@ def test_numbers_table_and_picture_agree(
         ({"gain_margin": 0.5}, "gain margin: 0.5; give a factor above 1"),
         ({"phase_margin": 120.0}, "phase margin: 120 degrees; give one between 0 and 90"),
         ({"rate": -1.0}, "rate: -1 Hz; give a number above 0"),
-        ({"limits": (1.0, 0.0)}, "give two voltages, the lower one first"),
+        ({"voltage": (1.0, 0.0)}, "give two voltages, the lower one first"),
         ({"frequencies": (400.0,)}, "frequencies: 400 Hz; at this rate give some from"),
         ({"amplitude": 1e4}, "amplitude: 10000 um; give one above 0 and within"),
     ],

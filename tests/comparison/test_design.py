@@ -147,5 +147,5 @@ def test_what_cannot_be_asked_is_one_line(known: tuple[Posterior, FloatArray]) -
         Amplifier(0.0, 1.0, current=1.0)
     with pytest.raises(InputError, match="leave nothing"):
         Amplifier(1.0, 1.0)
-    with pytest.raises(InputError, match="rate 0; must be above zero"):
-        Amplifier(0.0, 1.0, rate=0.0)
+    with pytest.raises(InputError, match="slew 0; must be above zero"):
+        Amplifier(0.0, 1.0, slew=0.0)

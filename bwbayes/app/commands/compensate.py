@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -45,10 +44,15 @@ __all__ = ["compensate"]
 )
 @click.option("--limit", type=float, help="Of the error, um; says how probably it is kept.")
 @click.option("--from-rest", is_flag=True, help="The actuator starts demagnetised at zero volts.")
-@click.option("--voltages", type=(float, float), help="The amplifier's lowest and highest, V.")
-@click.option("--slew", type=float, help="The amplifier's fastest change, V/s.")
-@click.option("--current", type=float, help="The amplifier's largest current, A.")
-@click.option("--capacitance", type=float, help="The actuator's, F; goes with --current.")
+@click.option(
+    "--voltage",
+    type=(float, float),
+    metavar="LOW HIGH",
+    help="Lowest and highest voltage of the amplifier, V; default: no limit.",
+)
+@click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
+@click.option("--current", type=float, help="Its largest current, A; with --capacitance.")
+@click.option("--capacitance", type=float, help="The actuator's capacitance, F.")
 @click.option("--nearest", is_flag=True, help="Where that does not suffice, come near.")
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option
@@ -64,13 +68,9 @@ def compensate(
     """
     from bwbayes.app.jobs.at_work import drawn
     from bwbayes.app.jobs.compensate import compensate_draws, reference_of
-    from bwbayes.model.inverse.limits import Limits
 
     if (shape is None) == (reference is None):
         raise InputError("compensate: give either a shape or --reference")
-    low, high = options["voltages"] or (-math.inf, math.inf)
-    slew = math.inf if options["slew"] is None else options["slew"]
-    limits = Limits(low, high, slew, options["current"], options["capacitance"])
     problem, flat = drawn(folder)
     interval = problem.record.interval
     if shape is None:
@@ -83,7 +83,10 @@ def compensate(
         asked,
         command=cast("Choice", options["command"]),
         from_rest=options["from_rest"],
-        limits=limits,
+        voltage=options["voltage"],
+        slew=options["slew"],
+        current=options["current"],
+        capacitance=options["capacitance"],
         nearest=options["nearest"],
         limit=options["limit"],
     )

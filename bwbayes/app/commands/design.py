@@ -25,11 +25,11 @@ __all__ = ["design"]
 )
 @click.option(
     "--voltage",
-    "voltages",
     type=(float, float),
-    help="Amplifier's range, V; default: the record's.",
+    metavar="LOW HIGH",
+    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
 )
-@click.option("--rate", type=float, help="Its fastest change of the voltage, V/s.")
+@click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
 @click.option("--current", type=float, help="Its largest current, A; with --capacitance.")
 @click.option("--capacitance", type=float, help="The actuator's capacitance, F.")
 @click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
@@ -39,8 +39,8 @@ def design(
     parameter: str | None,
     drive: str | None,
     candidates: str,
-    voltages: tuple[float, float] | None,
-    rate: float | None,
+    voltage: tuple[float, float] | None,
+    slew: float | None,
     current: float | None,
     capacitance: float | None,
     out: Path | None,
@@ -51,7 +51,7 @@ def design(
     What would be left of a parameter's standard deviation, or of a band's width along a drive,
     after one more record; the best signal within the amplifier's limits goes into best.csv.
 
-    Example: bwbayes design results/ring_bender --parameter beta --rate 2000
+    Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
     from bwbayes.app.jobs.design import design as rank
 
@@ -63,8 +63,10 @@ def design(
             candidates=candidates,
             parameter=parameter,
             drive=drive,
-            limits={"rate": rate, "current": current, "capacitance": capacitance},
-            voltages=voltages,
+            voltage=voltage,
+            slew=slew,
+            current=current,
+            capacitance=capacitance,
             overwrite=overwrite,
         )
     except NotConvergedError as error:

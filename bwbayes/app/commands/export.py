@@ -19,8 +19,9 @@ __all__ = ["export"]
 @click.argument("folder", type=FILE)
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/export.")
 @click.option(
-    "--limits",
+    "--voltage",
     type=(float, float),
+    metavar="LOW HIGH",
     help="Lowest and highest voltage that the inverse may give, V; default: the record's.",
 )
 @click.option(
@@ -35,7 +36,7 @@ __all__ = ["export"]
 def export(
     folder: Path,
     out: Path | None,
-    limits: tuple[float, float] | None,
+    voltage: tuple[float, float] | None,
     rate: float | None,
     hold: str | None,
     overwrite: bool,
@@ -51,7 +52,7 @@ def export(
     made, files = write(
         folder,
         out,
-        limits=limits,
+        voltage=voltage,
         rate=rate,
         hold=cast("Hold | None", hold),
         overwrite=overwrite,

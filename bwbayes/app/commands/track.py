@@ -24,8 +24,9 @@ __all__ = ["track"]
 )
 @click.option("--amplitude", type=float, help="Of the references, um; default: 80 % of the reach.")
 @click.option(
-    "--limits",
+    "--voltage",
     type=(float, float),
+    metavar="LOW HIGH",
     help="Lowest and highest voltage of the amplifier, V; default: the record's.",
 )
 @click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
@@ -50,7 +51,7 @@ def track(
     out: Path | None,
     frequencies: tuple[float, ...],
     amplitude: float | None,
-    limits: tuple[float, float] | None,
+    voltage: tuple[float, float] | None,
     rate: float,
     delay: int,
     gain_margin: float,
@@ -69,7 +70,7 @@ def track(
     from bwbayes.app.jobs.track import Setup, show, track_run
 
     setup = Setup(
-        limits, rate, delay, gain_margin, phase_margin, frequencies or None, amplitude, draws
+        voltage, rate, delay, gain_margin, phase_margin, frequencies or None, amplitude, draws
     )
     made, files = track_run(folder, out, setup, overwrite=overwrite)
     if not quiet:

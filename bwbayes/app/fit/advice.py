@@ -29,7 +29,7 @@ class Advice:
         """Rank signals by what they would leave of an sd, or of a band's width; the best first.
 
         ``target`` is a parameter's name, or a drive in V whose band is to be narrow; ``options``
-        (candidates, voltages, rate, current, capacitance) and errors are as of
+        (candidates, voltage, slew, current, capacitance) and errors are as of
         :func:`bwbayes.app.jobs.design.design_draws`.
 
         Raises

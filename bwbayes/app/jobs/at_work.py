@@ -46,7 +46,7 @@ def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
     voltage = problem.record.voltage
     low, high = given or (float(np.min(voltage)), float(np.max(voltage)))
     if not (np.isfinite([low, high]).all() and low < high):
-        raise InputError(f"limits: {low:g} to {high:g} V; give two voltages, the lower one first")
+        raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
     return Span(low, high)
 
 

@@ -7,6 +7,7 @@ page with pictures, ``compensation.html``.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -106,7 +107,10 @@ def compensate_draws(
     *,
     command: Choice = "mean",
     from_rest: bool = False,
-    limits: Limits | None = None,
+    voltage: tuple[float, float] | None = None,
+    slew: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
     nearest: bool = False,
     limit: float | None = None,
     interval: float | None = None,
@@ -123,8 +127,11 @@ def compensate_draws(
     reference
         A :class:`~bwbayes.control.wished.Reference`, a file, or displacements (samples,), um, at
         the record's sampling interval or the given ``interval``, s.
-    command, from_rest, limits, nearest, limit
+    command, from_rest, nearest, limit
         As of :func:`~bwbayes.control.compensation.compensate`.
+    voltage, slew, current, capacitance
+        Limits of the amplifier, by default none: lowest and highest voltage, V; its fastest change,
+        V/s; the largest current, A, into the actuator's capacitance, F.
     interval, smoothed
         Sampling interval, and sd of a smoothing, s, of displacements.
 
@@ -133,6 +140,8 @@ def compensate_draws(
     InputError
         A reference that cannot be read or reached.
     """
+    low, high = (-math.inf, math.inf) if voltage is None else voltage
+    limits = Limits(low, high, math.inf if slew is None else slew, current, capacitance)
     alone = next(iter(problem.posterior.each(flat)))
     asked = reference_of(reference, interval or problem.record.interval, smoothed)
     seed = problem.config.seed

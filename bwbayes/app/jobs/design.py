@@ -60,8 +60,10 @@ def design(
     candidates: str = PRESET,
     parameter: str | None = None,
     drive: str | None = None,
-    limits: Mapping[str, float | None] | None = None,
-    voltages: tuple[float, float] | None = None,
+    voltage: tuple[float, float] | None = None,
+    slew: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
     overwrite: bool = False,
 ) -> list[Promise]:
     """Rank candidates for a finished run; write and show what came of it.
@@ -79,10 +81,8 @@ def design(
         ``"standard"``.
     parameter, drive
         What is to be known better: a parameter, or the band along a record's voltage or a signal.
-    limits
-        The amplifier's ``rate`` (V/s), ``current`` (A) and ``capacitance`` (F).
-    voltages
-        Its range, V; by default that of the fitted record.
+    voltage, slew, current, capacitance
+        What the amplifier can do: V, V/s, A, F; by default the voltages of the fitted record.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def design(
     if not outcome.converged:
         raise NotConvergedError(f"{path}: has not converged, so nothing is known to start from")
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
-    amplifier = amplifier_of(problem, voltages, limits or {})
+    amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
     signals = candidates_of(candidates, problem, amplifier)
     target = parameter if drive is None else _drive(drive, problem)
     assert target is not None
@@ -141,8 +141,8 @@ def design_draws(
     target: str | ArrayLike,
     *,
     candidates: Mapping[str, ArrayLike] | None = None,
-    voltages: tuple[float, float] | None = None,
-    rate: float | None = None,
+    voltage: tuple[float, float] | None = None,
+    slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
 ) -> list[Promise]:
@@ -157,7 +157,7 @@ def design_draws(
     candidates
         Voltages (samples,) by name, V, at the fitted record's interval, from rest; by default the
         preset.
-    voltages, rate, current, capacitance
+    voltage, slew, current, capacitance
         What the amplifier can do: V, V/s, A, F.
 
     Raises
@@ -165,8 +165,7 @@ def design_draws(
     InputError
         A target that is not a free parameter of the actuator, or limits that leave nothing.
     """
-    limits = {"rate": rate, "current": current, "capacitance": capacitance}
-    amplifier = amplifier_of(problem, voltages, limits)
+    amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
     if candidates is None:
         signals = candidates_of(PRESET, problem, amplifier)
     else:
@@ -193,20 +192,15 @@ def promised(
 
 def amplifier_of(
     problem: Problem,
-    voltages: tuple[float, float] | None,
-    limits: Mapping[str, float | None],
+    voltage: tuple[float, float] | None,
+    slew: float | None,
+    current: float | None,
+    capacitance: float | None,
 ) -> Amplifier:
     """Return the amplifier; by default with the voltages of the fitted record alone."""
-    voltage = problem.record.voltage
-    low, high = voltages or (float(np.min(voltage)), float(np.max(voltage)))
-    rate = limits.get("rate")
-    return Amplifier(
-        low,
-        high,
-        np.inf if rate is None else rate,
-        limits.get("current"),
-        limits.get("capacitance"),
-    )
+    known = problem.record.voltage
+    low, high = voltage or (float(np.min(known)), float(np.max(known)))
+    return Amplifier(low, high, np.inf if slew is None else slew, current, capacitance)
 
 
 def candidates_of(candidates: str, problem: Problem, amplifier: Amplifier) -> dict[str, FloatArray]:

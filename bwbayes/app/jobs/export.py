@@ -40,7 +40,7 @@ def export_draws(
     flat: FloatArray,
     folder: Path,
     *,
-    limits: tuple[float, float] | None = None,
+    voltage: tuple[float, float] | None = None,
     rate: float | None = None,
     hold: Hold | None = None,
     overwrite: bool = False,
@@ -55,8 +55,8 @@ def export_draws(
         Its draws, (draws, free), parameters in their own units.
     folder
         Where the files go.
-    limits
-        Voltages that the inverse may give, V; by default those of the record.
+    voltage
+        Lowest and highest that the inverse may give, V; by default those of the record.
     rate
         The controller's samples a second; by default the record's.
     hold
@@ -78,7 +78,7 @@ def export_draws(
     actuator = at_rate(one.actuator, rate, hold)
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, limits), sds)
+    made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, voltage), sds)
     return made, _written(made, folder, overwrite)
 
 

@@ -43,8 +43,8 @@ class Setup:
 
     Parameters
     ----------
-    limits
-        Voltages of the amplifier, V; by default those of the record.
+    voltage
+        Lowest and highest of the amplifier, V; by default those of the record.
     rate
         Samples a second.
     delay
@@ -64,7 +64,7 @@ class Setup:
         A delay, a number of draws or margins that make no sense.
     """
 
-    limits: tuple[float, float] | None = None
+    voltage: tuple[float, float] | None = None
     rate: float = 1000.0
     delay: int = 1
     gain_margin: float = 2.0
@@ -101,7 +101,7 @@ def track_draws(problem: Problem, flat: FloatArray, setup: Setup) -> Tracking:
     theta = posterior.table.of(posterior.prior.theta(every), one.name)
     some = theta[: setup.draws]
     actuator = at_rate(one.actuator, setup.rate, "zero")
-    stand = Stand(limits_of(problem, setup.limits), setup.delay)
+    stand = Stand(limits_of(problem, setup.voltage), setup.delay)
     wishes = Wishes(setup.robustness, setup.frequencies, setup.amplitude)
     return track(
         actuator,
