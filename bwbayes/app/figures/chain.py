@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import corner
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -43,6 +42,8 @@ def draw_corner(result: Result) -> Figure:
 
     The true values, where they are known, are lines.
     """
+    import corner  # noqa: PLC0415  # it loads all of arviz, which nobody else here needs
+
     flat = result.flat_draws
     flat = flat[starts(flat.shape[0], CORNER_DRAWS)]
     free = len(result.free)
