@@ -9,10 +9,11 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import get_type_hints
 
 import bwbayes
@@ -53,16 +54,21 @@ def every_module() -> Iterator[ModuleType]:
 def _resolve(module: ModuleType) -> None:
     """Put types for the annotations that pdoc cannot read.
 
-    These are of named tuples, whose constructors know no module, and of generic functions.
+    These are of named tuples, whose constructors know no module, of fields that are inherited from
+    another module, and of generic functions and methods.
     """
     for one in list(vars(module).values()):
         if getattr(one, "__module__", "") != module.__name__:
             continue
         if isinstance(one, type) and issubclass(one, tuple):
             one.__new__.__annotations__ = get_type_hints(one)
-        elif parameters := getattr(one, "__type_params__", ()):
-            names = {parameter.__name__: parameter for parameter in parameters}
-            one.__annotations__ = get_type_hints(one, localns=names)
+        elif isinstance(one, type) and is_dataclass(one):
+            hints, made = get_type_hints(one), one.__init__
+            made.__annotations__ = {n: hints.get(n, a) for n, a in made.__annotations__.items()}
+        for function in (one, *(vars(one).values() if isinstance(one, type) else ())):
+            if isinstance(function, FunctionType) and function.__type_params__:
+                names = {parameter.__name__: parameter for parameter in function.__type_params__}
+                function.__annotations__ = get_type_hints(function, localns=names)
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ KEEPERS = {
     "matplotlib": (
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",
+        "bwbayes.app.jobs.compensate",
         "bwbayes.app.running.predictions",
     ),
     "corner": ("bwbayes.app.figures*",),

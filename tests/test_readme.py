@@ -63,7 +63,7 @@ def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
 
 @pytest.mark.parametrize("text", re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL))
 def test_each_config_of_the_readme_can_be_read(text: str) -> None:
-    record = "" if "[record]" in text else '[record]\nfile = "my_record.csv"\n'
+    record = "" if "[record" in text else '[record]\nfile = "my_record.csv"\n'
     parse(record + text, "README")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table as Grid
 
-from bwbayes.app.running.run import versions
+from bwbayes.app.running.fingerprint import versions
 
 __all__ = ["Cell", "Table", "machine", "printed", "written"]
 

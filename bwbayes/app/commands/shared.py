@@ -62,7 +62,14 @@ def finish(
     console = Console(stderr=True, quiet=quiet)
     try:
         result = carry_on(
-            folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
+            folder,
+            console,
+            workers=workers,
+            ess=ess,
+            steps=steps,
+            engine=engine,
+            how=how,
+            apart=True,
         )
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)

@@ -7,7 +7,8 @@ package alone knows matplotlib and corner; it opens no window and touches no glo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
@@ -28,7 +29,20 @@ from bwbayes.app.figures.style import STYLE
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
 
-__all__ = ["draw_all", "draw_alone", "save", "save_one"]
+__all__ = [
+    "Drawings",
+    "draw_all",
+    "draw_alone",
+    "of_draws",
+    "of_predictions",
+    "pictures",
+    "save",
+    "save_one",
+    "save_pictures",
+]
+
+# What draws a figure, by the figure's name.
+type Drawings = dict[str, Callable[[], Figure]]
 
 
 def draw_all(result: Result) -> dict[str, Figure]:
@@ -40,31 +54,49 @@ def draw_all(result: Result) -> dict[str, Figure]:
     Without convergence only the last two; without bands or a measurement to hold them against,
     what needs them is left out.
     """
-    figures: dict[str, Figure] = {}
     with mpl.rc_context(STYLE):
-        if result.outcome.converged:
-            # A step has no loop.
-            looped = [bands for bands in result.bands if bands.name not in result.steps]
-            if looped:
-                figures["loop"] = draw_loop(looped)
-            if result.agreement:
-                figures["agreement"] = draw_agreement(result.agreement)
-            if result.loops is not None:
-                figures["loops"] = draw_loops(result.loops)
-            if result.steps:
-                figures["steps"] = draw_steps(result.steps)
-            figures |= {f"bands_{bands.name}": draw_bands(bands) for bands in result.bands}
-            if result.scores:
-                figures["coverage"] = draw_coverage(result.bands, result.scores)
-            for name, innovations in result.innovations.items():
-                several = len(result.innovations) > 1
-                figures[f"innovations_{name}" if several else "innovations"] = draw_innovations(
-                    innovations
-                )
-            figures["corner"] = draw_corner(result)
-        figures["trace"] = draw_trace(result)
-        figures["ranks"] = draw_ranks(result)
-    return figures
+        return {name: draw() for name, draw in (of_predictions(result) | of_draws(result)).items()}
+
+
+def of_predictions(result: Result) -> Drawings:
+    """Return, by name, what draws each figure of predictions; nothing without convergence."""
+    drawings: Drawings = {}
+    if not result.outcome.converged:
+        return drawings
+    # A step has no loop.
+    looped = [bands for bands in result.bands if bands.name not in result.steps]
+    if looped:
+        drawings["loop"] = partial(draw_loop, looped)
+    if result.agreement:
+        drawings["agreement"] = partial(draw_agreement, result.agreement)
+    if result.loops is not None:
+        drawings["loops"] = partial(draw_loops, result.loops)
+    if result.steps:
+        drawings["steps"] = partial(draw_steps, result.steps)
+    drawings |= {f"bands_{bands.name}": partial(draw_bands, bands) for bands in result.bands}
+    if result.scores:
+        drawings["coverage"] = partial(draw_coverage, result.bands, result.scores)
+    several = len(result.innovations) > 1
+    return drawings | {
+        f"innovations_{name}" if several else "innovations": partial(draw_innovations, one)
+        for name, one in result.innovations.items()
+    }
+
+
+def of_draws(result: Result) -> Drawings:
+    """Return, by name, what draws each figure of the draws, which are known before predictions."""
+    drawings: Drawings = {}
+    if result.outcome.converged:
+        drawings["corner"] = partial(draw_corner, result)
+    drawings["trace"] = partial(draw_trace, result)
+    drawings["ranks"] = partial(draw_ranks, result)
+    return drawings
+
+
+def pictures(drawings: Drawings) -> dict[str, bytes]:
+    """Draw figures and return them as PNG by name."""
+    with mpl.rc_context(STYLE):
+        return {name: _png(draw()) for name, draw in drawings.items()}
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
@@ -72,13 +104,17 @@ def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
 
     The folder is made if need be; what a file name may not hold is percent-encoded.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures: dict[str, bytes] = {}
     with mpl.rc_context(STYLE):
-        for name, figure in figures.items():
-            pictures[name] = _png(figure)
-            (folder / f"{quote(name, safe=' ,;()+')}.png").write_bytes(pictures[name])
-    return pictures
+        drawn = {name: _png(figure) for name, figure in figures.items()}
+    save_pictures(drawn, folder)
+    return drawn
+
+
+def save_pictures(drawn: Mapping[str, bytes], folder: Path) -> None:
+    """Write pictures, PNG by name, as :func:`save` does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, picture in drawn.items():
+        (folder / f"{quote(name, safe=' ,;()+')}.png").write_bytes(picture)
 
 
 def draw_alone(bands: Bands) -> Figure:

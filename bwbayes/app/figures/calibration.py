@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
-from bwbayes.app.figures.style import COLOURS, STYLE, axis_label, hide_unused
+from bwbayes.app.figures.style import COLOURS, STYLE, axis_label, hide_unused, share_legend
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.bands import KINDS, LEVELS
@@ -61,7 +60,7 @@ def _draw_histograms(calibration: Calibration, labels: Sequence[str]) -> Figure:
         panel.axhline(1.0, color=NOMINAL_COLOUR, lw=0.8)
         panel.stairs(heights * scale, 100 * edges, color=COLOURS[0], lw=1.2, label="replicates")
     panels[0].set_ylim(bottom=0)
-    _share_legend(figure)
+    share_legend(figure)
     return figure
 
 
@@ -85,7 +84,7 @@ def _draw_ecdf(calibration: Calibration, labels: Sequence[str]) -> Figure:
         )
         panel.text(0.97, 0.95, f"p = {one.p:.2g}", transform=panel.transAxes, ha="right", va="top")
         panel.margins(y=0.2)
-    _share_legend(figure)
+    share_legend(figure)
     return figure
 
 
@@ -159,11 +158,3 @@ def _grid(labels: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list
 
 def _closed(values: FloatArray, first: float, last: float) -> FloatArray:
     return np.concatenate([[first], values, [last]])
-
-
-def _share_legend(figure: Figure) -> None:
-    handles: dict[str, Artist] = {}
-    for panel in figure.axes:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=8)

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import itertools
 
-import corner
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from scipy.stats import rankdata
 
-from bwbayes.app.figures.style import COLOURS, TRUTH_COLOUR, axis_label, hide_unused, starts
+from bwbayes.app.figures.style import (
+    COLOURS,
+    TRUTH_COLOUR,
+    axis_label,
+    hide_unused,
+    share_legend,
+    starts,
+)
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.result import Result
 
@@ -36,6 +42,8 @@ def draw_corner(result: Result) -> Figure:
 
     The true values, where they are known, are lines.
     """
+    import corner  # noqa: PLC0415  # it loads all of arviz, which nobody else here needs
+
     flat = result.flat_draws
     flat = flat[starts(flat.shape[0], CORNER_DRAWS)]
     free = len(result.free)
@@ -126,7 +134,7 @@ def draw_trace(result: Result) -> Figure:
             panel.plot(
                 steps + 1, middle[:, ensemble, i], color=colour, label=f"ensemble {ensemble + 1}"
             )
-    _share_legend(figure)
+    share_legend(figure)
     return figure
 
 
@@ -176,7 +184,7 @@ def draw_ranks(result: Result) -> Figure:
                 lw=1.2,
                 label=f"ensemble {ensemble + 1}",
             )
-    _share_legend(figure)
+    share_legend(figure)
     return figure
 
 
@@ -199,8 +207,3 @@ def _draw_even(panel: Axes, independent: float, ensembles: int) -> None:
         reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
         band = (max(1 - reach, 0.0), 1 + reach)
         panel.axhspan(*band, color="#dddddd", lw=0, label="what independent draws show")
-
-
-def _share_legend(figure: Figure) -> None:
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=8)

@@ -13,6 +13,7 @@ from bwbayes.app.figures.style import (
     STYLE,
     envelope,
     plain,
+    share_legend,
     zigzag,
 )
 from bwbayes.arrays import FloatArray
@@ -54,8 +55,7 @@ def _tracking(made: Compensation) -> Figure:
     middle.set_ylabel("displacement (µm)")
     _errors(below, made)
     below.set_xlabel("time (s)")
-    for panel in (top, middle, below):
-        panel.legend(loc="upper right", ncols=4, fontsize=8)
+    share_legend(figure, ncols=5)
     return figure
 
 
@@ -64,7 +64,6 @@ def _error(made: Compensation) -> Figure:
     along, spread = figure.subplots(1, 2, width_ratios=(2, 1))
     _errors(along, made, without=False)
     along.set_xlabel("time (s)")
-    along.legend(loc="upper right", fontsize=8)
     for played, colour, name in (
         (made.linear, LINEAR_COLOUR, "uncompensated"),
         (made.compensated, MEAN_COLOUR, "compensated"),
@@ -73,7 +72,7 @@ def _error(made: Compensation) -> Figure:
     spread.set_xlabel("rms of the error (µm)")
     spread.set_ylabel("density")
     spread.set_xscale("log")
-    spread.legend(fontsize=8)
+    share_legend(figure)
     return figure
 
 

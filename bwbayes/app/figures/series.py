@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -19,6 +18,7 @@ from bwbayes.app.figures.style import (
     ZOOM_COLOUR,
     envelope,
     plain,
+    share_legend,
     title,
     zigzag,
 )
@@ -60,11 +60,7 @@ def draw_bands(bands: Bands) -> Figure:
     axes[0, 0].set_title(plain(title(bands)))
     where = "largest displacement" if bands.measured is None else "largest error"
     axes[0, 1].set_title(f"at the {where}")
-    named: dict[str, Artist] = {}
-    for panel in axes[2]:
-        handles, labels = panel.get_legend_handles_labels()
-        named |= zip(labels, handles, strict=True)
-    figure.legend(list(named.values()), list(named), loc="outside upper center", ncols=4)
+    share_legend(figure, ncols=4)
     return figure
 
 

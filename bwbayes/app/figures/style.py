@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.mathtext import MathTextParser
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -33,6 +35,7 @@ __all__ = [
     "envelope",
     "hide_unused",
     "plain",
+    "share_legend",
     "starts",
     "title",
     "unit_text",
@@ -140,3 +143,12 @@ def hide_unused(axes: np.ndarray[Any, Any], used: int, xlabel: str) -> list[Axes
         if i < used <= i + axes.shape[1]:
             panel.set_xlabel(xlabel)
     return panels[:used]
+
+
+def share_legend(figure: Figure, ncols: int = 8) -> None:
+    """Put one legend of all panels above them, where it hides no curve."""
+    handles: dict[str, Artist] = {}
+    for panel in figure.axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=ncols)

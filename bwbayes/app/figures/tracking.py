@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from bwbayes.app.figures.style import COLOURS, STYLE, hide_unused
+from bwbayes.app.figures.style import COLOURS, STYLE, hide_unused, share_legend
 from bwbayes.control.tracking import CONTROLLERS, Tracking
 
 __all__ = ["draw_tracking"]
@@ -34,6 +35,9 @@ def draw_tracking(tracking: Tracking) -> Figure:
             panel.set_yscale("log")
         for left in axes[:, 0]:
             left.set_ylabel("rms error (µm)")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(handles))
+        for panel in panels:
+            panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            panel.xaxis.set_major_formatter(ScalarFormatter())
+            panel.xaxis.set_minor_formatter(NullFormatter())
+        share_legend(figure)
     return figure

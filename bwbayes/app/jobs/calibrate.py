@@ -26,9 +26,9 @@ from bwbayes.app.figures import save
 from bwbayes.app.figures.calibration import draw_calibration
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.report.calibration_report import render
+from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import ReplicateProgress
-from bwbayes.app.running.run import versions
 from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.results.calibration import Calibration, judge, summary

@@ -7,10 +7,9 @@ says nothing of parameters or displacement.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from bwbayes.app.figures import interactive
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
 from bwbayes.app.report.page import Picture, picture, template
@@ -28,7 +27,11 @@ EVIDENCE = ("agreement", "coverage", "innovations")
 LEVEL = 95  # %, of the bands that the answer speaks of
 
 
-def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+def render(
+    result: Result,
+    summary: Mapping[str, Any],
+    pictures: Mapping[str, bytes] | Callable[[], Mapping[str, bytes]],
+) -> str:
     """Return the report's page.
 
     Parameters
@@ -40,14 +43,18 @@ def render(result: Result, summary: Mapping[str, Any], pictures: Mapping[str, by
         ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
         ``go_on``, the command that goes on.
     pictures
-        PNG files by the name of their figure, in their order.
+        PNG files by the name of their figure, in their order, or what returns them: it is called
+        last.
     """
+    from bwbayes.app.figures import interactive  # noqa: PLC0415  # bokeh is slow to load
+
     converged = result.outcome.converged
     check = result.outcome.check
     plots = interactive.draw(result) if converged else {}
+    drawn = pictures() if callable(pictures) else pictures
     shown = {
         name: picture(png, name, *caption(name), plots.get(name, ""))
-        for name, png in pictures.items()
+        for name, png in drawn.items()
         if converged or name in OF_THE_CHAIN
     }
     held_out_first = sorted(result.bands, key=lambda bands: bands.training)

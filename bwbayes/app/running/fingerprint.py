@@ -10,15 +10,20 @@ of its own), and what is predicted.
 from __future__ import annotations
 
 import json
+import platform
 import re
 from collections.abc import Iterator, Mapping
+from importlib.metadata import version
 from pathlib import Path
 
 from bwbayes.app.config.config import Config
 from bwbayes.errors import InputError
+from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 
-__all__ = ["fingerprint", "require_same", "version_remarks"]
+__all__ = ["fingerprint", "require_same", "version_remarks", "versions"]
+
+PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
 # Keys of a config that a chain does not depend on; of tables, everything in them. The record is
 # compared by its readings, not by its file's name.
@@ -86,6 +91,12 @@ def require_same(noted: object, config: Config, chain: Path) -> None:
         f"{chain}: {first} was {_shown(before.get(first))} when the chain was sampled, is "
         f"{_shown(now.get(first))}{also}; undo the edit or start a new run"
     )
+
+
+def versions(engine: Engine = "numpy") -> dict[str, str]:
+    """Return the versions of what computed a result."""
+    packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
 def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +25,9 @@ from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.report.report import render
+from bwbayes.app.running.drawing import Beside, beside
 from bwbayes.app.running.facts import facts_of, stepped
-from bwbayes.app.running.fingerprint import fingerprint, require_same, version_remarks
+from bwbayes.app.running.fingerprint import fingerprint, require_same, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import judged, predictions, scoring
 from bwbayes.app.running.progress import Progress
@@ -66,8 +66,6 @@ __all__ = [
     "versions",
     "write_files",
 ]
-
-PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
 
 class Run(NamedTuple):
@@ -108,11 +106,11 @@ def carry_on(
     steps: int | None = None,
     engine: Engine | None = None,
     how: str | Executor | None = None,
+    apart: bool = False,
 ) -> Result:
     """Finish a run and write its files, as :func:`go_on` does; return the result."""
-    return go_on(
-        folder, console, workers=workers, ess=ess, steps=steps, engine=engine, how=how
-    ).result
+    to = partial(go_on, ess=ess, steps=steps, engine=engine)
+    return to(folder, console, workers=workers, how=how, apart=apart).result
 
 
 def go_on(
@@ -125,6 +123,7 @@ def go_on(
     engine: Engine | None = None,
     files: bool = True,
     how: str | Executor | None = None,
+    apart: bool = False,
 ) -> Run:
     """Finish a run.
 
@@ -145,6 +144,8 @@ def go_on(
         Write what a run leaves besides its config, records and chain.
     how
         Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
+    apart
+        Draw in a process of its own, if there may be several: sooner, and the same pictures.
 
     Raises
     ------
@@ -152,7 +153,8 @@ def go_on(
         The folder's files do not fit together, or another process is writing them.
     """
     begun = time.monotonic()
-    with folder.locked(), one_thread():
+    drawing = beside(workers, asked=apart and files)
+    with folder.locked(), one_thread(), drawing as artist:
         if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
@@ -165,10 +167,10 @@ def go_on(
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
-        result = assemble(problem, chain, outcome)
+        result = assemble(problem, chain, outcome, artist)
         seconds = time.monotonic() - begun
         if files:
-            write_files(folder, problem, result, seconds)
+            write_files(folder, problem, result, seconds, artist)
     return Run(problem, chain, outcome, result, seconds)
 
 
@@ -208,12 +210,6 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
     as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
     with executor(1) as pool:
         return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
-
-
-def versions(engine: Engine = "numpy") -> dict[str, str]:
-    """Return the versions of what computed a result."""
-    packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
 def _chain(
@@ -271,7 +267,9 @@ def _retarget(
     draft.replace(folder.config)
 
 
-def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
+def assemble(
+    problem: Problem, chain: ChainFile, outcome: Outcome, artist: Beside | None = None
+) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions."""
     posterior = problem.posterior
     sampled = draws(posterior, chain)
@@ -297,6 +295,8 @@ def assemble(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         remarks=tuple(remarks),
         truth=problem.config.truth,
     )
+    if artist is not None:
+        artist.begin(result)
     if not outcome.converged:
         return result
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
@@ -377,16 +377,23 @@ def numbers_of(
     }
 
 
-def write_files(folder: RunFolder, problem: Problem, result: Result, seconds: float) -> None:
+def write_files(
+    folder: RunFolder,
+    problem: Problem,
+    result: Result,
+    seconds: float,
+    artist: Beside | None = None,
+) -> None:
     """Write all files of a run; the summary last, as the sign that all is done."""
+    figures = folder.path / "figures"
+    shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
+    apart = None if artist is None else artist.pictures(result, figures)
     numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.records)
-    (folder.path / "bands.csv").unlink(missing_ok=True)  # none of an earlier end, as of pictures
+    (folder.path / "bands.csv").unlink(missing_ok=True)
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)
-    shutil.rmtree(folder.path / "figures", ignore_errors=True)
-    pictures = save(draw_all(result), folder.path / "figures")
-    page = render(result, numbers, pictures)
+    page = render(result, numbers, apart or (lambda: save(draw_all(result), figures)))
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

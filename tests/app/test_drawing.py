@@ -1,0 +1,50 @@
+"""Pictures that another process draws are those that this one draws, whatever comes of it."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bwbayes.app.figures import draw_all, save
+from bwbayes.app.running.drawing import Beside, beside
+from tests.app import example
+
+
+class Broken(Executor):
+    """Loses its processes at every call."""
+
+    def submit(self, _: Callable[..., Any], /, *__: Any, **___: Any) -> Future[Any]:
+        """Return what has failed already."""
+        future: Future[Any] = Future()
+        future.set_exception(BrokenProcessPool())
+        return future
+
+
+def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
+    run = example.run()
+    with beside(2, asked=True) as artist:
+        if artist is None:
+            pytest.skip("this machine has one core")
+        artist.begin(run)
+        drawn = artist.pictures(run, tmp_path / "apart")()
+    here = save(draw_all(run), tmp_path / "here")
+    assert list(here.items()) == list(drawn.items())
+    assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
+        path.name: path.read_bytes() for path in (tmp_path / "apart").iterdir()
+    }
+
+
+def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
+    """Also where the process that was to draw them has died, and nothing was begun."""
+    drawn = Beside(Broken()).pictures(example.run(converged=False), tmp_path)()
+    assert ["trace", "ranks"] == list(drawn)
+    assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(("workers", "asked"), [(1, True), (2, False)])
+def test_one_worker_draws_by_itself(workers: int, asked: bool) -> None:
+    with beside(workers, asked=asked) as artist:
+        assert artist is None
