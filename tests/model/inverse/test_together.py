@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -78,12 +80,12 @@ def test_steps_as_large_as_the_range_against_a_search() -> None:
     made = voltages(column, drive, state, 0.0)
     for row in range(4):
         d = float(column["d"][row])
-        shape = [float(column[name][row]) for name in ("alpha", "beta", "gamma")]
+        shape = {name: column[name][row] for name in ("alpha", "beta", "gamma")}
         u, h = 0.0, float(state[row])
         for t, goal in enumerate(drive[row]):
 
-            def moved(v: float, u: float = u, h: float = h, shape: list[float] = shape) -> float:
-                return float(hysteresis([u, v], *shape, 1.0, h)[0, -1])
+            def moved(v: float, u: float = u, h: float = h, shape: Any = shape) -> float:
+                return float(hysteresis([u, v], **shape, initial=h)[0, -1])
 
             v = brentq(
                 lambda v, d=d, goal=goal, moved=moved: d * v - moved(v) - goal,
