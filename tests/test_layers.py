@@ -46,7 +46,6 @@ KEEPERS = {
         "bwbayes.app.figures*",
         "bwbayes.app.fit.plots",
         "bwbayes.app.jobs.compensate",
-        "bwbayes.app.jobs.compensate",
         "bwbayes.app.running.predictions",
     ),
     "corner": ("bwbayes.app.figures*",),
