@@ -69,7 +69,6 @@ def finish(
             steps=steps,
             engine=engine,
             how=how,
-            apart=True,
         )
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
