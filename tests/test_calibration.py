@@ -128,6 +128,7 @@ def test_white_noise_model_fails_the_bands() -> None:
         right,
         datasets=(replace(right.only, noise=WhiteNoise()),),
         prior=JointPrior(p for p in right.prior.parameters if p.name in names),
+        joint=None,
     )
     found = made(replace(common, posterior=white, source=right), FEW)
     off = dict(errors_off(found))

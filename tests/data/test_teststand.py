@@ -124,7 +124,7 @@ def test_the_dac_and_the_limit_are_symmetric() -> None:
 
 def test_a_command_beyond_100_volts_is_limited_and_said_so() -> None:
     drive = Waveform(Sine(130.0, 1.0), duration=1.0)
-    with pytest.warns(InputWarning, match="reaches 130 V, but the amplifier limits it to 100 V"):
+    with pytest.warns(InputWarning, match="reaches 130 V, the amplifier limits it to 100 V"):
         record = VirtualTestStand("none").run(drive, generator())
     output = Amplifier().output(record.voltage, MILLISECOND)
     np.testing.assert_array_equal([-100.0, 100.0], [output.min(), output.max()])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import hypothesis.strategies as st
@@ -239,8 +238,8 @@ def test_a_displacement_that_falls_with_the_voltage_has_a_coercive_voltage_too()
 
 def test_loops_are_those_of_the_whole_range_and_of_half_of_it() -> None:
     of, draws = problem("bouc-wen")
-    loops = measure_loops(replace(of, voltage=of.voltage + 30.0), draws)
-    low, high = np.min(of.voltage) + 30, np.max(of.voltage) + 30
+    loops = measure_loops(of.altered(voltage=of.only.voltage + 30.0), draws)
+    low, high = np.min(of.only.voltage) + 30, np.max(of.only.voltage) + 30
     quarter = (high - low) / 4
     assert (low, high) == (loops.major.voltage[0], loops.major.voltage[-1])
     assert [low + quarter, high - quarter] == pytest.approx(loops.minor.voltage[[0, -1]])
@@ -269,7 +268,7 @@ def test_state_before_the_record_and_offset_do_not_count() -> None:
     theta = of.prior.theta(draws)
     column = of.table.columns(theta)
     moved = {**column, "initial": column["initial"] + 3.0, "offset": column["offset"] + 5.0}
-    one, other = (steady_loop(of.actuator, c, -50.0, 50.0) for c in (column, moved))
+    one, other = (steady_loop(of.only.actuator, c, -50.0, 50.0) for c in (column, moved))
     np.testing.assert_array_equal(one.rising, other.rising)
 
 
@@ -277,8 +276,8 @@ def test_summary_holds_mean_sd_and_interval_of_the_draws() -> None:
     of, draws = problem("plays")
     loops = measure_loops(of, draws)
     column = of.table.columns(of.prior.theta(draws))
-    low, high = np.min(of.voltage), np.max(of.voltage)
-    areas = measures(steady_loop(of.actuator, column, low, high))["area_um_V"]
+    low, high = np.min(of.only.voltage), np.max(of.only.voltage)
+    areas = measures(steady_loop(of.only.actuator, column, low, high))["area_um_V"]
     assert areas is not None
     kept: Any = numbers(loops)
     expected = {"mean": np.mean(areas), "sd": np.std(areas, ddof=1)}

@@ -147,9 +147,13 @@ def test_summary_names_the_steps() -> None:
 
 
 def test_a_forecast_is_the_end_of_a_record_that_goes_on() -> None:
-    """State, offset and random draws are those of the whole record's simulation."""
+    """State, offset and random draws are those of the whole record's simulation.
+
+    With a discrepancy that is forgotten within a sample, for else a forecast carries it on.
+    """
     actuator = Actuator("lag", "first", INTERVAL, creep=Creep((0.1, 1.0, 10.0)))
     of, draws = problem(actuator)
+    draws[:, of.names.index("discrepancy_time")] = INTERVAL / 100
     record = Record(of.only.voltage, of.only.displacement, INTERVAL, start=3.0)
     planned = np.full(500, 40.0)
     got = forecast(of, draws, record, planned, np.random.default_rng(5))

@@ -55,8 +55,8 @@ class Scaled:
     by: float
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Return the right density."""
-        return self.right.log_density(coordinates)
+        """Return what the wrong ratio is made of."""
+        return self.by * self.right.log_density(coordinates)
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw from the right distribution."""

@@ -69,6 +69,7 @@ def finish(
             steps=steps,
             engine=engine,
             how=how,
+            apart=True,
         )
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
