@@ -234,7 +234,7 @@ def test_bands_have_every_window_and_kind(run: Path) -> None:
 
 
 def test_report_needs_nothing_but_itself(run: Path) -> None:
-    """The plots' script names pages that it does not load: tests/app/test_browser.py sees to that."""
+    """The script of the plots names pages that it does not load; test_browser.py sees to that."""
     page = (run / "report.html").read_text(encoding="utf-8")
     page = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
