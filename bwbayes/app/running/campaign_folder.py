@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Self
 
-from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from bwbayes.app.running.lock import only_writer
 from bwbayes.data.io.formats import SUFFIXES
 from bwbayes.errors import InputError
 
@@ -206,28 +206,9 @@ class CampaignFolder:
             and digest(file) == one.file
         )
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the folder as its only writer.
-
-        Raises
-        ------
-        InputError
-            Another process holds it, or it cannot be written.
-        """
-        lock = FileLock(self.path / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise InputError(
-                f"{self.path}: another process is writing this campaign; wait for it to end"
-            ) from None
-        except OSError as error:
-            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
-        try:
-            yield
-        finally:
-            lock.release()
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the folder as its only writer, as :func:`only_writer` does."""
+        return only_writer(self.path, "campaign")
 
 
 def records_in(folder: Path) -> list[Path]:

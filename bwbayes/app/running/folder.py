@@ -8,16 +8,14 @@ refuses a second writer.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
 
-from filelock import FileLock, Timeout
-
 from bwbayes.app.config.config import dump
 from bwbayes.app.problem.problem import Problem
+from bwbayes.app.running.lock import only_writer
 from bwbayes.data import write_record
 from bwbayes.errors import InputError
 
@@ -124,28 +122,9 @@ class RunFolder:
         its_own = self.config.is_file() and self._has_records() and self._is_of_its_kind()
         return empty or its_own
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the folder as its only writer.
-
-        Raises
-        ------
-        InputError
-            Another process holds it, or it cannot be written.
-        """
-        lock = FileLock(self.path / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise InputError(
-                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
-            ) from None
-        except OSError as error:
-            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
-        try:
-            yield
-        finally:
-            lock.release()
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the folder as its only writer, as :func:`only_writer` does."""
+        return only_writer(self.path, self.KIND)
 
 
 @dataclass(frozen=True)
