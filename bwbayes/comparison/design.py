@@ -22,72 +22,16 @@ from scipy import linalg
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.identifiability import stretches_once
 
-__all__ = ["Amplifier", "Promise", "promises", "ranked"]
+__all__ = ["Promise", "promises", "ranked"]
 
 # Draws that the promise is averaged over, and those that say what is known already.
 DRAWS, KNOWN = 40, 4000
 
 # Step of the derivatives, in posterior sds of a coordinate.
 STEP = 0.01
-
-# Limits are kept to within rounding.
-SLACK = 1e-9
-
-
-@dataclass(frozen=True)
-class Amplifier:
-    """What an amplifier can do.
-
-    Parameters
-    ----------
-    low, high
-        Its voltages, V.
-    slew
-        Its fastest change of the voltage, V/s.
-    current, capacitance
-        Its largest current, A, into the actuator's capacitance, F: I = C dU/dt.
-
-    Raises
-    ------
-    InputError
-        Limits that leave nothing, or a current without a capacitance.
-    """
-
-    low: float
-    high: float
-    slew: float = np.inf
-    current: float | None = None
-    capacitance: float | None = None
-
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise InputError(f"design: voltages from {self.low:g} to {self.high:g} V leave nothing")
-        if (self.current is None) != (self.capacitance is None):
-            raise InputError("design: a current's limit needs the capacitance too; give both")
-        for name in ("slew", "current", "capacitance"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise InputError(f"design: {name} {value:g}; must be above zero")
-
-    @property
-    def fastest(self) -> float:
-        """The fastest change of the voltage that both slew and current allow, V/s."""
-        if self.current is None or self.capacitance is None:
-            return self.slew
-        return min(self.slew, self.current / self.capacitance)
-
-    def refuses(self, voltage: FloatArray, interval: float) -> str:
-        """Say why it cannot make a voltage (samples,), V; empty if it can."""
-        low, high = float(np.min(voltage)), float(np.max(voltage))
-        slack = SLACK * (self.high - self.low)
-        if low < self.low - slack or high > self.high + slack:
-            return f"goes from {low:.4g} to {high:.4g} V, beyond {self.low:g} to {self.high:g} V"
-        fastest = float(np.max(np.abs(np.diff(voltage)), initial=0.0)) / interval
-        if fastest > self.fastest * (1 + SLACK):
-            return f"changes by {fastest:.4g} V/s, more than {self.fastest:.4g} V/s"
-        return ""
 
 
 @dataclass(frozen=True)
@@ -123,7 +67,7 @@ def promises(
     draws: FloatArray,
     candidates: Mapping[str, FloatArray],
     target: str | FloatArray,
-    amplifier: Amplifier,
+    amplifier: Limits,
     generator: np.random.Generator,
 ) -> list[Promise]:
     """Work out what candidates would teach.

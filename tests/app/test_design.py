@@ -96,8 +96,8 @@ def test_the_preset_keeps_to_the_amplifiers_limits(run: Path, tmp_path: Path) ->
         (["--parameter", "alpha", "--candidates", "none.toml"], "none.toml: No such file"),
         (["--parameter", "alpha", "--candidates", "empty.toml"], "has no candidate"),
         (["--parameter", "alpha", "--candidates", "odd.toml"], "odd.toml: one"),
-        (["--parameter", "alpha", "--voltage", "5", "5"], "leave nothing"),
-        (["--parameter", "alpha", "--current", "1"], "needs the capacitance too"),
+        (["--parameter", "alpha", "--voltage", "5", "5"], "no voltage from 5 to 5 V"),
+        (["--parameter", "alpha", "--current", "1"], "together, or neither"),
         (["--parameter", "alpha", "--voltage", "-1", "1", "--candidates", "far.toml"], "can make"),
     ],
 )

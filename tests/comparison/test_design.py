@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.design import Amplifier, Promise, promises, ranked
+from bwbayes.comparison.design import Promise, promises, ranked
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
+from bwbayes.model.inverse.limits import Limits
 from bwbayes.sampling.diagnostics import smoothed_weights
 from tests.inference.problems import decaying_sine, short_posterior
 from tests.inference.test_solvable import closed_form, covariance, linear_posterior, prior_moments
 from tests.results.runs import weighted_draws
 
-WIDE = Amplifier(-100.0, 100.0)
+WIDE = Limits(-100.0, 100.0)
 SAMPLES = 400
 
 
@@ -45,7 +46,7 @@ def promised(
     known: tuple[Posterior, FloatArray],
     candidates: dict[str, FloatArray],
     target: str | FloatArray = "beta",
-    amplifier: Amplifier = WIDE,
+    amplifier: Limits = WIDE,
 ) -> list[Promise]:
     return ranked(promises(*known, candidates, target, amplifier, np.random.default_rng(2)))
 
@@ -129,8 +130,8 @@ def test_the_promise_is_kept_when_the_record_is_measured(
 def test_what_the_amplifier_cannot_make_is_refused_and_comes_last(
     known: tuple[Posterior, FloatArray],
 ) -> None:
-    slow = Amplifier(-60.0, 60.0, current=2e-3, capacitance=5e-6)
-    assert slow.fastest == pytest.approx(400)
+    slow = Limits(-60.0, 60.0, current=2e-3, capacitance=5e-6)
+    assert slow.rate == pytest.approx(400)
     candidates = {"far": steady(100.0), "fast": steady(50.0, 20.0), "fine": steady(50.0)}
     made = promised(known, candidates, amplifier=slow)
     assert made[0].name == "fine"
@@ -143,9 +144,9 @@ def test_what_the_amplifier_cannot_make_is_refused_and_comes_last(
 def test_what_cannot_be_asked_is_one_line(known: tuple[Posterior, FloatArray]) -> None:
     with pytest.raises(InputError, match="'bet' is not a free parameter of the actuator; did you"):
         promised(known, {"one": steady()}, "bet")
-    with pytest.raises(InputError, match="needs the capacitance too"):
-        Amplifier(0.0, 1.0, current=1.0)
-    with pytest.raises(InputError, match="leave nothing"):
-        Amplifier(1.0, 1.0)
-    with pytest.raises(InputError, match="slew 0; must be above zero"):
-        Amplifier(0.0, 1.0, slew=0.0)
+    with pytest.raises(InputError, match="and capacitance .F. together"):
+        Limits(0.0, 1.0, current=1.0)
+    with pytest.raises(InputError, match="no voltage from 1 to 1 V"):
+        Limits(1.0, 1.0)
+    with pytest.raises(InputError, match="slew 0; must be positive"):
+        Limits(0.0, 1.0, slew=0.0)

@@ -25,11 +25,12 @@ from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.comparison.design import Amplifier, Promise, promises, ranked
+from bwbayes.comparison.design import Promise, promises, ranked
 from bwbayes.data import Record, write_record
 from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal, signal_names
 from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.model.drive import time_between_turns
+from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.outputs import write_summary
 from bwbayes.sampling.sampler import draws
 
@@ -179,7 +180,7 @@ def promised(
     flat: FloatArray,
     signals: Mapping[str, FloatArray],
     target: str | FloatArray,
-    amplifier: Amplifier,
+    amplifier: Limits,
 ) -> list[Promise]:
     """Return what signals (samples,) promise, the best first."""
     source = generator(problem.config.seed, "design")
@@ -196,14 +197,14 @@ def amplifier_of(
     slew: float | None,
     current: float | None,
     capacitance: float | None,
-) -> Amplifier:
+) -> Limits:
     """Return the amplifier; by default with the voltages of the fitted record alone."""
     known = problem.record.voltage
     low, high = voltage or (float(np.min(known)), float(np.max(known)))
-    return Amplifier(low, high, np.inf if slew is None else slew, current, capacitance)
+    return Limits(low, high, np.inf if slew is None else slew, current, capacitance)
 
 
-def candidates_of(candidates: str, problem: Problem, amplifier: Amplifier) -> dict[str, FloatArray]:
+def candidates_of(candidates: str, problem: Problem, amplifier: Limits) -> dict[str, FloatArray]:
     """Return the candidates' voltages (samples,) by name, V, at the fitted record's interval.
 
     Raises
@@ -217,7 +218,7 @@ def candidates_of(candidates: str, problem: Problem, amplifier: Amplifier) -> di
     return {name: waveform.sample(rate)[1] for name, waveform in waveforms.items()}
 
 
-def preset(problem: Problem, amplifier: Amplifier) -> dict[str, Waveform]:
+def preset(problem: Problem, amplifier: Limits) -> dict[str, Waveform]:
     """Return sines and triangles, steady and decaying, small and slow, and a staircase.
 
     They are as long as the fitted record, about the middle of the amplifier's range, and turn as
@@ -228,7 +229,7 @@ def preset(problem: Problem, amplifier: Amplifier) -> dict[str, Waveform]:
     half, middle = (amplifier.high - amplifier.low) / 2, (amplifier.high + amplifier.low) / 2
     usual = 0.5 / time_between_turns(record.voltage, record.interval)
     # A sine changes fastest, by 2π f times its amplitude.
-    fastest = min(usual, amplifier.fastest / (2 * np.pi * half))
+    fastest = min(usual, amplifier.rate / (2 * np.pi * half))
     fading = Decay(0.0, (1 - LEFT) / duration)
     made = {
         "steady sine": Waveform(Sine(half, fastest), duration, bias=middle),
@@ -241,7 +242,7 @@ def preset(problem: Problem, amplifier: Amplifier) -> dict[str, Waveform]:
         "steady triangle": Waveform(Triangle(half, fastest), duration, bias=middle),
         "decaying triangle": Waveform(Triangle(half, fastest), duration, decay=fading, bias=middle),
     }
-    if not np.isfinite(amplifier.fastest):
+    if not np.isfinite(amplifier.rate):
         levels = tuple(half * part for part in STAIRS)
         stairs = Staircase(levels, duration / len(levels))
         made["staircase"] = Waveform(stairs, duration, bias=middle)

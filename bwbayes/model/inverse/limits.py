@@ -64,6 +64,17 @@ class Limits:
             return self.slew
         return min(self.slew, self.current / self.capacitance)
 
+    def refuses(self, voltage: FloatArray, interval: float) -> str:
+        """Say why the amplifier cannot make a voltage (samples,), V; empty if it can."""
+        low, high = float(np.min(voltage)), float(np.max(voltage))
+        slack = ROUNDED * (self.high - self.low)
+        if low < self.low - slack or high > self.high + slack:
+            return f"goes from {low:.4g} to {high:.4g} V, beyond {self.low:g} to {self.high:g} V"
+        fastest = float(np.max(np.abs(np.diff(voltage)), initial=0.0)) / interval
+        if fastest > self.rate * (1 + ROUNDED):
+            return f"changes by {fastest:.4g} V/s, more than {self.rate:.4g} V/s"
+        return ""
+
     def require(self, voltage: FloatArray, displacement: FloatArray, interval: float) -> None:
         """Raise an InputError where voltages (samples,) for a displacement are out of reach."""
         slack = ROUNDED * float(np.max(np.abs(voltage)))
