@@ -48,7 +48,7 @@ __all__ = ["compensate"]
     "--voltage",
     type=(float, float),
     metavar="LOW HIGH",
-    help="Lowest and highest voltage of the amplifier, V; default: no limit.",
+    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
 )
 @click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
 @click.option("--current", type=float, help="Its largest current, A; with --capacitance.")

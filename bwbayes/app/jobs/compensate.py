@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.compensation import draw_compensation, draw_compensations
-from bwbayes.app.jobs.at_work import drawn, refuse_existing
+from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.report.compensation_report import render
 from bwbayes.arrays import FloatArray
@@ -130,8 +130,8 @@ def compensate_draws(
     command, from_rest, nearest, limit
         As of :func:`~bwbayes.control.compensation.compensate`.
     voltage, slew, current, capacitance
-        Limits of the amplifier, by default none: lowest and highest voltage, V; its fastest change,
-        V/s; the largest current, A, into the actuator's capacitance, F.
+        Limits of the amplifier: lowest and highest voltage, V, by default the record's; its fastest
+        change, V/s, and the largest current, A, into the actuator's capacitance, F, by default any.
     interval, smoothed
         Sampling interval, and sd of a smoothing, s, of displacements.
 
@@ -140,8 +140,9 @@ def compensate_draws(
     InputError
         A reference that cannot be read or reached.
     """
-    low, high = (-math.inf, math.inf) if voltage is None else voltage
-    limits = Limits(low, high, math.inf if slew is None else slew, current, capacitance)
+    span = limits_of(problem, voltage)
+    fastest = math.inf if slew is None else slew
+    limits = Limits(span.low, span.high, fastest, current, capacitance)
     alone = next(iter(problem.posterior.each(flat)))
     asked = reference_of(reference, interval or problem.record.interval, smoothed)
     seed = problem.config.seed

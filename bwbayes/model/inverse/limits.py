@@ -85,8 +85,8 @@ class Limits:
             raise InputError(
                 f"reference: {displacement[worst]:.6g} um at {worst * interval:.6g} s needs "
                 f"{voltage[worst]:.6g} V, and from {first * interval:.6g} s on it is beyond the "
-                f"amplifier's {self.low:g} to {self.high:g} V; make it smaller, or ask for the "
-                "nearest command"
+                f"amplifier's {self.low:g} to {self.high:g} V; make it smaller, allow other "
+                "voltages, or ask for the nearest command"
             )
         speed = np.abs(np.diff(voltage)) / interval
         fast = speed > self.rate * (1 + ROUNDED) + slack / interval
