@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from bwbayes.app.commands.shared import FILE, overwrite_option
+from bwbayes.app.commands.shared import (
+    FILE,
+    capacitance_option,
+    current_option,
+    overwrite_option,
+    slew_option,
+    voltage_option,
+)
 from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,15 +51,10 @@ __all__ = ["compensate"]
 )
 @click.option("--limit", type=float, help="Of the error, um; says how probably it is kept.")
 @click.option("--from-rest", is_flag=True, help="The actuator starts demagnetised at zero volts.")
-@click.option(
-    "--voltage",
-    type=(float, float),
-    metavar="LOW HIGH",
-    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
-)
-@click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
-@click.option("--current", type=float, help="Its largest current, A; with --capacitance.")
-@click.option("--capacitance", type=float, help="The actuator's capacitance, F.")
+@voltage_option
+@slew_option
+@current_option
+@capacitance_option
 @click.option("--nearest", is_flag=True, help="Where that does not suffice, come near.")
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option

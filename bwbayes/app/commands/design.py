@@ -7,7 +7,15 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.shared import FILE, NOT_CONVERGED, overwrite_option
+from bwbayes.app.commands.shared import (
+    FILE,
+    NOT_CONVERGED,
+    capacitance_option,
+    current_option,
+    overwrite_option,
+    slew_option,
+    voltage_option,
+)
 from bwbayes.errors import NotConvergedError
 
 __all__ = ["design"]
@@ -23,15 +31,10 @@ __all__ = ["design"]
     show_default=True,
     help="A TOML file with a table for each signal, or the preset.",
 )
-@click.option(
-    "--voltage",
-    type=(float, float),
-    metavar="LOW HIGH",
-    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
-)
-@click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
-@click.option("--current", type=float, help="Its largest current, A; with --capacitance.")
-@click.option("--capacitance", type=float, help="The actuator's capacitance, F.")
+@voltage_option
+@slew_option
+@current_option
+@capacitance_option
 @click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
 @overwrite_option
 def design(

@@ -17,10 +17,14 @@ __all__ = [
     "FILE",
     "INTERRUPTED",
     "NOT_CONVERGED",
+    "capacitance_option",
+    "current_option",
     "executor_option",
     "finish",
     "overwrite_option",
     "quiet_option",
+    "slew_option",
+    "voltage_option",
     "workers_option",
 ]
 
@@ -40,6 +44,19 @@ executor_option = click.option(
     help="local (default), threads, processes, dask, or dask://HOST:PORT.",
 )
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
+voltage_option = click.option(
+    "--voltage",
+    type=(float, float),
+    metavar="LOW HIGH",
+    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
+)
+slew_option = click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
+current_option = click.option(
+    "--current", type=float, help="Its largest current, A; with --capacitance."
+)
+capacitance_option = click.option(
+    "--capacitance", type=float, help="The actuator's capacitance, F."
+)
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 

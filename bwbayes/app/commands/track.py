@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.shared import FILE, overwrite_option, quiet_option
+from bwbayes.app.commands.shared import FILE, overwrite_option, quiet_option, voltage_option
 
 __all__ = ["track"]
 
@@ -23,12 +23,7 @@ __all__ = ["track"]
     help="Of the references, Hz; may be given again; default: 0.1 Hz to where dynamics matter.",
 )
 @click.option("--amplitude", type=float, help="Of the references, um; default: 80 % of the reach.")
-@click.option(
-    "--voltage",
-    type=(float, float),
-    metavar="LOW HIGH",
-    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
-)
+@voltage_option
 @click.option("--rate", type=float, default=1000.0, show_default=True, help="Samples a second.")
 @click.option(
     "--delay", type=int, default=1, show_default=True, help="Samples from reading to answer."
