@@ -34,6 +34,7 @@ __all__ = [
     "nested_rhat",
     "pareto_k",
     "smoothed_weights",
+    "stuck",
     "times",
 ]
 
@@ -204,7 +205,7 @@ def check(
         autocorrelation=autocorrelation,
         acceptance=float(accepted.sum() / (accepted.size * block)),
         walker_rhat=float(np.max(walker_rhat)),
-        stuck=_stuck(accepted, STILL * np.max(autocorrelation) / block),
+        stuck=stuck(accepted, block, autocorrelation),
     )
 
 
@@ -226,8 +227,12 @@ def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     return float(rhat[0]), bulk, tail, mean, _walker_rhat(scores)
 
 
-def _stuck(accepted: IntArray, blocks: float) -> int:
-    """Count walkers without a move in the last so many blocks, if that is a number, or in all."""
+def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
+    """Count the walkers that have not moved for ``STILL`` autocorrelation times, or never.
+
+    Arguments as in :func:`check`.
+    """
+    blocks = STILL * np.max(autocorrelation) / block
     last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
     return int(np.sum(~accepted[-last:].any(axis=0)))
 

@@ -1,8 +1,8 @@
 """A chain on its way to convergence, judged again and again with more of its blocks each time.
 
 To judge everything costs as much as many steps (:mod:`bwbayes.sampling.diagnostics`). How long the
-chain is against its autocorrelation times, and whether the proposal covers it, costs little: by
-that a :class:`Judge` tells first how many blocks are needed at least.
+chain is against its autocorrelation times, whether a walker is stuck, and whether the proposal
+covers the draws, costs little: by that a :class:`Judge` tells first how many blocks are needed.
 """
 
 from __future__ import annotations
@@ -11,10 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import MOST_DRAWS, Chain, thinning
-from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, LENGTH, Check, check, pareto_k, times
+from bwbayes.sampling.diagnostics import (
+    LARGEST_PARETO_K,
+    LENGTH,
+    Check,
+    check,
+    pareto_k,
+    stuck,
+    times,
+)
 
 __all__ = ["Judge", "constrained"]
 
@@ -54,21 +62,25 @@ class Judge:
     def least(self, blocks: int, part: float) -> float:
         """Return how many blocks make a ``part`` of the autocorrelation times that are needed.
 
-        By what the first ``blocks`` blocks say; none if the proposal does not cover them, because
-        more would not help.
+        By what the first ``blocks`` blocks say; more than these if a walker is stuck in them. None
+        if the proposal does not cover them, because more would not help.
         """
         self._prepare(blocks)
         if not self.pareto_k < LARGEST_PARETO_K:
             return 0.0
-        return part * LENGTH * float(np.max(self.times)) / self._block
+        more = blocks + 1.0 if stuck(self._accepted(blocks), self._block, self.times) else 0.0
+        return max(more, part * LENGTH * float(np.max(self.times)) / self._block)
 
     def __call__(self, blocks: int) -> Check:
         """Judge the first ``blocks`` blocks."""
         self._prepare(blocks)
         (every,) = self.draws
-        accepted = self.chain.accepted("sampling")[:blocks]
-        latest = check(every, accepted, self._block, self.thin, self.times)
+        latest = check(every, self._accepted(blocks), self._block, self.thin, self.times)
         return replace(latest, pareto_k=None if self.proposal is None else self.pareto_k)
+
+    def _accepted(self, blocks: int) -> IntArray:
+        """Return the moves of the first ``blocks`` blocks, (blocks, ensembles, walkers)."""
+        return self.chain.accepted("sampling")[:blocks]
 
     @property
     def _block(self) -> int:

@@ -5,8 +5,8 @@ ensemble lies on; a snooker step now and then helps between modes. Neither needs
 bring the pilot to the posterior, where half of its steps try places of the point fit's own guess.
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws proposes places
 independently of where a walker is, which mixes about ten times faster. The fit is frozen before
-the draws that count, and a tenth of the steps remain differential evolution and snooker, so that
-whatever the fit does not cover stays reachable.
+the draws that count, and a seventh of the steps remain differential evolution and snooker, so
+that whatever the fit does not cover is reached, and left again.
 """
 
 from __future__ import annotations
@@ -71,4 +71,4 @@ def sampling_moves(proposal: Proposal | None) -> Weighted:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()
-    return [(moves.DEMove(), 0.08), (SnookerMove(), 0.02), (moves.MHMove(proposal), 0.9)]
+    return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (moves.MHMove(proposal), 0.85)]

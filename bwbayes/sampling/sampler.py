@@ -67,7 +67,7 @@ TUNING_BLOCKS = 2
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing.
-FIRST_CHECK = 4
+FIRST_CHECK = 3
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
