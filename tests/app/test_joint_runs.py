@@ -187,8 +187,7 @@ def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_pat
     scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))
     models = models_of("linear", scoped.model)
     out = tmp_path / "out"
-    keys = {"workers": 1, "with_future": False}
-    made = compare_models(scoped, Path(), models, out, small.quiet(), **keys)
+    made = compare_models(scoped, Path(), models, out, small.quiet(), workers=1, with_future=False)
     assert "linear is the only model that has converged" == made.lines[0]
     assert [] == parse((out / "linear/config.toml").read_text(), "").model.per_record
     both = [finished.path, out / "linear"]
@@ -202,7 +201,7 @@ def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_pat
 def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: RunFolder) -> None:
     """Voltages are those of all records, the pattern that of the one that turns most."""
     made = load_run(finished)
-    flipped = replace(made, records=dict(reversed(made.records.items())))
+    flipped = replace(made, records=dict(reversed(list(made.records.items()))))
     assert ["step", "loops"] == [*flipped.records]
     signals = []
     for one in (made, flipped):

@@ -49,7 +49,8 @@ def _best(asked: Asked, best: Promise) -> Figure:
     voltage = asked.signals[best.name]
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     panel = figure.subplots()
-    panel.plot(*zigzag(asked.interval * np.arange(voltage.size), voltage), color=MEAN_COLOUR)
+    time = asked.interval * np.arange(voltage.size, dtype=np.float64)
+    panel.plot(*zigzag(time, voltage), color=MEAN_COLOUR)
     for side in (asked.amplifier.low, asked.amplifier.high):
         panel.axhline(side, color="#222222", lw=1, ls=":")
     panel.set_title(plain(best.name))

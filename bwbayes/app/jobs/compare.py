@@ -19,6 +19,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, ModelConfig, dump
 from bwbayes.app.config.models import slug
+from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.problem.records import training_records
@@ -115,7 +116,8 @@ def compare_models(
         The config, its records or a folder cannot be used, or a folder has another run.
     """
     _require_free(out, overwrite)
-    records = list(training_records(config, where, {})[0].values())
+    _, wholes = joined(config, training_records(config, where, {})[0])
+    records = list(wholes.values())
     problems = {
         name: resolve(_with_model(config, model, name, records), where)
         for name, model in models.items()
