@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.control.steps import Gone, HysteresisStep, step_of
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inverse.stepped import step_of
+from bwbayes.model.inverse.steps import Gone, HysteresisStep
 from bwbayes.model.operator import Span
 
 ComplexArray = NDArray[np.complex128]
@@ -167,7 +168,7 @@ class SampledModel:
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
-        least, largest = self.step.slopes()
+        least, largest = self.step.slopes(limits)
         if self.actuator.gain is None:
             return least, largest
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.

@@ -7,6 +7,7 @@ and its own turns, and then one sample of all of them at a time is several times
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,13 +18,13 @@ __all__ = ["able", "voltages"]
 # Stands for a rate of zero, 1/V.
 TINY = 1e-100
 
-# Newton's steps double the digits: after one below this part of 1/c, V, all of them are right.
-CLOSE = 1e-8
+# A step of Halley's below this part of 1/c, V, triples the digits to more than there are.
+CLOSE = 1e-5
 
-# Samples that are turned round at a time.
-PIECE = 64
+# Samples that are looked for at once, and steps of Halley's that these get.
+PIECE, STEPS = 16, 2
 
-# Rounds of Newton; two are usual.
+# Rounds of Halley's where these do not do; two are usual.
 ROUNDS = 50
 
 
@@ -64,74 +65,141 @@ def voltages(
 
     Notes
     -----
-    From one sample to the next, in direction s and with g = s h, v = |Δu| solves
-    d v − (α/c − g) (1 − exp(−c v)) = s Δw with c = β − γ while g < 0 and c = β + γ from there on.
-    Its left side is convex, or concave where h is beyond the ceiling, and rises with v, so that
-    Newton's method finds v from anywhere; it starts from the parabola that touches at v = 0.
+    From one sample to a later one, in direction s and with g = s h, v = |Δu| solves
+    d v − (α/c − g) (1 − exp(−c v)) = s Δw with c = β − γ while g < 0 and c = β + γ from there on,
+    by Halley's method. That holds for some samples in a row, whose voltages are found together;
+    models that turn among them, or whose g passes zero, go from each sample to the next.
     """
     d, alpha, beta = (column[name] for name in ("d", "alpha", "beta"))
     gamma = column.get("gamma", np.zeros_like(beta))
-    against, ahead = np.maximum(beta - gamma, TINY), np.maximum(beta + gamma, TINY)
-    close = CLOSE / float(np.max(np.maximum(against, ahead)))
+    model = _Models(d, alpha, np.maximum(beta - gamma, TINY), np.maximum(beta + gamma, TINY))
     u = (drive[:, 0] + state) / d if start is None else np.full(d.size, start)
-    before = d * u - state
     result = np.empty_like(drive)
-    h = state
-    # A sample of all models lies together, in pieces that a processor's cache holds.
+    before, h = d * u - state, state
     for first in range(0, drive.shape[1], PIECE):
-        goals = drive[:, first : first + PIECE].T.copy()
-        for t, goal in enumerate(goals):
-            change = goal - before
-            s = np.where(change < 0, -1.0, 1.0)
-            g, rise = s * h, np.abs(change)
-            behind = g < 0
-            v = _moved(d, alpha, np.where(behind, against, ahead), g, rise, close)
-            u = u + s * v
-            h = d * u - goal
-            crossed = behind & (s * h > 0)
-            if crossed.any():
-                _cross(crossed, (d, alpha, against, ahead), (s, g, rise, v), u, close)
-                h = d * u - goal
-            before = goal.copy()
-            goals[t] = u
-        result[:, first : first + PIECE] = goals.T
+        # A sample of all models lies together.
+        asked = drive[:, first : first + PIECE].T.copy()
+        made, exact = _ahead(model, asked, before, u, h)
+        rows = np.flatnonzero(~exact)
+        if rows.size:
+            made[:, rows] = _one_by_one(
+                _Models(*(one[rows] for one in model)),
+                asked[:, rows],
+                before[rows],
+                u[rows],
+                h[rows],
+            )
+        result[:, first : first + PIECE] = made.T
+        before, u = asked[-1], made[-1]
+        h = d * u - before
     return result
 
 
-def _moved(
-    d: FloatArray,
-    alpha: FloatArray,
-    rate: FloatArray,
-    g: FloatArray,
-    rise: FloatArray,
-    close: float,
+class _Models(NamedTuple):
+    """d and α, um/V, and c while g = s h is below zero and above, 1/V, each (models,)."""
+
+    d: FloatArray
+    alpha: FloatArray
+    against: FloatArray
+    ahead: FloatArray
+
+
+def _ahead(
+    model: _Models, asked: FloatArray, before: FloatArray, u: FloatArray, h: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the voltages (samples, models) of drives that go one way, and whose are exact.
+
+    Before them the drive was ``before``, with a voltage u and h, (models,).
+    """
+    d, alpha, against, ahead = model
+    s = np.copysign(1.0, asked[-1] - before)
+    g = s * h
+    behind = g < 0
+    rate = np.where(behind, against, ahead)
+    curved = alpha - rate * g
+    rise = asked - before
+    rise *= s
+    exact = (rise[0] >= 0) & (np.diff(rise, axis=0).min(axis=0, initial=0.0) >= 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        v, last = _moved(d, rate, curved, rise, STEPS)
+        exact &= np.abs(last).max(axis=0) * rate <= CLOSE
+    v *= s
+    v += u
+    exact &= ~behind | (s * (d * v[-1] - asked[-1]) <= 0)
+    return v, exact
+
+
+def _one_by_one(
+    model: _Models, asked: FloatArray, before: FloatArray, u: FloatArray, h: FloatArray
 ) -> FloatArray:
-    """Return how far the voltages (models,) go, V, all with one rate each."""
-    missing = alpha / rate - g
-    curved = rate * missing
-    slope = d - curved
-    v = 2 * rise / (slope + np.sqrt(np.maximum(slope * slope + 2 * rate * curved * rise, 0.0)))
-    for _ in range(ROUNDS):
-        gone = np.expm1(-rate * v)
-        step = (d * v + missing * gone - rise) / (slope - curved * gone)
-        v = v - step
-        if np.max(np.abs(step)) <= close:
-            break
-    return v
+    """Return the voltages (samples, models) of any drives, as :func:`_ahead`."""
+    d, alpha, against, ahead = model
+    made = np.empty_like(asked)
+    for t, goal in enumerate(asked):
+        change = goal - before
+        s = np.copysign(1.0, change)
+        g = s * h
+        behind = g < 0
+        rate = np.where(behind, against, ahead)
+        rise = np.abs(change)
+        v, _ = _moved(d, rate, alpha - rate * g, rise, ROUNDS)
+        u = u + s * v
+        h = d * u - goal
+        rows = np.flatnonzero(behind & (s * h > 0))
+        if rows.size:
+            # Their rate changes where g passes zero.
+            some = _Models(*(one[rows] for one in model))
+            u[rows] += s[rows] * (_across(some, g[rows], rise[rows]) - v[rows])
+            h = d * u - goal
+        made[t], before = u, goal
+    return made
 
 
-def _cross(
-    crossed: BoolArray,
-    model: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    step: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    u: FloatArray,
-    close: float,
-) -> None:
-    """Correct the voltages of models whose g passes zero within a step: its rate changes there."""
-    rows = np.flatnonzero(crossed)
-    d, alpha, against, ahead = (one[rows] for one in model)
-    s, g, rise, v = (one[rows] for one in step)
+def _across(model: _Models, g: FloatArray, rise: FloatArray) -> FloatArray:
+    """Return how far the voltages (models,) go, V, from g below zero to above."""
+    d, alpha, against, ahead = model
     crossing = np.log1p(-g * against / alpha) / against
     late = np.maximum(rise - (d * crossing + g), 0.0)
-    beyond = _moved(d, alpha, ahead, np.zeros_like(g), late, close)
-    u[rows] += s * (crossing + beyond - v)
+    return crossing + _moved(d, ahead, alpha, late, ROUNDS)[0]
+
+
+def _moved(
+    d: FloatArray, rate: FloatArray, curved: FloatArray, rise: FloatArray, rounds: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return v ≥ 0, V, at which d v − k (1 − exp(−c v))/c is the rise, and the last step to it.
+
+    ``curved`` is k, (models,), the rise (samples, models) or (models,). What rises with v is
+    convex, or concave where h is beyond the ceiling, so that Halley's method finds v from anywhere;
+    it starts near the parabola that touches at v = 0.
+    """
+    slope = d - curved
+    curve = rate * curved
+    v = rise / slope
+    bent = (curve / slope) * v
+    near = 2 * bent
+    near += 1
+    np.maximum(near, 0.0, out=near)
+    np.sqrt(near, out=near)
+    near += 1
+    bent *= (rate / 6) * v
+    bent += 1
+    v *= bent
+    v *= 2
+    v /= near
+    half, missing = 0.5 * curve, curved / rate
+    for _ in range(rounds):
+        gone = np.expm1(-rate * v)
+        steep = slope - curved * gone
+        step = d * v
+        step += missing * gone
+        step -= rise
+        step /= steep
+        gone += 1
+        gone *= half
+        gone *= step
+        gone /= steep
+        step /= 1 - gone
+        v -= step
+        if rounds > STEPS and np.max(np.abs(step) * rate) <= CLOSE:
+            break
+    return v, step
