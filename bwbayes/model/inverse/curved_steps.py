@@ -29,7 +29,7 @@ LOOKED = 1001
 POWER_ROUNDS = (20, 60)
 
 # A search ends when it moves h by less than this part of what it may have become.
-CLOSE = 4e-16
+CLOSE = 1e-15
 
 # Stands for a rate of zero times a range of voltages.
 SLOW = 1e-6

@@ -1,8 +1,9 @@
-"""Which operators have a step of bounded time, and which step it is."""
+"""Which operators have a step of bounded time, which step it is, and the drive with their gain."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -10,8 +11,9 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Values
+from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.inverse.curved_steps import AsymmetricStep, DuhemStep, PowerStep
-from bwbayes.model.inverse.steps import HysteresisStep, LinearStep, PlaysStep
+from bwbayes.model.inverse.steps import Gone, HysteresisStep, LinearStep, PlaysStep
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -21,7 +23,7 @@ from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, threshold_volts
 
-__all__ = ["STEPPED", "step_of"]
+__all__ = ["STEPPED", "DriveStep", "step_of"]
 
 # Names, as a config has them, of the operators that have a step.
 STEPPED = (
@@ -33,6 +35,46 @@ STEPPED = (
     "plays",
     "maxwell-slip",
 )
+
+
+@dataclass(frozen=True)
+class DriveStep:
+    """Hysteresis and polynomial gain together, each model with a voltage of its own.
+
+    Parameters
+    ----------
+    step
+        The hysteresis.
+    gain
+        What is added to it, or None.
+    column
+        The gain's coefficients (models,), um, by name.
+    """
+
+    step: HysteresisStep
+    gain: PolynomialGain | None
+    column: Values
+
+    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return the drive, its slope and the memory once voltages (models,) have gone there."""
+        w, slope, after = self.step.go(memory, voltage)
+        if self.gain is None:
+            return Gone(w, slope, after)
+        x = self.gain.scaled(voltage)
+        for name in self.gain.terms:
+            w = w + self.column[name] * x ** TERMS[name].power
+        return Gone(w, slope + self.added_slope(voltage), after)
+
+    def added_slope(self, voltage: FloatArray) -> FloatArray:
+        """Return the gain's own slope, um/V, at voltages (models,) or (any, 1)."""
+        added = np.zeros(np.broadcast_shapes(voltage.shape, self.column["offset"].shape))
+        if self.gain is None or not self.gain.reference.half > 0:
+            return added
+        x = self.gain.scaled(voltage)
+        for name in self.gain.terms:
+            power = TERMS[name].power
+            added += self.column[name] * power * x ** (power - 1) / self.gain.reference.half
+        return added
 
 
 def step_of(operator: Operator, column: Values) -> HysteresisStep:
