@@ -73,7 +73,7 @@ class One:
     ) -> FloatArray:
         """Return the voltage (samples,) for a displacement; without limits it may be known."""
         drive = displacement - self.column["offset"][0]
-        anything = self.anywhere(drive)
+        anything = self.anywhere(float(np.max(np.abs(drive))))
         voltage = self._undone(drive, anything) if made is None else made
         edges = (voltage <= anything.low) | (voltage >= anything.high)
         if edges.any() and not nearest:
@@ -93,9 +93,9 @@ class One:
             return voltage
         return self._undone(drive, Path(low, high, math.inf if slow else step))
 
-    def anywhere(self, drive: FloatArray) -> Path:
-        """Return a range of voltages that is wide for a drive."""
-        size = float(np.max(np.abs(drive))) / self.slope if self.slope > 0 else 1.0
+    def anywhere(self, peak: float) -> Path:
+        """Return a range of voltages that is wide for displacements up to a peak, um."""
+        size = peak / self.slope if self.slope > 0 else 1.0
         most = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
         return Path(-most, most)
 

@@ -112,27 +112,33 @@ def _together(
     if isinstance(actuator.hysteresis, BoucWen | BacklashLike) and actuator.gain is None:
         state, start = columns["initial"], 0.0 if ones[0].from_rest else None
         if ones[0].state is not None:
-            begun = [one.begun(0.0, one.anywhere(asked[0]))[1] for one in ones]
+            begun = [one.begun(0.0, one.anywhere(0.0))[1] for one in ones]
             state, start = np.array([one.state[0] for one in begun]), float(begun[0].voltage)
         for part in _parts(np.flatnonzero(able(columns, state))):
-            here = _drives(ones, columns, asked, part, result)
-            result[part] = voltages(here, result[part], state[part], start)
+            here, drive = _drives(ones, columns, asked, part, result)
+            _put(voltages(here, drive, state[part], start, drive), part, result)
             known[part] = True
     # Fewer are done sooner alone.
     left = np.flatnonzero(~known)
     for part in _parts(left) if left.size >= MANY else ():
-        here = _drives(ones, columns, asked, part, result)
-        known[part] = _stepped(ones, here, part, result)
-    for row in np.flatnonzero(known).tolist():
-        most = ones[row].anywhere(asked[row] - columns["offset"][row]).high
-        known[row] = max(result[row].max(), -result[row].min()) < most
-    return known
+        here, drive = _drives(ones, columns, asked, part, result)
+        made, known[part] = _stepped([ones[row] for row in part.tolist()], here, drive)
+        _put(made, part, result)
+    peak = np.maximum(asked.max(axis=1) - columns["offset"], columns["offset"] - asked.min(axis=1))
+    most = [one.anywhere(size).high for one, size in zip(ones, peak.tolist(), strict=True)]
+    return known & (np.maximum(result.max(axis=1), -result.min(axis=1)) < most)
 
 
 def _parts(rows: IntArray) -> Iterator[IntArray]:
     """Yield rows that are done at a time."""
     for first in range(0, rows.size, BATCH):
         yield rows[first : first + BATCH]
+
+
+def _put(made: FloatArray, rows: IntArray, result: FloatArray) -> None:
+    """Write what rows are to the result, unless it is there."""
+    if made is not result:
+        result[rows] = made
 
 
 def _has_step(actuator: Actuator, columns: Mapping[str, FloatArray]) -> bool:
@@ -149,29 +155,29 @@ def _drives(
     asked: FloatArray,
     rows: IntArray,
     result: FloatArray,
-) -> dict[str, FloatArray]:
-    """Write the drives of rows to the result, and return their columns."""
+) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Return the columns of rows and their drives; of all rows, in the place of the result."""
     here = {name: values[rows] for name, values in columns.items()}
     sections = ones[0].actuator.sections(here)
-    for place, row in enumerate(rows):
+    drive = result if rows.size == len(result) else np.empty((rows.size, result.shape[1]))
+    for place, row in enumerate(rows.tolist()):
         its = _of_row(sections, place)
-        result[row] = ones[row].drive(asked[row] - columns["offset"][row], its)
-    return here
+        drive[place] = ones[row].drive(asked[row] - columns["offset"][row], its)
+    return here, drive
 
 
 def _stepped(
-    ones: Sequence[One], here: Mapping[str, FloatArray], rows: IntArray, result: FloatArray
-) -> BoolArray:
-    """Write the voltages of rows for their drives, which the result has; tell which are right."""
+    ones: Sequence[One], here: Mapping[str, FloatArray], drive: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the voltages of models for their drives, and tell which are right."""
     actuator = ones[0].actuator
     shaped = DriveStep(step_of(actuator.hysteresis, here), actuator.gain, here)
-    memory, start = shaped.step.demagnetised(), np.empty(rows.size)
-    for place, row in enumerate(rows):
-        one, drive = ones[row], result[row]
-        start[place], its = one.begun(float(drive[0]), one.anywhere(drive))
+    memory, start = shaped.step.demagnetised(), np.empty(len(ones))
+    for place, one in enumerate(ones):
+        path = one.anywhere(float(np.max(np.abs(drive[place]))))
+        start[place], its = one.begun(float(drive[place, 0]), path)
         memory[place] = step_of(actuator.hysteresis, one.column).remembered(its)[0]
-    result[rows], right = followed(shaped, result[rows], memory, start)
-    return right
+    return followed(shaped, drive, memory, start)
 
 
 def _checked(displacement: ArrayLike, models: int) -> FloatArray:

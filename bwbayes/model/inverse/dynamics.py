@@ -53,7 +53,9 @@ def undone(
         later: FloatArray = lfilter(denominator, numerator[1:], forced)[1:]
         last = later[-1:] if later.size else np.zeros(1)
         return np.concatenate([later, last])
-    # A sum that no root from outside of the unit circle leaves: np.roots takes longer than filters.
+    if numerator.size == denominator.size == 1:
+        return np.asarray(forced / numerator[0])
+    # Then no zero lies outside of the unit circle; to look for them takes as long as the filter.
     if np.abs(numerator[1:]).sum() < numerator[0]:
         return np.asarray(lfilter(denominator, numerator, forced))
     zeros = np.roots(numerator)

@@ -21,13 +21,14 @@ __all__ = ["able", "followed", "voltages"]
 # Stands for a rate of zero, 1/V.
 TINY = 1e-100
 
-# A step of Halley's below this part of 1/c, V, triples the digits to more than there are.
-CLOSE = 1e-5
+# A step of Newton's below this part of 1/c, V, doubles the digits to more than there are.
+CLOSE = 1e-8
 
-# Samples that are looked for at once, and steps of Halley's that these get.
-PIECE, STEPS = 16, 2
+# Samples that are turned round at a time, those of them that are looked for at once, and the steps
+# that these get.
+SLAB, PIECE, STEPS = 64, 16, 2
 
-# Rounds of Halley's where these do not do; two are usual.
+# Rounds where these do not do; three are usual.
 ROUNDS = 50
 
 
@@ -56,8 +57,8 @@ def followed(
     close = MET * np.max(np.abs(drive), axis=1)
     right = np.ones(start.size, dtype=np.bool_)
     u, moved = start, np.zeros_like(start)
-    for first in range(0, drive.shape[1], PIECE):
-        asked = drive[:, first : first + PIECE].T.copy()
+    for first in range(0, drive.shape[1], SLAB):
+        asked = drive[:, first : first + SLAB].T.copy()
         for t, goal in enumerate(asked):
             guess = u + moved
             for _ in range(NEWTON):
@@ -72,7 +73,7 @@ def followed(
             moved = np.where(right, guess - u, 0.0)
             u, memory = guess, after
             asked[t] = u
-        result[:, first : first + PIECE] = asked.T
+        result[:, first : first + SLAB] = asked.T
     return result, right
 
 
@@ -97,6 +98,7 @@ def voltages(
     drive: FloatArray,
     state: FloatArray,
     start: float | None,
+    out: FloatArray | None = None,
 ) -> FloatArray:
     """Return the voltages (models, samples), V, at which d u − h is the drive.
 
@@ -110,36 +112,36 @@ def voltages(
         h (models,), um, where the path starts.
     start
         The voltage, V, at which it starts; None: at the first sample, whatever its voltage.
+    out
+        Where the voltages go, if not to an array of their own; it may be the drive.
 
     Notes
     -----
     From one sample to a later one, in direction s and with g = s h, v = |Δu| solves
     d v − (α/c − g) (1 − exp(−c v)) = s Δw with c = β − γ while g < 0 and c = β + γ from there on,
-    by Halley's method. That holds for some samples in a row, whose voltages are found together;
+    by Newton's rule. That holds for some samples in a row, whose voltages are found together;
     models that turn among them, or whose g passes zero, go from each sample to the next.
     """
     d, alpha, beta = (column[name] for name in ("d", "alpha", "beta"))
     gamma = column.get("gamma", np.zeros_like(beta))
     model = _Models(d, alpha, np.maximum(beta - gamma, TINY), np.maximum(beta + gamma, TINY))
     u = (drive[:, 0] + state) / d if start is None else np.full(d.size, start)
-    result = np.empty_like(drive)
+    result = np.empty_like(drive) if out is None else out
     before, h = d * u - state, state
-    for first in range(0, drive.shape[1], PIECE):
+    for first in range(0, drive.shape[1], SLAB):
         # A sample of all models lies together.
-        asked = drive[:, first : first + PIECE].T.copy()
-        made, exact = _ahead(model, asked, before, u, h)
-        rows = np.flatnonzero(~exact)
-        if rows.size:
-            made[:, rows] = _one_by_one(
-                _Models(*(one[rows] for one in model)),
-                asked[:, rows],
-                before[rows],
-                u[rows],
-                h[rows],
-            )
-        result[:, first : first + PIECE] = made.T
-        before, u = asked[-1], made[-1]
-        h = d * u - before
+        slab = drive[:, first : first + SLAB].T.copy()
+        for start_of in range(0, len(slab), PIECE):
+            asked = slab[start_of : start_of + PIECE]
+            made, exact = _ahead(model, asked, before, u, h)
+            rows = np.flatnonzero(~exact)
+            if rows.size:
+                some = _Models(*(one[rows] for one in model))
+                made[:, rows] = _one_by_one(some, asked[:, rows], before[rows], u[rows], h[rows])
+            before, u = asked[-1].copy(), made[-1]
+            h = d * u - before
+            asked[:] = made
+        result[:, first : first + SLAB] = slab.T
     return result
 
 
@@ -217,36 +219,40 @@ def _moved(
     """Return v ≥ 0, V, at which d v − k (1 − exp(−c v))/c is the rise, and the last step to it.
 
     ``curved`` is k, (models,), the rise (samples, models) or (models,). What rises with v is
-    convex, or concave where h is beyond the ceiling, so that Halley's method finds v from anywhere;
-    it starts near the parabola that touches at v = 0.
+    convex, or concave where h is beyond the ceiling, so that Newton's rule finds v from anywhere;
+    it starts near the parabola that touches at v = 0, and with a step of Halley's.
     """
     slope = d - curved
-    curve = rate * curved
+    curve, minus, missing = rate * curved, -rate, curved / rate
     v = rise / slope
-    bent = (curve / slope) * v
-    near = 2 * bent
+    near = (2 * curve / slope) * v
+    bent = (rate / 3) * v
+    bent *= near
     near += 1
     np.maximum(near, 0.0, out=near)
     np.sqrt(near, out=near)
     near += 1
-    bent *= (rate / 6) * v
-    bent += 1
+    bent += 4
     v *= bent
-    v *= 2
     v /= near
-    half, missing = 0.5 * curve, curved / rate
-    for _ in range(rounds):
-        gone = np.expm1(-rate * v)
-        steep = slope - curved * gone
-        step = d * v
-        step += missing * gone
+    v *= 0.5
+    gone, step, steep = np.empty_like(v), near, bent
+    for done in range(rounds):
+        np.multiply(minus, v, out=gone)
+        np.expm1(gone, out=gone)
+        np.multiply(d, v, out=step)
+        np.multiply(curved, gone, out=steep)
+        np.subtract(slope, steep, out=steep)
         step -= rise
+        step += missing * gone
         step /= steep
-        gone += 1
-        gone *= half
-        gone *= step
-        gone /= steep
-        step /= 1 - gone
+        if done == 0:
+            gone += 1
+            gone *= 0.5 * curve
+            gone *= step
+            gone /= steep
+            np.subtract(1.0, gone, out=gone)
+            step /= gone
         v -= step
         if rounds > STEPS and np.max(np.abs(step) * rate) <= CLOSE:
             break
