@@ -84,8 +84,8 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     best: tuple[float, FloatArray, float, int] | None = None
     lags = _lags(record)
     every = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
-    for lag, basis in zip(lags, _bases(np.array(every), judged), strict=True):
-        basis = np.column_stack([basis, trend_shape])
+    for lag, loops in zip(lags, _bases(np.array(every), judged), strict=True):
+        basis = np.column_stack([loops, trend_shape])
         left, which = _best_decay(basis, decays, centred)
         if best is None or left < best[0]:
             best = left, basis, lag, which
@@ -95,8 +95,8 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     products = _products(whole, centred[:, np.newaxis])
     among = _products(whole, whole)
     coefficients = _inverse(among) @ products[:, 0]
-    loops = among[:-2, -2]  # the products of the loops' columns with the trend's
-    imitated = float(loops @ _inverse(among[:-2, :-2]) @ loops)
+    shared = among[:-2, -2]  # the products of the loops' columns with the trend's
+    imitated = float(shared @ _inverse(among[:-2, :-2]) @ shared)
     residual = centred - (whole * coefficients).sum(axis=1)
     undriven = (whole[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centred - undriven
