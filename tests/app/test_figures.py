@@ -251,15 +251,15 @@ def test_pit_leaves_out_the_lead_in() -> None:
 
 
 def test_corner_marks_the_known_truth_alone(figures: Mapping[str, Figure]) -> None:
-    panels = figures["corner"].axes
+    panels = {places(panel): panel for panel in figures["corner"].axes}
 
     def upright(panel: Axes) -> list[float]:
         lines = [np.asarray(line.get_xdata()) for line in panel.lines]
         return [float(x[0]) for x in lines if x.size == 2 and x[0] == x[1]]
 
-    assert [0.7] == upright(panels[0])
-    assert [] == upright(panels[5])
-    assert [2e-3] == upright(panels[14])
+    assert [0.7] == upright(panels[0, 0])
+    assert [] == upright(panels[1, 1])
+    assert [2e-3] == upright(panels[3, 2])
 
 
 def test_corner_shows_a_truth_far_from_the_draws() -> None:
@@ -337,9 +337,13 @@ def test_tick_labels_of_the_corner_picture_do_not_collide() -> None:
     """Along the bottom row and the left column, whose panels touch each other."""
     figure = draw_corner(example.run())
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    panels = figure.axes
+    panels = {places(panel): panel for panel in figure.axes}
     free = 4
-    for axes, along_x in ((panels[-free:], True), (panels[::free], False)):
+    lowest, first = (
+        [panels[at] for at in panels if free - 1 == at[0]],
+        [panels[at] for at in panels if 0 == at[1]],
+    )
+    for axes, along_x in ((lowest, True), (first, False)):
         labels = [
             label.get_window_extent(renderer)
             for panel in axes
