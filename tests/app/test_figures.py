@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -19,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
+from PIL import Image
 
 from bwbayes.app.figures import draw_all, interactive, save
 from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, draw_trace
@@ -379,3 +381,19 @@ def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None
     assert ["bands_</script><b>", "loop"] == list(plots)
     assert not any("<" in text for text in plots.values())
     assert {} == interactive.draw(example.run(converged=False))
+
+
+def test_pictures_have_few_colours_and_look_the_same(tmp_path: Path) -> None:
+    """Half the size and less; all but one pixel in a thousand within 12 of 255, and white is white."""
+    figure = draw_loop(example.run().bands)
+    small = save({"loop": figure}, tmp_path)["loop"]
+    canvas = FigureCanvasAgg(figure)
+    plain = BytesIO()
+    canvas.print_png(plain)  # type: ignore[no-untyped-call]
+    drawn, shown = (
+        np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
+        for png in (plain.getvalue(), small)
+    )
+    assert 2 * len(small) < len(plain.getvalue())
+    assert 0.999 < np.mean(np.abs(drawn - shown).max(axis=-1) <= 12)
+    assert [255] * 3 == list(shown[0, 0])

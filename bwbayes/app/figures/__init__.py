@@ -2,7 +2,7 @@
 
 :func:`draw_all` draws what there is to see of a :class:`~bwbayes.results.result.Result`, and
 :func:`save` writes it as PNG. A run that has not converged shows its chains and nothing else. This
-package alone knows matplotlib and corner; it opens no window and touches no global figure.
+package alone knows matplotlib, Pillow and corner; it opens no window and touches no global figure.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from pathlib import Path
 from urllib.parse import quote
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from bwbayes.app.figures.agreement import draw_agreement
 from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
@@ -136,8 +138,17 @@ def save_one(figure: Figure, path: Path) -> None:
 
 
 def _png(figure: Figure) -> bytes:
-    """Return a figure as PNG, laid out and drawn once: ``savefig`` does either twice."""
+    """Return a figure as PNG, laid out and drawn once: ``savefig`` does either twice.
+
+    Of its thousands of colours, nearly all from smooth edges, it keeps those that come nearest to
+    all: nobody sees the difference, and the file has a third of the size.
+    """
     figure.set_dpi(mpl.rcParams["savefig.dpi"])
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    drawn = Image.fromarray(pixels).convert("RGB")
+    few = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     buffer = BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
+    few.save(buffer, "png")
     return buffer.getvalue()

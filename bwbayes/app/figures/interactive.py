@@ -49,10 +49,10 @@ from bwbayes.results.result import Result
 __all__ = ["draw", "made", "scripts"]
 
 # Stretches of a time series, each with up to six samples: more in all than a screen has pixels.
-STRETCHES = 700
+STRETCHES = 500
 
 # A loop keeps one in so many of the points that its picture has.
-ONE_IN = 2
+ONE_IN = 4
 
 # A loop shows one reading in each cell of a grid of so many by so many.
 CELLS = 200
