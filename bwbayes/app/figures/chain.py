@@ -59,11 +59,12 @@ def draw_corner(result: Result) -> Figure:
     margin, far = CORNER_MARGIN / side, 1 - 0.2 / side
     edges = {"left": margin, "bottom": margin, "right": far, "top": far}
     grid = figure.add_gridspec(free, free, **edges, wspace=0.05, hspace=0.05)
-    for row, column in [(row, column) for row in range(free) for column in range(row + 1)]:
+    for row, column in zip(*(axis.tolist() for axis in np.tril_indices(free)), strict=True):
         panel = figure.add_subplot(grid[row, column])
         panel.tick_params(labelsize=CORNER_FONT, labelbottom=False, labelleft=False)
         if row == column:
-            bins = np.linspace(*ranges[row], CORNER_BINS + 1).tolist()
+            low, high = ranges[row]
+            bins = np.linspace(low, high, CORNER_BINS + 1).tolist()
             heights = panel.hist(flat[:, row], bins, histtype="step", color=COLOURS[0])[0]
             panel.set(xlim=ranges[row], ylim=(0, 1.1 * np.max(heights)))
         else:
