@@ -49,6 +49,7 @@ KEEPERS = {
         "bwbayes.app.running.predictions",
     ),
     "corner": ("bwbayes.app.figures*", "bwbayes.app.running.drawing"),
+    "PIL": ("bwbayes.app.figures",),
     "bokeh": ("bwbayes.app.figures.interactive",),
     "click": ("bwbayes.app.*",),
     "rich": ("bwbayes.app.*",),

@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,6 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import State
 from bwbayes.results import mixture
 from bwbayes.results.along import quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
@@ -224,13 +223,12 @@ def _simulated(
     start: Started, voltage: FloatArray, window: slice
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
-    states: Sequence[State | None] = ()
-    for first in range(0, window.stop, PIECE):
-        piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, states = start.advance(piece, states)
+    first = 0
+    for simulated in start.pieces(voltage[: window.stop], PIECE):
         skipped = max(window.start - first, 0)
-        if skipped < piece.size:
+        if skipped < simulated.shape[1]:
             yield first + skipped, simulated[:, skipped:]
+        first += simulated.shape[1]
 
 
 def _summarised(
