@@ -298,7 +298,14 @@ def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"), r"record\.loops\.train|window 9"),
+        (
+            ("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"),
+            r"^record\.loops\.train: window 9 to 10 s: reaches outside the record; choose",
+        ),
+        (
+            ("window = [3.0, 4.0]", "window = [3.0, 5.0]"),
+            r"^validation\.later\.window: window 3 to 5 s: reaches outside the record; choose",
+        ),
         (
             ("decimate = 2", "decimate = 2\nstart = 1.0\ntrain = [[0.0, 0.8]]"),
             r"record\.step\.train: no readings from 0 to 0\.78 s; .* in \[record\.step\]",
@@ -354,6 +361,16 @@ def test_files_in_another_unit_and_of_another_interval(tmp_path: Path) -> None:
     bad.write_text(text + '[record.c]\nfile = "c.csv"\n')
     with pytest.raises(InputError, match=r"c\.csv"):
         resolve(parse(bad.read_text(), ""), tmp_path)
+
+
+def test_readings_do_not_count_twice(tmp_path: Path) -> None:
+    """One measurement under two names is refused, unless each has windows of its own."""
+    write_record(measured(1), tmp_path / "a.h5")
+    text = '[record.a]\nfile = "a.h5"\n[record.b]\nfile = "a.h5"\n'
+    with pytest.raises(InputError, match=r"^record\.b: the same measurement as record\.a, whose"):
+        resolve(parse(text, ""), tmp_path)
+    apart = text.replace("[record.b]", "train = [0.0, 1.0]\n[record.b]") + "train = [1.0, 2.0]\n"
+    assert 2 == len(resolve(parse(apart, ""), tmp_path).records)
 
 
 def test_another_record_cannot_stand_for_several(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from bwbayes.app.problem.records import (
     findings_of,
     generator,
     other_record,
+    require_different,
     sampled_waveform,
     start_of,
     training_records,
@@ -150,6 +151,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         fitted, stand = training_records(config, folder, given)
         config, fitted = joined(config, fitted)
         windows = {name: windows_of(config, name, record) for name, record in fitted.items()}
+        require_different(fitted, windows)
         others = {
             name: other_record(config, name, folder, fitted, given.get(name))
             for name, validation in config.validation.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,7 @@ __all__ = [
     "findings_of",
     "generator",
     "other_record",
+    "require_different",
     "sampled_waveform",
     "start_of",
     "training_records",
@@ -206,6 +208,14 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
         train = [whole(record)]
     else:
         train = [(window[0], window[1]) for window in source.train]
+    for where, edges in (
+        *((f"{place}.train", one) for one in train),
+        *((f"validation.{n}.window", (one[0], one[1])) for n, one in held_out.items()),
+    ):
+        try:
+            record.window_slice(*edges)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
     try:
         split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
     except InputError as error:
@@ -220,6 +230,27 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
                 f"start, exclude and decimate in [{place}]"
             )
     return Windows(split.training, dict(zip(held_out, split.held_out, strict=True)))
+
+
+def require_different(records: Mapping[str, Record], windows: Mapping[str, Windows]) -> None:
+    """Refuse readings that would count twice: one record under two names.
+
+    Raises
+    ------
+    InputError
+        The same measurement is fitted twice, in windows that overlap.
+    """
+    for (name, one), (other, two) in combinations(records.items(), 2):
+        overlap = any(
+            a.start < b.stop and b.start < a.stop
+            for a in windows[name].training
+            for b in windows[other].training
+        )
+        if overlap and one.sha256 == two.sha256:
+            raise InputError(
+                f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
+                "would count twice; remove one, or give them other windows"
+            )
 
 
 def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
