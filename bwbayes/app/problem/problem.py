@@ -16,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from bwbayes.app.config.config import ALONE, Config, RecordConfig
+from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, explicit_model
 from bwbayes.app.problem.parameters import (
     as_config,
@@ -147,6 +148,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         warnings.simplefilter("always", InputWarning)
         given = records or {}
         fitted, stand = training_records(config, folder, given)
+        config, fitted = joined(config, fitted)
         windows = {name: windows_of(config, name, record) for name, record in fitted.items()}
         others = {
             name: other_record(config, name, folder, fitted, given.get(name))

@@ -19,7 +19,7 @@ from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.stand import planned, stand_of
 from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect
-from bwbayes.data.record import require_readable
+from bwbayes.data.record import Window, require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import (
     Carrier,
@@ -42,6 +42,7 @@ __all__ = [
     "start_of",
     "training_records",
     "unlike",
+    "whole",
     "windows_of",
 ]
 
@@ -181,6 +182,12 @@ def _named(record: Record, wanted: str | SignalConfig | None) -> Record:
     return replace(record, origin=f"{record.origin}, {name} signal")
 
 
+def whole(record: Record) -> Window:
+    """Return the window in s of all readings of a record."""
+    first, last = np.flatnonzero(record.has_reading)[[0, -1]]
+    return float(record.time[first]), float(record.time[last]) + record.interval
+
+
 def windows_of(config: Config, name: str, record: Record) -> Windows:
     """Return the windows of a training record.
 
@@ -196,8 +203,7 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
         if v.window and not v.another and v.of in (name, None)
     }
     if source.train is None:
-        first, last = np.flatnonzero(record.has_reading)[[0, -1]]
-        train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
+        train = [whole(record)]
     else:
         train = [(window[0], window[1]) for window in source.train]
     try:
