@@ -48,7 +48,7 @@ KEEPERS = {
         "bwbayes.app.jobs.compensate",
         "bwbayes.app.running.predictions",
     ),
-    "corner": ("bwbayes.app.figures*", "bwbayes.app.running.drawing"),
+    "corner": ("bwbayes.app.figures*",),
     "PIL": ("bwbayes.app.figures",),
     "bokeh": ("bwbayes.app.figures.interactive",),
     "click": ("bwbayes.app.*",),

@@ -24,7 +24,7 @@ from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import mixture
-from bwbayes.results.along import quantiles_and_spread
+from bwbayes.results.along import moments_of, quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.start import Start, Started, fitted, going_on, started
 
@@ -258,11 +258,16 @@ def _stretch(
     middle = first + simulated.shape[1] / 2
     summarised = {"mean": np.mean(expected, axis=0)}
     spread = {}
-    for kind in KINDS:
+    of_kind = {kind: mixed.sds(kind, middle) for kind in KINDS}
+    alike = [kind for kind in KINDS if expected is simulated or kind != "parameter"]
+    shared = moments_of(expected, [of_kind[kind] for kind in alike])
+    moments = dict(zip(alike, shared, strict=True))
+    for kind, sds in of_kind.items():
         edges, spread[kind] = quantiles_and_spread(
-            simulated if kind == "parameter" else expected,
-            mixed.sds(kind, middle),
+            expected if kind in alike else simulated,
+            sds,
             np.concatenate([tails, 1 - tails]),
+            moments.get(kind),
         )
         for i, level in enumerate(LEVELS):
             summarised[f"{kind} {level} lower"] = edges[i]

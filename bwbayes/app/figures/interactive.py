@@ -30,7 +30,7 @@ from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
 
-from bwbayes.app.figures.loop import along
+from bwbayes.app.figures.loop import along, one_way
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
     BAND_NAMES,
@@ -274,11 +274,8 @@ def _ribbon(bands: Bands, at: IntArray, kind: Kind) -> dict[str, list[FloatArray
     """Return the corners of a band, one polygon from each turning point to the next."""
     voltage = bands.voltage[at].astype(np.float32)
     lower, upper = (edge[kind, LEVEL][at].astype(np.float32) for edge in (bands.lower, bands.upper))
-    rising = np.diff(voltage) > 0
-    turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
     xs, ys = [], []
-    for first, last in itertools.pairwise([0, *turns, at.size - 1]):
-        part = slice(first, last + 1)
+    for part in one_way(bands.voltage[at]):
         xs.append(np.concatenate([voltage[part], voltage[part][::-1]]))
         ys.append(np.concatenate([lower[part], upper[part][::-1]]))
     return {"x": xs, "y": ys}

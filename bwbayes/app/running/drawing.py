@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
-from bwbayes.app.figures import Drawing, drawings, picture_of, save_pictures
+from bwbayes.app.figures import Drawing, drawings, picture_of, prepare, save_pictures
 from bwbayes.app.report.page import Plots
 from bwbayes.app.running.workers import Processes, ended
 from bwbayes.results.result import Result
@@ -30,7 +30,7 @@ class Beside:
         self.pool = pool
         self.pictured: dict[str, Future[bytes]] = {}
         self.plotted: Future[Plots] | None = None
-        pool.submit(_prepare)
+        pool.submit(prepare)
 
     def draw(self, result: Result) -> None:
         """Begin with all that can be seen of a result, but for what was begun before."""
@@ -71,13 +71,6 @@ def beside(workers: int | None, *, asked: bool) -> Iterator[Beside | None]:
     copied = sys.platform == "linux" and threading.active_count() == 1
     with ended(Processes(1, "fork" if copied else "spawn")) as pool:
         yield Beside(pool)
-
-
-def _prepare() -> None:
-    """Load what is slow to load, before there is anything to draw."""
-    import corner  # noqa: F401, PLC0415
-
-    import bwbayes.app.figures.interactive  # noqa: F401, PLC0415
 
 
 def _plots_of(result: Result) -> Plots:

@@ -82,7 +82,7 @@ def executor(
 
 
 @contextmanager
-def ended[E: Executor](own: E) -> Iterator[E]:
+def ended(own: Executor) -> Iterator[Executor]:
     """Give an executor, and end it when all is done, or at once if that is interrupted."""
     try:
         yield own
