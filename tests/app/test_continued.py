@@ -126,7 +126,8 @@ def test_a_continued_record_beside_another(tmp_path: Path) -> None:
     assert made.config.records["a"].outliers == [0.5, 3.5]
     assert made.config.records["a"].continues is None
     assert made.records["a"].origin == "a.h5, then b.h5"
-    both = problem({"a": record, "other": other}, per_record=["sensor_sd"])
+    table = {"record": record, "outliers": [0.5, 3.5]}
+    both = problem({"a": table, "other": other}, per_record=["sensor_sd"])
     np.testing.assert_allclose(densities(made), densities(both), rtol=1e-10)
 
 

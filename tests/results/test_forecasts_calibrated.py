@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
@@ -82,12 +82,12 @@ def drawn(posterior: Posterior, source: np.random.Generator) -> FloatArray:
     return posterior.prior.constrain(places[chosen])[0]
 
 
-def ranks(replicates: Iterable[Replicate]) -> FloatArray:
+def ranks(replicates: Iterable[Replicate]) -> IntArray:
     """Where readings lie in their bands, (replicates, samples): 0 below 95 %, ... 6 above it."""
     return np.array(list(_ranks(replicates)))
 
 
-def _ranks(replicates: Iterable[Replicate]) -> Iterator[FloatArray]:
+def _ranks(replicates: Iterable[Replicate]) -> Iterator[IntArray]:
     for posterior, draws, record, voltage, reading in replicates:
         bands = forecast(posterior, draws, record, voltage, np.random.default_rng(1))
         edges = [bands.lower["sensor", level] for level in (95, 90, 50)]
@@ -95,7 +95,7 @@ def _ranks(replicates: Iterable[Replicate]) -> Iterator[FloatArray]:
         yield np.sum(reading > np.array(edges), axis=0)
 
 
-def smallest_p(of: FloatArray) -> float:
+def smallest_p(of: IntArray) -> float:
     """Return the smallest p-value of all distances, for both tails of 95 % and for the quartiles.
 
     Two tests of each of five distances: binomial, chi-square with two degrees of freedom.

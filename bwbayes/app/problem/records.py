@@ -102,14 +102,22 @@ def training_records(
         purpose = "record" if name == ALONE else f"record {name}"
         made = stand.run(waveform, generator(config.seed, purpose))
         read[name] = _named(made, config.records[name].signal)
-    records = {name: _cut(config.records[name], record) for name, record in read.items()}
+    records = {
+        name: _cut(config.records[name], record, place_of(name)) for name, record in read.items()
+    }
     for name, record in records.items():
         require_readable(record, place_of(name))
     return records, stand
 
 
-def _cut(source: RecordConfig, record: Record) -> Record:
+def _cut(source: RecordConfig, record: Record, place: str) -> Record:
     """Leave out the readings that a config leaves out."""
+    if source.outliers:
+        rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
+        if rows.min() < 0 or rows.max() >= record.samples:
+            end = record.start + record.duration
+            raise InputError(f"{place}.outliers: a time outside of {record.start:g} to {end:g} s")
+        record = record.without(rows.astype(np.int64))
     if source.exclude is not None:
         record = record.exclude([(window[0], window[1]) for window in source.exclude])
     if source.start is not None or source.stop is not None:
