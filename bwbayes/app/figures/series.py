@@ -109,9 +109,9 @@ def _draw_ribbons(panel: Axes, bands: Bands, part: slice, about: FloatArray) -> 
         upper = (bands.upper[kind, 95] - about)[part]
         drawn = envelope(bands.time[part], lower, upper)
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
-        edge = 1.0 if kind == "sensor" else 0.0
+        edge, style = (1.0, "--") if kind == "sensor" else (0.0, "-")
         panel.fill_between(
-            *drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, ls="--", label=BAND_NAMES[kind]
+            *drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, ls=style, label=BAND_NAMES[kind]
         )
 
 
