@@ -118,35 +118,52 @@ def test_parts_halve_the_error_and_the_bands(honest: Any, parts: Any) -> None:
     assert held_out["width_95_um"] <= 0.65 * honest["validation"]["held_out"]["width_95_um"]
 
 
-def voltage_missed(folder: Path) -> float:
-    """Return how far the voltage computed for the held-out displacement is off the applied one.
+# Widths of the smoothing that are tried, sd in s: from none to about the time of the stack's lag.
+WIDTHS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
 
-    Rms over the held-out window, in um through the record's slope, as a part of the range there.
-    The displacement is smoothed over two samples, half of the lag: undoing a lag of some samples
-    makes much of a sensor's noise.
+
+def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
+    """Return how far voltages computed for the measured displacement are off the applied ones.
+
+    Rms over the window that was fitted and over the one that was held out, in um through the
+    record's slope, as parts of the ranges there, for each width of a smoothing: undoing a lag of
+    some samples makes much of a sensor's noise.
     """
     fit = bw.open_run(folder)
     record, posterior = fit.problem.record, fit.problem.posterior
     model = posterior.only.table.actuator(posterior.prior.theta(fit.result.flat_draws)).mean(axis=0)
-    window = record.window_slice(3.0, 17.0)
-    assert record.displacement is not None
-    until = slice(0, window.stop)
-    smooth = gaussian_filter1d(np.asarray(record.displacement[until]), 0.01 / record.interval)
     actuator = posterior.only.actuator.within(record.voltage)
-    off = (inverse(actuator, model, smooth)[0] - record.voltage[until])[window]
-    displacement = record.displacement[window]
-    slope = np.polyfit(record.voltage[window], displacement, 1)[0]
-    return float(slope * np.sqrt(np.mean(off**2)) / np.ptp(displacement))
+    assert record.displacement is not None
+    displacement = np.asarray(record.displacement)
+    missed = {}
+    for width in WIDTHS:
+        smooth = gaussian_filter1d(displacement, width / record.interval) if width else displacement
+        off = inverse(actuator, model, smooth)[0] - record.voltage
+        parts = []
+        for window in (record.window_slice(25.0, 36.0), record.window_slice(3.0, 17.0)):
+            slope = np.polyfit(record.voltage[window], displacement[window], 1)[0]
+            rms = np.sqrt(np.mean(off[window] ** 2))
+            parts.append(float(slope * rms / np.ptp(displacement[window])))
+        missed[width] = (parts[0], parts[1])
+    return missed
 
 
+@pytest.mark.parametrize(("name", "limit"), [("plain", 0.0085), ("parts", 0.0045)])
 def test_the_voltage_computed_for_the_held_out_displacement_is_the_applied_one(
-    folder: Path, honest: Any, parts_folder: Path, parts: Any
+    name: str, limit: float, request: pytest.FixtureRequest
 ) -> None:
-    """At most 0.85 % of the range with Bouc-Wen, 0.45 % with elements that slip and a gain."""
-    assert honest["converged"]
-    assert parts["converged"]
-    assert voltage_missed(folder) <= 0.0085
-    assert voltage_missed(parts_folder) <= 0.0045
+    """At most 0.85 % of the range with Bouc-Wen, 0.45 % with elements that slip and a gain.
+
+    The smoothing is the one whose voltages are nearest on the window that was fitted; the other
+    window has no say in it.
+    """
+    run_of, folder_of = {"plain": ("honest", "folder"), "parts": ("parts", "parts_folder")}[name]
+    assert request.getfixturevalue(run_of)["converged"]
+    missed = voltages_missed(request.getfixturevalue(folder_of))
+    width = min(missed, key=lambda one: missed[one][0])
+    assert missed[width][1] <= limit, (width, missed)
+    # It is a choice between widths that were too small and ones that are too large.
+    assert WIDTHS[0] < width < WIDTHS[-1]
 
 
 @pytest.fixture(scope="module")

@@ -170,7 +170,7 @@ def show_calibration(calibration: Calibration, folder: CalibrationFolder, consol
     for name, one in calibration.statistics.items():
         ecdf = "leaves band" if one.outside else "inside"
         covered = (f"{one.covered[level]:.1%}" for level in LEVELS)
-        table.add_row(name, f"{one.p:.2g}", f"{one.adjusted:.2g}", ecdf, *covered)
+        table.add_row(escape(name), f"{one.p:.2g}", f"{one.adjusted:.2g}", ecdf, *covered)
     console.print(table)
     if calibration.bands:
         table = _table("band", "of", *(f"{level} %" for level in LEVELS))
@@ -201,8 +201,8 @@ def show_campaign(campaign: CampaignResult, folder: CampaignFolder, console: Con
             low, high = np.quantile(one.new, [0.025, 0.975])
             spread = float(np.median(one.spread))
             table.add_row(
-                one.name,
-                one.unit,
+                escape(one.name),
+                escape(one.unit),
                 f"{np.median(one.mean):.4g}",
                 f"{spread:.1%}" if one.logarithmic else f"{spread:.3g}",
                 f"{low:.4g} to {high:.4g}",
@@ -261,7 +261,7 @@ def show_priors(
             shares = parameter.prior.frozen.cdf([low, middle, high])
             if max(abs(shares - [0.025, 0.5, 0.975])) > CHANGED:
                 known += f"\n  in effect {middle:.3g} ({low:.2g} to {high:.2g})"
-        row = [parameter.name, known]
+        row = [escape(parameter.name), escape(known)]
         if fitted:
             row.append(f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "")
         table.add_row(*row, escape(parameter.unit))

@@ -216,10 +216,11 @@ def _in_words(
     worse = [one for one in ordered if differences[one.name][measure].worse]
     if worse:
         nearest = differences[worse[0].name][measure]
+        which = f"{worse[0].name} " if len(worse) > 1 else ""
         lines.append(
             f"by the {WORDS[measure]} {_listed([one.name for one in worse])} "
             f"{'is' if len(worse) == 1 else 'are'} worse by more than {SURE:g} standard errors, "
-            f"{worse[0].name} by {-nearest.value:.3g} ± {nearest.error:.2g}"
+            f"{which}by {-nearest.value:.3g} ± {nearest.error:.2g}"
         )
     if by_evidence:
         nearest_one = max(by_evidence, key=_log_evidence)

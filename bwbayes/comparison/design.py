@@ -25,7 +25,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.identifiability import stretches_once
 
-__all__ = ["Promise", "promises", "ranked"]
+__all__ = ["Asked", "Promise", "promises", "ranked"]
 
 # Draws that the promise is averaged over, and those that say what is known already.
 DRAWS, KNOWN = 40, 4000
@@ -55,6 +55,44 @@ class Promise:
     left: float
     error: float
     refused: str = ""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was asked of a design.
+
+    Attributes
+    ----------
+    run
+        The name of the run that is started from.
+    parameter, drive
+        What is to be known better: a parameter, or the band along a drive of that name.
+    amplifier
+        What can be driven.
+    signals
+        The candidates' voltages (samples,) by name, V.
+    interval
+        Their sampling interval, s.
+    """
+
+    run: str
+    parameter: str | None
+    drive: str | None
+    amplifier: Limits
+    signals: Mapping[str, FloatArray]
+    interval: float
+
+    @property
+    def target(self) -> str:
+        """The name of what is to be known better."""
+        return self.parameter or self.drive or ""
+
+    @property
+    def left(self) -> str:
+        """What the promises are parts of, in words."""
+        if self.parameter is not None:
+            return f"sd left of {self.parameter}"
+        return f"width left of the band along {self.drive}"
 
 
 def ranked(every: Sequence[Promise]) -> list[Promise]:

@@ -34,6 +34,25 @@ __all__ = ["Exported", "exported"]
 BETWEEN = {"first": "voltage's drive goes straight", "zero": "voltage is held"}
 
 
+# Of a step's coefficients that the JSON file has; the others serve the C file alone.
+UNITS = {
+    "d": "um/V",
+    "d2": "um/V^2",
+    "d3": "um/V^3",
+    "alpha": "um/V",
+    "alpha1": "um/V^2",
+    "alpha2": "um/V^3",
+    "beta": "1/V",
+    "against": "1/V",
+    "ahead": "1/V",
+    "below": "um^-n",
+    "above": "um^-n",
+    "exponent": "-",
+    "weights": "um/V",
+    "thresholds": "V",
+}
+
+
 @dataclass(frozen=True)
 class Exported:
     """A model of an actuator that is ready for a controller.
@@ -132,7 +151,6 @@ class Exported:
             held=actuator.hold == "zero",
             low=self.limits.low,
             high=self.limits.high,
-            linear=hysteresis["kind"] == "linear",
             hysteresis=hysteresis,
             plays=hysteresis.get("weights", ()),
             sections=self._sections,
@@ -162,17 +180,9 @@ class Exported:
 
     @property
     def _hysteresis(self) -> dict[str, Any]:
-        units = {
-            "d": "um/V",
-            "alpha": "um/V",
-            "against": "1/V",
-            "ahead": "1/V",
-            "weights": "um/V",
-            "thresholds": "V",
-        }
         known = self.model.step.coefficients()
         return {
-            name: {"value": v, "unit": units[name]} for name, v in known.items() if name in units
+            name: {"value": v, "unit": UNITS[name]} for name, v in known.items() if name in UNITS
         }
 
     @property

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.control.steps import Gone, HysteresisStep, step_of
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inverse.stepped import DriveStep, step_of
+from bwbayes.model.inverse.steps import Gone, HysteresisStep
 from bwbayes.model.operator import Span
 
 ComplexArray = NDArray[np.complex128]
@@ -167,12 +168,12 @@ class SampledModel:
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
-        least, largest = self.step.slopes()
+        least, largest = self.step.slopes(limits)
         if self.actuator.gain is None:
             return least, largest
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
-        added = self._gain_slope(np.linspace(limits.low, limits.high, 1001)[np.newaxis])
-        return least + added.min(axis=1), largest + added.max(axis=1)
+        added = self._shaped.added_slope(np.linspace(*limits, 1001)[:, np.newaxis])
+        return least + added.min(axis=0), largest + added.max(axis=0)
 
     def _instant(
         self, state: SteppedState, displacement: FloatArray
@@ -221,26 +222,11 @@ class SampledModel:
 
     def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return hysteresis and gain once the voltage has gone there."""
-        w, slope, after = self.step.go(memory, voltage)
-        gain = self.actuator.gain
-        if gain is None:
-            return Gone(w, slope, after)
-        x = gain.scaled(voltage)
-        for name, power in (("quadratic", 2), ("cubic", 3)):
-            if name in gain.terms:
-                w = w + self.column[name] * x**power
-        return Gone(w, slope + self._gain_slope(voltage[:, np.newaxis])[:, 0], after)
+        return self._shaped.go(memory, voltage)
 
-    def _gain_slope(self, voltage: FloatArray) -> FloatArray:
-        """Return the gain's slope (models, any), um/V, at voltages (models or 1, any)."""
-        gain = self.actuator.gain
-        assert gain is not None
-        x, half = gain.scaled(voltage), gain.reference.half
-        slope = np.zeros((self.models, 1)) * x
-        for name, power in (("quadratic", 2), ("cubic", 3)):
-            if name in gain.terms and half > 0:
-                slope = slope + self.column[name][:, np.newaxis] * power * x ** (power - 1) / half
-        return slope
+    @property
+    def _shaped(self) -> DriveStep:
+        return DriveStep(self.step, self.actuator.gain, self.column)
 
     @property
     def _even(self) -> bool:

@@ -7,6 +7,7 @@ no physics to be had from it, but what it misses is what no actuator does by its
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,9 +82,10 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     decays = np.exp(-elapsed[:, np.newaxis] / times)
 
     best: tuple[float, FloatArray, float, int] | None = None
-    for lag in _lags(record):
-        basis = _basis(_lagged(record.voltage, lag / record.interval)[rows], judged)
-        basis = np.column_stack([basis, trend_shape])
+    lags = _lags(record)
+    every = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
+    for lag, loops in zip(lags, _bases(np.array(every), judged), strict=True):
+        basis = np.column_stack([loops, trend_shape])
         left, which = _best_decay(basis, decays, centred)
         if best is None or left < best[0]:
             best = left, basis, lag, which
@@ -93,8 +95,8 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     products = _products(whole, centred[:, np.newaxis])
     among = _products(whole, whole)
     coefficients = _inverse(among) @ products[:, 0]
-    loops = among[:-2, -2]  # the products of the loops' columns with the trend's
-    imitated = float(loops @ _inverse(among[:-2, :-2]) @ loops)
+    shared = among[:-2, -2]  # the products of the loops' columns with the trend's
+    imitated = float(shared @ _inverse(among[:-2, :-2]) @ shared)
     residual = centred - (whole * coefficients).sum(axis=1)
     undriven = (whole[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centred - undriven
@@ -142,23 +144,24 @@ def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
     return lagged
 
 
-def _basis(voltage: FloatArray, judged: BoolArray) -> FloatArray:
-    """Return columns that span the loops of a voltage (rows,), at the rows that are judged."""
-    low, high = float(voltage.min()), float(voltage.max())
-    half = max((high - low) / 2, 1e-300)
-    scaled = (voltage - (low + high) / 2) / half
-    starts = scaled[0] + np.concatenate([np.zeros(WIDTHS.size), WIDTHS[FREE_STARTS]])
+def _bases(voltages: FloatArray, judged: BoolArray) -> Iterator[FloatArray]:
+    """Yield columns that span the loops of each of some voltages (lags, rows), where judged."""
+    low, high = voltages.min(axis=1), voltages.max(axis=1)
+    half = np.maximum((high - low) / 2, 1e-300)
+    scaled = (voltages - ((low + high) / 2)[:, np.newaxis]) / half[:, np.newaxis]
     widths = np.concatenate([WIDTHS, WIDTHS[FREE_STARTS]])
-    plays = np.empty((scaled.size, widths.size))
-    state = starts
-    for row, value in enumerate(scaled):
-        state = np.minimum(np.maximum(state, value - widths), value + widths)
-        plays[row] = state
-    # What another state at the start would change, until the drive has wiped it out.
-    unknown = plays[:, WIDTHS.size :] - plays[:, : WIDTHS.size][:, FREE_STARTS]
-    plays = half * plays[:, : WIDTHS.size]
-    columns = [np.ones(scaled.size), half * scaled, *plays.T, scaled**2, *unknown.T]
-    return np.column_stack(columns)[judged]
+    state = scaled[:, :1] + np.concatenate([np.zeros(WIDTHS.size), WIDTHS[FREE_STARTS]])
+    # One row after the other, all lags side by side.
+    lower = scaled.T[:, :, np.newaxis] - widths
+    upper = scaled.T[:, :, np.newaxis] + widths
+    plays = np.empty((scaled.shape[1], *state.shape))
+    for row in range(len(plays)):
+        state = np.minimum(np.maximum(state, lower[row]), upper[row], out=plays[row])
+    for one, x, size in zip(plays.swapaxes(0, 1), scaled, half, strict=True):
+        # What another state at the start would change, until the drive has wiped it out.
+        unknown = one[:, WIDTHS.size :] - one[:, : WIDTHS.size][:, FREE_STARTS]
+        shown = size * one[:, : WIDTHS.size]
+        yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[judged]
 
 
 def _best_decay(basis: FloatArray, decays: FloatArray, values: FloatArray) -> tuple[float, int]:

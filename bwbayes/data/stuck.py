@@ -19,6 +19,7 @@ __all__ = ["SHORTEST_AT_END", "Stuck", "clipped", "clipped_drive", "held", "repe
 SHORTEST_AT_END = 5  # samples in a row at the end of a range
 LEAST_FALL = 0.25  # of what follows a run, in its last quarter
 LEAST_OF_RANGE = 0.01
+MOST_REPEATED = 0.02  # of the readings of a sensor whose noise is larger than its steps
 FEWEST = 10  # samples that are stuck, in all
 LEAST_PART = 0.005  # of the samples
 LONG_ENOUGH = 20  # samples in a row, of which one run is enough
@@ -44,20 +45,24 @@ class Stuck(NamedTuple):
 def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     """Return where values (samples,) stay at their largest while the other column moves on.
 
-    A coarse sensor repeats its largest value too, in two ways that are harmless. At rest the other
-    column stands still: only runs count in which its quartiles lie apart, by 1 % of its range and
-    by what three steps of the sensor are worth. At a smooth peak the next level lasts as well: a
-    parabola stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
+    A sensor whose steps are finer than its noise hardly ever repeats itself: then all readings of
+    the largest value count. A coarse one repeats it in two ways that are harmless. At rest the
+    other column stands still: only runs count in which its quartiles lie apart, by 1 % of its range
+    and by what three steps of the sensor are worth. At a smooth peak the next level lasts as well:
+    a parabola stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
     """
     levels = np.unique(values)
     if levels.size < 3:
         return None
     at_top = values == levels[-1]
     first, lengths = runs(at_top)
-    resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
-    travel = max(0.01, 3 * resolution) * float(np.ptp(other))
-    moving = _quartile_distances(other[at_top], lengths) > travel
-    some = _enough(first, first + lengths - 1, (lengths >= SHORTEST_AT_END) & moving)
+    if np.mean(np.diff(values)[~(at_top[1:] & at_top[:-1])] == 0) < MOST_REPEATED:
+        some = _enough(first, first + lengths - 1, np.full(first.size, np.ptp(other[at_top]) > 0))
+    else:
+        resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
+        travel = max(0.01, 3 * resolution) * float(np.ptp(other))
+        moving = _quartile_distances(other[at_top], lengths) > travel
+        some = _enough(first, first + lengths - 1, (lengths >= SHORTEST_AT_END) & moving)
     if some is None or some.samples <= 3 * np.count_nonzero(values == levels[-2]):
         return None
     return some

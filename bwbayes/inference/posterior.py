@@ -216,16 +216,21 @@ class Posterior:
         model = one.table.actuator(theta)
         unrest = likelihood.start(theta).mean if likelihood.unknown else None
         voltage = one.voltage[: one.training[-1].stop]
+
+        def simulated(part: slice) -> FloatArray:
+            actuator, rest = likelihood.actuator, one.from_rest
+            moving = None if unrest is None else unrest[part]
+            if self.engine == "numba":
+                # Here, because it is slow to load.
+                from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
+
+                begun = walk(actuator, model[part], voltage, moving, from_rest=rest)
+                if begun is not None:
+                    return begun.to(voltage.size)
+            return actuator.advance(model[part], voltage, None, moving, from_rest=rest)[0]
+
         return np.concatenate(
-            [
-                likelihood.actuator.advance(
-                    model[part],
-                    voltage,
-                    unrest=None if unrest is None else unrest[part],
-                    from_rest=one.from_rest,
-                )[0][:, rows]
-                for part in batches(len(theta), voltage.size)
-            ]
+            [simulated(part)[:, rows] for part in batches(len(theta), voltage.size)]
         )
 
     def altered(self, **fields: Any) -> Posterior:

@@ -10,13 +10,14 @@ where they do not, as along a noisy voltage or at a step, it is worked out at ev
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.results import mixture
 
-__all__ = ["quantiles_and_spread"]
+__all__ = ["Moments", "moments_of", "quantiles_and_spread"]
 
 # Samples between those at which the shape is worked out, where it changes least.
 COARSEST = 32
@@ -31,7 +32,10 @@ KURTOSIS_MOVES = 0.1
 
 
 def quantiles_and_spread(
-    means: FloatArray, sds: FloatArray, probabilities: FloatArray
+    means: FloatArray,
+    sds: FloatArray,
+    probabilities: FloatArray,
+    already: Moments | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Quantiles of the mixture and half the mean distance of two draws, sample by sample.
 
@@ -50,6 +54,8 @@ def quantiles_and_spread(
         interpolated.
     probabilities
         (q,) inside (0, 1).
+    already
+        The mixture's moments, if they are known already.
 
     Returns
     -------
@@ -61,7 +67,7 @@ def quantiles_and_spread(
     """
     if not sds.any():
         return mixture.quantiles_and_spread(means, sds, probabilities)
-    mean, sd, moments = _moments(means, sds)
+    mean, sd, moments = already or moments_of(means, [sds])[0]
     shape = np.empty((probabilities.size + 1, mean.size))
     every = np.arange(mean.size)
     known = np.zeros(mean.size, dtype=bool)
@@ -93,26 +99,44 @@ def quantiles_and_spread(
     return mean + sd * shape[:-1], sd * shape[-1]
 
 
-def _moments(
-    means: FloatArray, sds: FloatArray
-) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-    """Mean and sd of the mixture, and what its skewness and its kurtosis move a quantile by."""
-    equal, variances = np.full(sds.size, 1 / sds.size), sds**2 / sds.size
+class Moments(NamedTuple):
+    """Mean and sd of a mixture, and what its skewness and kurtosis move a quantile by, (samples,).
+
+    See :func:`moments_of`.
+    """
+
+    mean: FloatArray
+    sd: FloatArray
+    moves: tuple[FloatArray, FloatArray]
+
+
+def moments_of(means: FloatArray, every: Sequence[FloatArray]) -> list[Moments]:
+    """Return the moments of mixtures with the same means and different sds.
+
+    ``means`` (draws, samples) and each of ``every`` (draws,) as in :func:`quantiles_and_spread`.
+    Their means are gone through once for all of them.
+    """
+    draws, samples = means.shape
+    # The first row makes means of what it multiplies, the others means of it times variances.
+    weights = np.stack([np.ones(draws), *(sds**2 for sds in every)]) / draws
     mean = means.mean(axis=0)
-    second, third, fourth = np.empty((3, mean.size))
+    first, second = np.empty((2, len(weights), samples))
+    third, fourth = np.empty((2, samples))
     for piece in mixture.pieces(means):
         away = means[:, piece] - mean[piece]
         square = away**2
-        second[piece] = equal @ square
-        third[piece] = equal @ (square * away) + 3 * variances @ away
-        fourth[piece] = equal @ square**2 + 6 * variances @ square
-    second += variances.sum()
-    fourth += 3 * (sds**4).mean()
-    return (
-        mean,
-        np.sqrt(second),
-        (SKEWNESS_MOVES * third / second**1.5, KURTOSIS_MOVES * fourth / second**2),
-    )
+        first[:, piece] = weights @ away
+        second[:, piece] = weights @ square
+        third[piece] = weights[0] @ (square * away)
+        fourth[piece] = weights[0] @ square**2
+    result = []
+    for sds, with_away, with_square in zip(every, first[1:], second[1:], strict=True):
+        variance = second[0] + (sds**2).mean()
+        skewness = (third + 3 * with_away) / variance**1.5
+        kurtosis = (fourth + 6 * with_square + 3 * (sds**4).mean()) / variance**2
+        moves = SKEWNESS_MOVES * skewness, KURTOSIS_MOVES * kurtosis
+        result.append(Moments(mean, np.sqrt(variance), moves))
+    return result
 
 
 def _missed(rows: Sequence[FloatArray], known: BoolArray) -> FloatArray:

@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -23,9 +23,8 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import State
 from bwbayes.results import mixture
-from bwbayes.results.along import quantiles_and_spread
+from bwbayes.results.along import moments_of, quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.start import Start, Started, fitted, going_on, started
 
@@ -224,13 +223,12 @@ def _simulated(
     start: Started, voltage: FloatArray, window: slice
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
-    states: Sequence[State | None] = ()
-    for first in range(0, window.stop, PIECE):
-        piece = voltage[first : min(first + PIECE, window.stop)]
-        simulated, states = start.advance(piece, states)
+    first = 0
+    for simulated in start.pieces(voltage[: window.stop], PIECE):
         skipped = max(window.start - first, 0)
-        if skipped < piece.size:
+        if skipped < simulated.shape[1]:
             yield first + skipped, simulated[:, skipped:]
+        first += simulated.shape[1]
 
 
 def _summarised(
@@ -260,11 +258,16 @@ def _stretch(
     middle = first + simulated.shape[1] / 2
     summarised = {"mean": np.mean(expected, axis=0)}
     spread = {}
-    for kind in KINDS:
+    of_kind = {kind: mixed.sds(kind, middle) for kind in KINDS}
+    alike = [kind for kind in KINDS if expected is simulated or kind != "parameter"]
+    shared = moments_of(expected, [of_kind[kind] for kind in alike])
+    moments = dict(zip(alike, shared, strict=True))
+    for kind, sds in of_kind.items():
         edges, spread[kind] = quantiles_and_spread(
-            simulated if kind == "parameter" else expected,
-            mixed.sds(kind, middle),
+            expected if kind in alike else simulated,
+            sds,
             np.concatenate([tails, 1 - tails]),
+            moments.get(kind),
         )
         for i, level in enumerate(LEVELS):
             summarised[f"{kind} {level} lower"] = edges[i]

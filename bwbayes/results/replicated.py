@@ -23,6 +23,9 @@ __all__ = ["STATISTICS", "Replicated", "Statistic", "numbers", "replicated"]
 # Replicated records; p-values come in steps of one over them.
 RECORDS = 200
 
+# Readings of several records that are looked at together.
+LARGEST = 1 << 18
+
 # A p-value below this, two-sided, is odd.
 ODD = 0.01
 
@@ -102,14 +105,18 @@ def replicated(
     # Where readings are missing they are missing in all.
     neighbours = np.flatnonzero(np.diff(rows) == one.readings.stride)
 
-    def looked_at(readings: FloatArray) -> list[float]:
+    def looked_at(readings: FloatArray) -> FloatArray:
         return _statistics(readings, voltage, middle, sd, neighbours)
 
     made = []
-    for mean, own in zip(simulated, noise, strict=True):
-        discrepancy, sensor = one.noise.draw(own[np.newaxis], samples, generator)
-        made.append(looked_at(mean + (discrepancy + sensor)[rows]))
-    every, observed = np.array(made), np.array(looked_at(one.readings.values))
+    at_once = max(LARGEST // rows.size, 1)
+    for first in range(0, count, at_once):
+        some = slice(first, first + at_once)
+        noises = (one.noise.draw(own[np.newaxis], samples, generator) for own in noise[some])
+        added = np.array([(discrepancy + sensor)[rows] for discrepancy, sensor in noises])
+        made.append(looked_at(simulated[some] + added))
+    every = np.concatenate(made)
+    observed = looked_at(np.asarray(one.readings.values)[np.newaxis])[0]
     lower, upper = np.quantile(every, [0.025, 0.975], axis=0)
     p = np.mean(every > observed, axis=0) + 0.5 * np.mean(every == observed, axis=0)
     values = np.stack([observed, lower, upper, p], axis=1).tolist()
@@ -141,28 +148,34 @@ def _statistics(
     middle: FloatArray,
     sd: FloatArray,
     neighbours: IntArray,
-) -> list[float]:
-    """Work out all ``STATISTICS`` of readings (readings,)."""
+) -> FloatArray:
+    """Work out all ``STATISTICS`` of readings (records, readings): (records, statistics)."""
     residual = readings - middle
-    centred = residual - np.mean(residual)
+    centred = residual - np.mean(residual, axis=1, keepdims=True)
     at = neighbours
-    total = float(np.sum(centred**2))
-    lag = float(np.sum(centred[at] * centred[at + 1])) / total if total > 0 else 0.0
+    total = np.sum(centred**2, axis=1)
+    lag = np.sum(centred[:, at] * centred[:, at + 1], axis=1)
     frequency, power = periodogram(residual, detrend="constant")
-    whole = float(np.sum(power))
+    whole = np.sum(power, axis=1)
     place = frequency / frequency[-1]
-    slow = float(np.sum(power[place <= SLOW])) / whole if whole > 0 else 0.0
-    fast = float(np.sum(power[place > MIDDLE])) / whole if whole > 0 else 0.0
+    slow, fast = (np.sum(power[:, part], axis=1) for part in (place <= SLOW, place > MIDDLE))
     pit = ndtr(residual / sd)
     # ∮ y du, by trapezes; turns of either direction count with their sign.
-    area = float(np.abs(np.sum(0.5 * (readings[1:] + readings[:-1]) * np.diff(voltage))))
-    return [
-        float(np.ptp(readings)),
-        area,
-        float(np.std(residual)),
-        lag,
-        slow,
-        fast,
-        float(np.mean(pit)),
-        float(np.mean(np.abs(pit - 0.5) > 0.45)),
-    ]
+    area = np.sum(0.5 * (readings[:, 1:] + readings[:, :-1]) * np.diff(voltage), axis=1)
+
+    def part(of: FloatArray, all_of: FloatArray) -> FloatArray:
+        return np.divide(of, all_of, out=np.zeros_like(of), where=all_of > 0)
+
+    return np.stack(
+        [
+            np.ptp(readings, axis=1),
+            np.abs(area),
+            np.std(residual, axis=1),
+            part(lag, total),
+            part(slow, whole),
+            part(fast, whole),
+            np.mean(pit, axis=1),
+            np.mean(np.abs(pit - 0.5) > 0.45, axis=1),
+        ],
+        axis=1,
+    )

@@ -10,8 +10,9 @@ model at all is tested.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
@@ -20,6 +21,7 @@ from scipy.special import ndtri
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
+from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
@@ -29,6 +31,9 @@ from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
+
+if TYPE_CHECKING:
+    from bwbayes.inference.compiled.walk import Walk
 
 __all__ = ["Start", "Started", "fitted", "going_on", "started"]
 
@@ -115,7 +120,7 @@ class Started:
     ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of
     the offset still; ``from_rest`` if the record starts so; ``lead_in`` says how that went, if
     there is one, and ``judged_from`` is the first sample after it; ``carried`` is what its readings
-    leave of the discrepancy, for a forecast.
+    leave of the discrepancy, for a forecast. ``engine`` is what simulates.
     """
 
     actuators: tuple[Actuator, ...]
@@ -127,6 +132,43 @@ class Started:
     lead_in: LeadIn | None = None
     judged_from: int = 0
     carried: Carried | None = None
+    engine: Engine = "numpy"
+
+    def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
+        """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
+        walks = self._walks(voltage)
+        states: Sequence[State | None] = ()
+        for first in range(0, voltage.size, size):
+            piece = voltage[first : first + size]
+            if walks is None:
+                simulated, states = self.advance(piece, states)
+            elif len(walks) == 1:
+                simulated = walks[0][1].to(first + piece.size)
+            else:
+                simulated = np.empty((len(self.model), piece.size))
+                for rows, walk in walks:
+                    simulated[rows] = walk.to(first + piece.size)
+            yield simulated
+
+    def _walks(self, voltage: FloatArray) -> list[tuple[IntArray, Walk]] | None:
+        """Put the draws of each history to the start on the compiled engine, if that can do it."""
+        if self.engine != "numba":
+            return None
+        # Here, because it is slow to load.
+        from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
+
+        walks = []
+        for number, actuator in enumerate(self.actuators):
+            rows = np.flatnonzero(self.which == number)
+            if not rows.size:
+                continue
+            begun = walk(
+                actuator, self.model[rows], voltage, self.unrest[rows], from_rest=self.from_rest
+            )
+            if begun is None:
+                return None
+            walks.append((rows, begun))
+        return walks
 
     def advance(
         self, voltage: FloatArray, states: Sequence[State | None] = ()
@@ -206,7 +248,8 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     unrest = _normal(start.mean, start.covariance, generator)
     model, none = posterior.only.table.actuator(theta), np.zeros(len(theta))
     which = np.zeros(len(theta), dtype=np.int64)
-    return Started((likelihood.actuator,), which, model, unrest, none, posterior.only.from_rest)
+    actuators, from_rest = (likelihood.actuator,), posterior.only.from_rest
+    return Started(actuators, which, model, unrest, none, from_rest, engine=posterior.engine)
 
 
 def _voltages(posterior: Posterior, record: Record) -> Span:
@@ -255,7 +298,7 @@ def _unseen(
     )
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(one.actuator for one in likelihoods)
-    return Started(actuators, which, model, unrest, none, first.from_rest)
+    return Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
 
 
 def _informed(
@@ -289,7 +332,8 @@ def _informed(
     model = likelihood.table.actuator(begun)
     actuators = tuple(one.actuator for one in histories.likelihoods)
     from_rest, which = likelihood.from_rest, histories.which
-    return Started(actuators, which, model, unrest, sd, from_rest, lead_in, window.stop)
+    known = which, model, unrest, sd, from_rest, lead_in, window.stop
+    return Started(actuators, *known, engine=likelihood.engine)
 
 
 def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:

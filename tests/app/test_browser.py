@@ -16,7 +16,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from bwbayes.app.jobs.check import check
+from bwbayes.app.report.design_report import render as design_page
 from bwbayes.app.report.report import render
+from bwbayes.comparison.design import Asked, Promise
+from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.result import summary
 from tests.app import example, small
 from tests.programs import needs
@@ -24,7 +27,7 @@ from tests.programs import needs
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 WIDTHS = (400, 1400)
-PAGES = ("run", "unconverged", "check")
+PAGES = ("run", "unconverged", "check", "design")
 FIGURES = ("loop", "bands_training", "bands_held-out", "coverage", "corner", "trace", "ranks")
 
 # WCAG 2.2, level AA, for text of ordinary size.
@@ -85,6 +88,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         page = render(run, summary(run), dict.fromkeys(FIGURES, picture))
         paths[name].write_text(page, encoding="utf-8")
     check(small.config(), folder, folder, small.quiet())
+    wave = 100 * np.sin(np.arange(300) / 10)
+    asked = Asked("a run", "beta", None, Limits(-100, 100), {"sine": wave, "far": 9 * wave}, 0.01)
+    made = [Promise("sine", 0.6, 0.01), Promise("far", np.nan, np.nan, "goes too far")]
+    drawn = dict.fromkeys(("promises", "best"), picture)
+    paths["design"].write_text(design_page(asked, made, drawn), encoding="utf-8")
     return paths
 
 

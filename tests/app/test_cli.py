@@ -441,6 +441,44 @@ def test_lead_in_longer_than_the_record_is_refused(
     assert 0 == said.status
 
 
+def test_predict_after_goes_on_from_the_readings(bwbayes: Type, run: Path, tmp_path: Path) -> None:
+    """The band of the displacement is narrower behind the lead-in, and as wide as ever later."""
+    # Longer than the correlation times of all draws.
+    sine = "--signal", "sine", "--frequency", "0.5", "--duration", "30"
+    bwbayes("simulate", "new.csv", *sine, "--rate", "50", "--seed", "5")
+    record = "--record", "new.csv", "--from-rest", "--lead-in", "5"
+    assert 0 == bwbayes("predict", run, *record, "--out", "usual.csv").status
+    assert 0 == bwbayes("predict", run, *record, "--after", "--out", "after.csv").status
+    wide = {}
+    for name in ("usual", "after"):
+        header, rows = columns(tmp_path / f"{name}.csv")
+        low, high = (header.index(f"displacement_{edge}_95_um") for edge in ("lower", "upper"))
+        behind = rows[:, 0] > 5 - 1e-6
+        wide[name] = (rows[:, high] - rows[:, low])[behind]
+    part = wide["after"] / wide["usual"]
+    assert part[0] < 0.9
+    assert part[-1] == pytest.approx(1, abs=0.02)
+    assert np.argmin(part) < 0.2 * part.size
+
+
+def test_predict_after_continues_the_training_record_with_a_signal(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    said = bwbayes("predict", run, "--signal", "step50", "--after", "--out", "bands.csv")
+    assert 0 == said.status
+    _, rows = columns(tmp_path / "bands.csv")
+    fitted = read_record(run / "records/record.h5")
+    assert rows[0, 0] == pytest.approx(fitted.start + fitted.duration)
+    assert 550 == len(rows)
+    said = bwbayes("predict", run, "--signal", "step50", "--after", "--window", "1", "2")
+    assert_one_line(said, "--window is for a --record")
+    rows_of = [f"{i / 100},{50 * np.sin(i / 30)}" for i in range(300)]
+    (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows_of))
+    said = bwbayes("predict", run, "--record", "plan.csv", "--after", "--out", "none.csv")
+    assert_one_line(said, "has no readings after which a forecast could start")
+    assert not (tmp_path / "none.csv").exists()
+
+
 @pytest.mark.parametrize("command", [(), ("--help",)])
 def test_installed_command_starts(command: tuple[str, ...]) -> None:
     done = subprocess.run(small.command(*command), capture_output=True, text=True, check=False)

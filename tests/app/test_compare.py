@@ -16,6 +16,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
+from bwbayes.app.commands.compare import compare as compare_command
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.data import Record
 from bwbayes.errors import InputError, InputWarning
@@ -138,7 +139,8 @@ def test_other_records_windows_and_held_out_parts_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["a"], "give two runs or more"),
+        (["a"], "give two runs or more, or a CONFIG (.toml)"),
+        (["b.toml"], "b.toml: No such file or directory; check the config's path"),
         (["a", "b", "--models", "linear"], "goes with one CONFIG"),
         (["a", "a"], "the same run is there twice"),
         (["a", "b"], "a: no run here"),
@@ -159,6 +161,26 @@ def test_what_cannot_be_compared_is_one_line_and_status_2(
     printed = capsys.readouterr().err
     assert said in printed
     assert printed.count("\n") == 1
+
+
+def test_a_config_alone_is_run_with_the_usual_models(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """At least six, with and without hysteresis; the help names each."""
+    (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
+    asked: list[dict[str, Any]] = []
+
+    def noted(*given: Any, **_: Any) -> Any:
+        asked.append(given[2])
+        raise InputError("that is enough")
+
+    monkeypatch.setattr("bwbayes.app.jobs.compare.compare_models", noted)
+    assert run([str(tmp_path / "c.toml")], monkeypatch) == 2
+    (models,) = asked
+    assert len(models) >= 6
+    assert {"linear", "bouc-wen"} <= {one.hysteresis for one in models.values()}
+    said = next(str(vars(o)["help"]) for o in compare_command.params if o.name == "models")
+    assert all(name in said for name in models)
 
 
 def test_a_config_is_run_with_each_model_and_gone_on_with(

@@ -12,7 +12,10 @@ from rich.console import Console
 
 from bwbayes.app.commands import cli
 from bwbayes.app.jobs.design import design
+from bwbayes.app.report.design_report import alike, render
+from bwbayes.comparison.design import Asked, Promise
 from bwbayes.data import read_record
+from bwbayes.model.inverse.limits import Limits
 from tests.app import small
 
 CANDIDATES = """\
@@ -62,9 +65,14 @@ def test_the_best_of_a_file_is_written_for_the_generator(
     time = best.time
     expected = 100 * np.sin(2 * np.pi * time) * np.maximum(1 - 0.3 * time, 0)
     np.testing.assert_allclose(best.voltage, expected, atol=1e-4)
+    page = (tmp_path / "out/design.html").read_text(encoding="utf-8")
+    for one in said["candidates"]:
+        assert f">{one['name']}<" in page
+        assert f"{one['left']:.1%}" in page
+    assert {"best.png", "promises.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
     # Once more it is not replaced.
     assert command([*arguments, "--out", str(tmp_path / "out")], monkeypatch) == 2
-    assert "design.json: exists" in capsys.readouterr().err
+    assert "best.csv: exists" in capsys.readouterr().err
 
 
 def test_the_preset_keeps_to_the_amplifiers_limits(run: Path, tmp_path: Path) -> None:
@@ -85,6 +93,24 @@ def test_the_preset_keeps_to_the_amplifiers_limits(run: Path, tmp_path: Path) ->
     lefts = [one.left for one in made if not one.refused]
     assert lefts == sorted(lefts)
     assert 0 < lefts[0] < 1
+
+
+def test_a_page_names_what_cannot_be_told_apart_and_what_is_refused() -> None:
+    """Two standard errors of the difference; refused signals have a reason, and no promise."""
+    wave = 100 * np.sin(np.arange(200) / 10)
+    made = [
+        Promise("a", 0.50, 0.01),
+        Promise("b", 0.52, 0.01),
+        Promise("c", 0.60, 0.01),
+        Promise("d", np.nan, np.nan, "is too fast"),
+    ]
+    assert ["b"] == alike(made)
+    asked = Asked("run", None, "x", Limits(-100, 100, 50.0), dict.fromkeys("abcd", wave), 0.01)
+    page = render(asked, made, {})
+    assert "Not to be told apart from it: b." in page
+    assert "<li>d is too fast</li>" in page
+    assert "Width left of the band along x after one more record of it: 50.0 ± 1.0 %." in page
+    assert "at most 50 V/s" in page
 
 
 @pytest.mark.parametrize(

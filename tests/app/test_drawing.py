@@ -1,5 +1,6 @@
 """Pictures that another process draws are those that this one draws, whatever comes of it."""
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
@@ -8,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bwbayes.app.figures import draw_all, save
+from bwbayes.app.figures import draw_all, interactive, save
 from bwbayes.app.running.drawing import Beside, beside
 from tests.app import example
 
@@ -28,8 +29,11 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
     with beside(2, asked=True) as artist:
         if artist is None:
             pytest.skip("this machine has one core")
-        artist.begin(run)
-        drawn = artist.pictures(run, tmp_path / "apart")()
+        artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
+        artist.draw(dataclasses.replace(run, scores={}))
+        drawn = artist.pictures(run, tmp_path / "apart")
+        plots = artist.plots(run)
+    assert interactive.made(run) == plots
     here = save(draw_all(run), tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
     assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
@@ -39,9 +43,18 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died, and nothing was begun."""
-    drawn = Beside(Broken()).pictures(example.run(converged=False), tmp_path)()
+    artist, run = Beside(Broken()), example.run(converged=False)
+    drawn = artist.pictures(run, tmp_path)
+    assert artist.plots(run) == ({}, [])
     assert ["trace", "ranks"] == list(drawn)
     assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
+    artist, run = Beside(Broken()), example.run()
+    artist.draw(run)
+    assert list(draw_all(run)) == list(artist.pictures(run, tmp_path))
+    assert interactive.made(run) == artist.plots(run)
 
 
 @pytest.mark.parametrize(("workers", "asked"), [(1, True), (2, False)])

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -19,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
+from PIL import Image
 
 from bwbayes.app.figures import draw_all, interactive, save
 from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, draw_trace
@@ -251,15 +253,15 @@ def test_pit_leaves_out_the_lead_in() -> None:
 
 
 def test_corner_marks_the_known_truth_alone(figures: Mapping[str, Figure]) -> None:
-    panels = figures["corner"].axes
+    panels = {places(panel): panel for panel in figures["corner"].axes}
 
     def upright(panel: Axes) -> list[float]:
         lines = [np.asarray(line.get_xdata()) for line in panel.lines]
         return [float(x[0]) for x in lines if x.size == 2 and x[0] == x[1]]
 
-    assert [0.7] == upright(panels[0])
-    assert [] == upright(panels[5])
-    assert [2e-3] == upright(panels[14])
+    assert [0.7] == upright(panels[0, 0])
+    assert [] == upright(panels[1, 1])
+    assert [2e-3] == upright(panels[3, 2])
 
 
 def test_corner_shows_a_truth_far_from_the_draws() -> None:
@@ -337,9 +339,13 @@ def test_tick_labels_of_the_corner_picture_do_not_collide() -> None:
     """Along the bottom row and the left column, whose panels touch each other."""
     figure = draw_corner(example.run())
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    panels = figure.axes
+    panels = {places(panel): panel for panel in figure.axes}
     free = 4
-    for axes, along_x in ((panels[-free:], True), (panels[::free], False)):
+    lowest, first = (
+        [panels[at] for at in panels if free - 1 == at[0]],
+        [panels[at] for at in panels if 0 == at[1]],
+    )
+    for axes, along_x in ((lowest, True), (first, False)):
         labels = [
             label.get_window_extent(renderer)
             for panel in axes
@@ -375,3 +381,21 @@ def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None
     assert ["bands_</script><b>", "loop"] == list(plots)
     assert not any("<" in text for text in plots.values())
     assert {} == interactive.draw(example.run(converged=False))
+
+
+def test_pictures_have_few_colours_and_look_the_same(tmp_path: Path) -> None:
+    """Half the size, all but one pixel in a thousand within 12 of 255, and white is white."""
+    figure = draw_loop(example.run().bands)
+    small = save({"loop": figure}, tmp_path)["loop"]
+    figure.set_layout_engine("none")  # it stays where it is
+    canvas = FigureCanvasAgg(figure)
+    plain = BytesIO()
+    with mpl.rc_context(STYLE):
+        canvas.print_png(plain)  # type: ignore[no-untyped-call]
+    drawn, shown = (
+        np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
+        for png in (plain.getvalue(), small)
+    )
+    assert 2 * len(small) < len(plain.getvalue())
+    assert 0.999 < np.mean(np.abs(drawn - shown).max(axis=-1) <= 12)
+    assert [255] * 3 == list(shown[0, 0])

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import bwbayes
 from bwbayes.app.config.config import Config, dump, parse
+from bwbayes.app.config.models import models_of
 from bwbayes.app.figures import draw_all
 from bwbayes.app.jobs.calibrate import experiment
+from bwbayes.app.jobs.compare import compare_models, compare_runs
+from bwbayes.app.jobs.design import amplifier_of, candidates_of, liveliest
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import carry_on, load_run, start
+from bwbayes.app.screen import show_priors
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
 from bwbayes.results.replicates import replicate
@@ -175,6 +182,50 @@ def test_any_other_record_is_predicted(finished: RunFolder) -> None:
     np.testing.assert_array_equal(predicted.mean, made.bands["sine"].mean)
 
 
+def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_path: Path) -> None:
+    """What a model has no parameter for is left out of its scopes; none is another's future."""
+    scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))
+    models = models_of("linear", scoped.model)
+    out = tmp_path / "out"
+    made = compare_models(scoped, Path(), models, out, small.quiet(), workers=1, with_future=False)
+    assert "linear is the only model that has converged" == made.lines[0]
+    assert [] == parse((out / "linear/config.toml").read_text(), "").model.per_record
+    both = [finished.path, out / "linear"]
+    made = compare_runs(both, tmp_path / "both", small.quiet(), workers=1)
+    assert "run" == made.recommended
+    assert all(one.future is None for one in made.candidates)
+    assert {"later", "sine"} == made["linear"].scores.keys() == made["run"].scores.keys()
+    assert (tmp_path / "both/comparison.html").is_file()
+
+
+def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: RunFolder) -> None:
+    """Voltages are those of all records, the pattern that of the one that turns most."""
+    made = load_run(finished)
+    flipped = replace(made, records=dict(reversed(list(made.records.items()))))
+    assert ["step", "loops"] == [*flipped.records]
+    signals = []
+    for one in (made, flipped):
+        assert "loops" == liveliest(one)
+        amplifier = amplifier_of(one, None, None, None, None)
+        assert made.records["loops"].range_voltage == (amplifier.low, amplifier.high)
+        signals.append(candidates_of("standard", one, amplifier))
+    assert signals[0].keys() == signals[1].keys()
+    for name, voltage in signals[0].items():
+        np.testing.assert_array_equal(voltage, signals[1][name])
+    best = bwbayes.open_run(finished.path).design("alpha")[0]
+    assert 0 < best.left < 1
+    with pytest.raises(InputError, match=r"'offset\[step\]' is not a free parameter of the act"):
+        bwbayes.open_run(finished.path).design("offset[step]")
+
+
+def test_parameters_of_a_record_are_shown_by_their_whole_name() -> None:
+    """Square brackets are no mark-up of the screen."""
+    text = StringIO()
+    show_priors(problem().posterior.prior, Console(file=text, width=120))
+    assert "offset[loops]" in text.getvalue()
+    assert "initial[step]" in text.getvalue()
+
+
 def test_replicates_make_all_records_anew() -> None:
     """Each with its own readings; the loop is measured in the record that has one."""
     common = experiment(problem(("ess = 150", "ess = 100")))
@@ -247,7 +298,14 @@ def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"), r"record\.loops\.train|window 9"),
+        (
+            ("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"),
+            r"^record\.loops\.train: window 9 to 10 s: reaches outside the record; choose",
+        ),
+        (
+            ("window = [3.0, 4.0]", "window = [3.0, 5.0]"),
+            r"^validation\.later\.window: window 3 to 5 s: reaches outside the record; choose",
+        ),
         (
             ("decimate = 2", "decimate = 2\nstart = 1.0\ntrain = [[0.0, 0.8]]"),
             r"record\.step\.train: no readings from 0 to 0\.78 s; .* in \[record\.step\]",
@@ -303,6 +361,16 @@ def test_files_in_another_unit_and_of_another_interval(tmp_path: Path) -> None:
     bad.write_text(text + '[record.c]\nfile = "c.csv"\n')
     with pytest.raises(InputError, match=r"c\.csv"):
         resolve(parse(bad.read_text(), ""), tmp_path)
+
+
+def test_readings_do_not_count_twice(tmp_path: Path) -> None:
+    """One measurement under two names is refused, unless each has windows of its own."""
+    write_record(measured(1), tmp_path / "a.h5")
+    text = '[record.a]\nfile = "a.h5"\n[record.b]\nfile = "a.h5"\n'
+    with pytest.raises(InputError, match=r"^record\.b: the same measurement as record\.a, whose"):
+        resolve(parse(text, ""), tmp_path)
+    apart = text.replace("[record.b]", "train = [0.0, 1.0]\n[record.b]") + "train = [1.0, 2.0]\n"
+    assert 2 == len(resolve(parse(apart, ""), tmp_path).records)
 
 
 def test_another_record_cannot_stand_for_several(tmp_path: Path) -> None:

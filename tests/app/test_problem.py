@@ -425,6 +425,16 @@ def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
     )
 
 
+def test_outliers_that_a_config_names_are_left_out(folder: Path) -> None:
+    """Whoever wrote their times, and whether others are to be searched or not."""
+    voltage = 50 * np.sin(np.arange(600) / 30)
+    write_record(Record(voltage, 0.5 * voltage, 0.01), folder / "record.csv")
+    problem = of(RECORD.rstrip() + "\noutliers = [1.0, 3.33]\n", folder)
+    assert [100, 333] == np.flatnonzero(np.isnan(problem.posterior.only.displacement)).tolist()
+    with pytest.raises(InputError, match=r"^record\.outliers: a time outside of 0 to 6 s"):
+        of(RECORD.rstrip() + "\noutliers = [6.2]\n", folder)
+
+
 def test_steps_are_drawn_up_from_levels_and_their_dwell() -> None:
     wanted = SignalConfig(shape="steps", levels=[0.0, 50.0, -20.0], dwell=2.0, duration=7.0)
     _, voltage = sampled_waveform(wanted).sample(10.0)

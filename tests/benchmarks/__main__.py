@@ -11,7 +11,7 @@ from rich.console import Console
 from bwbayes.app.running.workers import one_thread
 from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import FULL, MODELS, QUICK, Effort, problem
-from tests.benchmarks.control import controller
+from tests.benchmarks.control import controller, inversion
 from tests.benchmarks.replicates import replicates
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
@@ -72,6 +72,7 @@ def _measured(effort: Effort) -> Iterator[Table]:
     yield likelihood.threads(posterior, effort)
     yield from effective.sampling(effort)
     yield controller(effort)
+    yield inversion(effort)
     yield startup(effort)
     yield replicates(effort)
 

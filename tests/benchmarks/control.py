@@ -1,4 +1,4 @@
-"""What a step of an exported controller costs, forward and inverse."""
+"""What a step of an exported controller costs, and reading many draws backwards."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from bwbayes.control.exported import exported
+from bwbayes.data.waveforms import signal
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inverse.chain import inverse
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from tests.benchmarks.cases import Effort
 from tests.benchmarks.tables import Cell, Table
 from tests.benchmarks.timing import interleaved
@@ -16,9 +27,26 @@ from tests.control import cases
 from tests.control.compiled import Compiled
 from tests.programs import path
 
-__all__ = ["controller"]
+__all__ = ["controller", "inversion"]
 
 SAMPLES = 16_000
+
+# Draws of a posterior, and fewer samples and draws for a quick look.
+DRAWS, FEW_SAMPLES, FEW_DRAWS = 1000, 2000, 200
+
+# Hysteresis, dynamics, gain and creep of models that are read backwards.
+INVERTED: dict[str, tuple[Operator, str, PolynomialGain | None, Creep | None]] = {
+    "bouc-wen": (BoucWen(), "none", None, None),
+    "bouc-wen, lag": (BoucWen(), "lag", None, None),
+    "bouc-wen, second-order": (BoucWen(), "second-order", None, None),
+    "bouc-wen, lag, creep": (BoucWen(), "lag", None, cases.CREEP),
+    "bouc-wen, lag, gain": (BoucWen(), "lag", cases.GAIN, None),
+    "plays, lag": (Plays(10), "lag", None, None),
+    "maxwell-slip, lag": (MaxwellSlip(10), "lag", None, None),
+    "asymmetric bouc-wen, lag": (BoucWenAsymmetric(), "lag", None, None),
+    "duhem, lag": (Duhem(), "lag", None, None),
+    "bouc-wen n = 1.7, lag": (BoucWen(), "lag", None, None),
+}
 
 
 def controller(effort: Effort) -> Table:
@@ -50,3 +78,31 @@ def controller(effort: Effort) -> Table:
             )
     rows = rows or [{"model": "no C compiler here"}]
     return Table("controller", "Controller", "ns a step of the exported C file, -O2", rows)
+
+
+def inversion(effort: Effort) -> Table:
+    """Measure the inverse of many draws against simulating them, on the paper's record.
+
+    What is asked for is the displacement of their middle; each draw gets a voltage of its own.
+    """
+    samples, draws = (SAMPLES, DRAWS) if effort.everything else (FEW_SAMPLES, FEW_DRAWS)
+    voltage = signal("identification").sample(1000.0)[1][:samples]
+    rows: list[dict[str, Cell]] = []
+    for name, (hysteresis, dynamics, gain, creep) in INVERTED.items():
+        actuator = Actuator(dynamics, "first", 1e-3, hysteresis, gain, creep, cases.SPAN)
+        theta = cases.theta(actuator, draws, name)
+        simulate = partial(actuator.displacement, theta, voltage, from_rest=True)
+        asked = simulate().mean(axis=0)
+        invert = partial(inverse, actuator, theta, asked, from_rest=True)
+        # Where one takes minutes, more rounds would say no more.
+        costs = interleaved({"simulate": simulate, "invert": invert}, min(effort.rounds, 2))
+        forward, backward = costs["simulate"].wall, costs["invert"].wall
+        rows.append(
+            {
+                "model": name,
+                "simulate, ms": 1e3 * forward,
+                "invert, ms": 1e3 * backward,
+                "ratio": backward / forward,
+            }
+        )
+    return Table("inversion", "Inversion", f"{samples:,} samples, {draws:,} draws", rows)

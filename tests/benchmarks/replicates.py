@@ -35,7 +35,10 @@ CODE = """
 import json, sys, time
 from pathlib import Path
 from bwbayes.app.config.config import load
-from bwbayes.app.jobs.calibrate import experiment
+try:
+    from bwbayes.app.jobs.calibrate import experiment
+except ImportError:
+    from bwbayes.app.commands.calibrate import experiment  # where it was before
 from bwbayes.app.problem.problem import resolve
 from bwbayes.results.replicates import replicate
 

@@ -19,15 +19,17 @@ __all__ = ["STARTS", "started", "startup"]
 
 MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bwbayes'; main()"
 
-# One model through all that is compiled, with a record as a run has it: not to be written to.
+# One model through all that is compiled.
 COMPILED = """
 import numpy as np
-from bwbayes.inference.compiled import kernels, lanes, stages
-record = np.ones(9)
-record.flags.writeable = False
-one = np.ones((1, len(lanes.PARAMETERS)))
-own = np.ones((1, 9))
-kernels.sums(record, record, 0 * record, one, stages.BOUC_WEN, own, np.empty((0, 0)), 0, 1)
+from bwbayes.inference.compiled import moments
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.table import Table
+from bwbayes.model.actuator import Actuator
+parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)
+record = np.sin(np.arange(9.0))
+theta = np.ones((1, len(Table(*parts).names)))
+moments(theta, record, record, 0 * record, *parts, 1, 0, from_rest=True)
 """
 
 STARTS: Mapping[str, list[str]] = {

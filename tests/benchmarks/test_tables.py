@@ -13,6 +13,7 @@ from bwbayes.inference.posterior import Posterior
 from tests.benchmarks import likelihood, timing
 from tests.benchmarks.__main__ import TARGETS, main
 from tests.benchmarks.cases import Effort
+from tests.benchmarks.startup import STARTS, started
 from tests.benchmarks.tables import Table, written
 from tests.inference.problems import short_posterior
 
@@ -55,3 +56,8 @@ def test_the_quick_command_says_what_became_of_each_target(tmp_path: Path) -> No
     assert 0 == done.exit_code
     rows = json.loads(out.read_text(encoding="utf-8"))["targets"]["rows"]
     assert [name for name, _, _ in TARGETS] == [row["target"] for row in rows]
+
+
+def test_every_start_ends_well() -> None:
+    for arguments in STARTS.values():
+        started(arguments)()

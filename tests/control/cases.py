@@ -12,7 +12,10 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 
 __all__ = ["ACTUATORS", "HOLDS", "SPAN", "actuator", "drive", "theta"]
@@ -32,6 +35,11 @@ ACTUATORS = {
     "bouc-wen with all": (BoucWen(), "second-order", GAIN, GROWING),
     "backlash-like, lag, creep": (BacklashLike(), "lag", None, CREEP),
     "plays, lag, gain": (Plays(6), "lag", GAIN, None),
+    "bouc-wen, n = 1.7, lag": (BoucWen(), "lag", None, None),
+    "bouc-wen, n = 1.05 and gamma < 0": (BoucWen(), "none", GAIN, None),
+    "bouc-wen-asymmetric, lag": (BoucWenAsymmetric(), "lag", None, None),
+    "duhem, lag": (Duhem(odd=False), "lag", None, None),
+    "linear, second-order, creep": (NoHysteresis(), "second-order", None, CREEP),
     "maxwell-slip with all": (MaxwellSlip((5.0, 20.0, 70.0)), "lag", GAIN, GROWING),
 }
 
@@ -40,8 +48,19 @@ VALUES = {
     "d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "exponent": 1.0, "initial": 0.0,
     "lag": 3.8e-3, "mass": 1.34e-3, "damping": 1580.0, "stiffness": 4.1e5, "quadratic": 1.5,
     "cubic": -0.8, "creep_1": 0.012, "creep_2": 0.009, "creep_3": 0.01, "creep_growth": 0.4,
-    "threshold": 100.0, "offset": 0.0,
+    "threshold": 100.0, "offset": 0.0, "d2": 2e-4, "d3": 4e-6, "alpha1": 3e-4, "alpha2": 1e-5,
+    "b2": 0.06, "b3": 0.05, "b4": -0.07, "b5": 0.04, "b6": 0.08,
 }  # fmt: skip
+
+# What some of them have instead; without γ, h is twice as steep after a turn as at zero.
+OTHERS = {
+    "not passive": {"gamma": 0.035},
+    "backlash": {"alpha": 0.25},
+    "n = 1.7": {"exponent": 1.7, "beta": 0.006, "gamma": 0.003},
+    "n = 1.05": {"exponent": 1.05, "beta": 0.025, "gamma": -0.01, "alpha": 0.12},
+    "asymmetric": {"alpha": 0.25},
+    "duhem": {"alpha": 0.25, "beta": 0.03},
+}
 
 
 def actuator(name: str, hold: Hold = "first", interval: float = 1e-3) -> Actuator:
@@ -52,13 +71,14 @@ def actuator(name: str, hold: Hold = "first", interval: float = 1e-3) -> Actuato
 
 def theta(made: Actuator, models: int = 1, name: str = "") -> FloatArray:
     """Return parameters (models, parameters), the first the table's, the others near them."""
-    values = VALUES | ({"gamma": 0.035} if "not passive" in name else {})
-    # Without γ, h is twice as steep after a turn as at zero.
-    values |= {"alpha": 0.25} if "backlash" in name else {}
+    values = dict(VALUES)
+    for part, others in OTHERS.items():
+        values |= others if part in name else {}
     row = [values.get(one, 0.06) for one in made.parameters]
     rows = np.tile(row, (models, 1))
     rows[1:] *= 1 + 0.05 * np.random.default_rng(7).uniform(-1, 1, rows[1:].shape)
-    rows[:, [i for i, one in enumerate(made.parameters) if one == "exponent"]] = 1.0
+    if values["exponent"] == 1.0:
+        rows[:, [i for i, one in enumerate(made.parameters) if one == "exponent"]] = 1.0
     return rows
 
 

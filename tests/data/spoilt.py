@@ -152,6 +152,13 @@ def _clipped(record: Record, g: Generator) -> Record:
     return _displaced(record, side * np.minimum(side * values, limit))
 
 
+def _clipped_tip(record: Record, g: Generator) -> Record:
+    values = _readings(record)
+    side = float(g.choice([-1, 1]))
+    limit = np.quantile(side * values, float(g.uniform(0.98, 0.99)))
+    return _displaced(record, side * np.minimum(side * values, limit))
+
+
 def _clipped_voltage(record: Record, g: Generator) -> Record:
     limit = np.max(record.voltage) - float(g.uniform(0.15, 0.3)) * np.ptp(record.voltage)
     return replace(record, voltage=np.minimum(record.voltage, limit))
@@ -192,6 +199,7 @@ SPOILT: Mapping[str, Callable[[Record, Generator], Record]] = {
     "held readings": _held,
     "repeated samples": _dropped,
     "clipping": _clipped,
+    "clipping of the tips": _clipped_tip,
     "clipping of the voltage": _clipped_voltage,
     "drift": _drifting,
     "wrong units: mV": lambda record, _: replace(record, voltage=1e3 * record.voltage),

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bwbayes.inference.engine import Engine
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
@@ -118,3 +119,17 @@ def test_bands_cover_records_of_every_operator(name: str) -> None:
     assert LEAST <= found["95"][0] <= MOST
     assert wider < 1.1
     assert alarmed <= stats.binom.isf(1e-3, RECORDS, LEAD_IN_ALARM)
+
+
+@pytest.mark.parametrize("name", ["bouc-wen", "maxwell-slip", "preisach"])
+def test_bands_are_the_same_on_either_engine(name: str) -> None:
+    """Draws of different histories among them, which are simulated apart."""
+    case = Case(hysteresis=name)
+    record = record_of(case, np.random.default_rng(8))
+    engines: tuple[Engine, ...] = ("numba", "numpy")
+    compiled, plain = (
+        predicted(case, posterior_of_case(case, engine), record, 3) for engine in engines
+    )
+    for kind in KINDS:
+        np.testing.assert_allclose(compiled.lower[kind, 95], plain.lower[kind, 95], atol=1e-6)
+    np.testing.assert_allclose(compiled.mean, plain.mean, rtol=0, atol=1e-8)

@@ -17,12 +17,21 @@ from bwbayes.app.commands.shared import (
 )
 from bwbayes.errors import InputError
 
-__all__ = ["compare"]
+__all__ = ["USUAL", "compare"]
+
+# What a config is run with if nothing else is asked for: from no hysteresis at all to the two ways
+# of remembering it, a state or a stack of turning points, without and with the asymmetry of
+# measured loops.
+USUAL = (
+    "linear; bouc-wen; bouc-wen + quadratic; bouc-wen + quadratic + cubic; "
+    "prandtl-ishlinskii + quadratic + cubic; maxwell-slip(thresholds=4) + quadratic; "
+    "maxwell-slip(thresholds=4) + quadratic + cubic"
+)
 
 
 @click.command()
 @click.argument("paths", type=FILE, nargs=-1, required=True)
-@click.option("--models", help='Models to run a CONFIG with: "bouc-wen; bouc-wen + quadratic".')
+@click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL}.")
 @click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
 @click.option("--future/--no-future", default=True, help="Whether to leave out the future, too.")
 @overwrite_option
@@ -39,12 +48,11 @@ def compare(
     how: str | None,
     quiet: bool,
 ) -> int:
-    """Compare the runs in folders PATHS, or the --models that a config is run with.
+    """Compare the runs in folders PATHS, or models that one config is run with.
 
     Scores on what was held out, on the training record's own future, log evidence; differences
-    with paired errors; what is recommended, and what speaks against it. Of models the first word
-    is an operator; gain, creep, dynamics and noise follow after plus signs:
-    --models "linear; bouc-wen + quadratic; maxwell-slip(thresholds=4) + creep".
+    with paired errors; what is recommended, and what speaks against it. Of --models the first word
+    is an operator; gain, creep, dynamics and noise follow after plus signs.
 
     Example: bwbayes compare results/bender results/bender_plays
     """
@@ -54,9 +62,11 @@ def compare(
     from bwbayes.app.screen import show_comparison
 
     console = Console(stderr=True, quiet=quiet)
+    if models is None and len(paths) == 1 and paths[0].suffix == ".toml":
+        models = USUAL
     if models is None:
         if len(paths) < 2:
-            raise InputError("compare: give two runs or more, or a CONFIG and --models")
+            raise InputError("compare: give two runs or more, or a CONFIG (.toml)")
         where = out or Path("results") / "comparison"
         made = compare_runs(
             paths, where, console, workers=workers, how=how, with_future=future, overwrite=overwrite

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import click
 from rich.console import Console
@@ -12,6 +12,9 @@ from bwbayes.app.commands.init import config_or_proposal
 from bwbayes.app.commands.shared import FILE, executor_option, finish, quiet_option, workers_option
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.inference.engine import Engine
+
+if TYPE_CHECKING:
+    from bwbayes.app.problem.problem import Problem
 
 __all__ = ["resume", "run"]
 
@@ -39,7 +42,7 @@ def run(
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
-    from bwbayes.app.running.run import load_run, start
+    from bwbayes.app.running.run import start
     from bwbayes.app.screen import show_priors, show_remarks
     from bwbayes.data.io.formats import SUFFIXES
 
@@ -51,12 +54,13 @@ def run(
     if chosen.name is None:
         chosen = chosen.model_copy(update={"name": config.stem})
     folder = start(chosen, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
-    if not quiet:
-        problem = load_run(folder)
+
+    def show(problem: Problem) -> None:
         if config.suffix.lower() not in SUFFIXES:  # of a record alone they are shown already
             show_remarks(problem.remarks, Console())
         show_priors(problem.posterior.prior, Console())
-    return finish(folder.path, workers, quiet, how=how)
+
+    return finish(folder.path, workers, quiet, how=how, show=None if quiet else show)
 
 
 @click.command()

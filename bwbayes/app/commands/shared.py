@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import click
 from rich.console import Console
 
 if TYPE_CHECKING:
+    from bwbayes.app.problem.problem import Problem
     from bwbayes.inference.engine import Engine
 
 __all__ = [
@@ -69,8 +71,12 @@ def finish(
     steps: int | None = None,
     engine: Engine | None = None,
     how: str | None = None,
+    show: Callable[[Problem], None] | None = None,
 ) -> int:
-    """Sample the run in a folder to its end, say how it went, and return the exit status."""
+    """Sample the run in a folder to its end, say how it went, and return the exit status.
+
+    ``show`` is called with the problem at first.
+    """
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.running.run import carry_on, going_on, load_run
     from bwbayes.app.screen import show_result
@@ -87,6 +93,7 @@ def finish(
             engine=engine,
             how=how,
             apart=True,
+            show=show,
         )
     except KeyboardInterrupt:
         click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)

@@ -51,6 +51,7 @@ MEANINGS = {
     "skip": "exclude",
     "mask": "exclude",
     "ignore": "exclude",
+    "follows": "continues",
     "value": "fixed",
     "constant": "fixed",
     "min": "lower",

@@ -136,6 +136,14 @@ class RecordConfig(_Source):
         bool,
         described("Whether the record starts at rest, demagnetised.", example="true"),
     ] = False
+    continues: Annotated[
+        Name | None,
+        described(
+            "Of several records, the one that this one goes on from at once: state, offset and "
+            "discrepancy carry over, and the two are fitted as one record of that name.",
+            example='"first"',
+        ),
+    ] = None
     start: Annotated[
         float | None,
         described(

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from scipy.stats import rankdata
 
 from bwbayes.app.figures.style import (
@@ -35,6 +35,10 @@ CORNER_PANEL = 1.25
 CORNER_MARGIN = 1.3
 CORNER_FONT = 11
 CORNER_TICKS = 4
+CORNER_BINS = 20
+
+# How far its labels are off its panels, in units of a panel.
+CORNER_LABEL = 0.75
 
 
 def draw_corner(result: Result) -> Figure:
@@ -47,46 +51,54 @@ def draw_corner(result: Result) -> Figure:
     flat = result.flat_draws
     flat = flat[starts(flat.shape[0], CORNER_DRAWS)]
     free = len(result.free)
+    truths = [result.truth.get(p.name) for p in result.free]
+    ranges = [_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)]
+    ticks = [_inner_ticks(*one) for one in ranges]
     side = CORNER_PANEL * free + CORNER_MARGIN + 0.2
     figure = Figure(figsize=(side, side))
-    truths = [result.truth.get(p.name) for p in result.free]
-    corner.corner(
-        flat,
-        fig=figure,
-        labels=[axis_label(p) for p in result.free],
-        labelpad=0.45,
-        range=[_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)],
-        levels=(0.5, 0.9),
-        color=COLOURS[0],
-        smooth=0.8,
-        plot_density=False,
-        fill_contours=True,
-        data_kwargs={"alpha": 0.3, "ms": 1.2},
-        label_kwargs={"fontsize": CORNER_FONT + 2},
-        max_n_ticks=CORNER_TICKS,
-        quiet=True,
-    )
-    for panel in figure.axes[::free]:
-        panel.tick_params(axis="y", labelrotation=0)
-    for panel in figure.axes:
-        panel.tick_params(labelsize=CORNER_FONT)
-        for axis in (panel.xaxis, panel.yaxis):
-            if isinstance(axis.get_major_locator(), MaxNLocator):
-                axis.set_major_locator(FixedLocator(list(_inner_ticks(*axis.get_view_interval()))))
-    for panel in figure.axes[-free:]:
-        panel.tick_params(axis="x", labelrotation=90)
-    margin = CORNER_MARGIN / side
-    far = 1 - 0.2 / side
-    figure.subplots_adjust(left=margin, bottom=margin, right=far, top=far)
-    _mark_truths(figure.axes, truths)
+    margin, far = CORNER_MARGIN / side, 1 - 0.2 / side
+    edges = {"left": margin, "bottom": margin, "right": far, "top": far}
+    grid = figure.add_gridspec(free, free, **edges, wspace=0.05, hspace=0.05)
+    for row, column in zip(*(axis.tolist() for axis in np.tril_indices(free)), strict=True):
+        panel = figure.add_subplot(grid[row, column])
+        panel.tick_params(labelsize=CORNER_FONT, labelbottom=False, labelleft=False)
+        if row == column:
+            low, high = ranges[row]
+            bins = np.linspace(low, high, CORNER_BINS + 1).tolist()
+            heights = panel.hist(flat[:, row], bins, histtype="step", color=COLOURS[0])[0]
+            panel.set(xlim=ranges[row], ylim=(0, 1.1 * np.max(heights)))
+        else:
+            corner.hist2d(
+                *flat[:, [column, row]].T,
+                ax=panel,
+                bins=CORNER_BINS,
+                range=[ranges[column], ranges[row]],
+                levels=(0.5, 0.9),
+                color=COLOURS[0],
+                smooth=0.8,
+                plot_density=False,
+                fill_contours=True,
+                data_kwargs={"alpha": 0.3, "ms": 1.2},
+                quiet=True,
+            )
+        panel.xaxis.set_major_locator(FixedLocator(ticks[column]))
+        panel.yaxis.set_major_locator(FixedLocator(ticks[row]) if row > column else NullLocator())
+        _mark_truth(panel, truths[column], truths[row] if row > column else None)
+        if row == free - 1:
+            panel.tick_params("x", labelbottom=True, labelrotation=90)
+            panel.set_xlabel(axis_label(result.free[column]), fontsize=CORNER_FONT + 2)
+            panel.xaxis.set_label_coords(0.5, -CORNER_LABEL)
+        if column == 0 and row > 0:
+            panel.tick_params("y", labelleft=True)
+            panel.set_ylabel(axis_label(result.free[row]), fontsize=CORNER_FONT + 2)
+            panel.yaxis.set_label_coords(-CORNER_LABEL, 0.5)
     return figure
 
 
-def _inner_ticks(low: float, high: float) -> FloatArray:
+def _inner_ticks(low: float, high: float) -> list[float]:
     """Return ticks that keep away from the ends, where they would meet the next panel's."""
     ticks = np.asarray(MaxNLocator(CORNER_TICKS).tick_values(low, high), dtype=np.float64)
-    inner: FloatArray = ticks[np.abs(ticks - (low + high) / 2) < 0.4 * (high - low)]
-    return inner
+    return [float(x) for x in ticks if abs(x - (low + high) / 2) < 0.4 * (high - low)]
 
 
 def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
@@ -98,15 +110,12 @@ def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-def _mark_truths(panels: list[Axes], truths: list[float | None]) -> None:
-    """Draw the known true values; corner does so only for two parameters or more."""
-    for i, panel in enumerate(panels):
-        row, column = divmod(i, len(truths))
-        across, upright = truths[column], truths[row]
-        if column <= row and across is not None:
-            panel.axvline(across, color=TRUTH_COLOUR)
-        if column < row and upright is not None:
-            panel.axhline(upright, color=TRUTH_COLOUR)
+def _mark_truth(panel: Axes, across: float | None, upright: float | None) -> None:
+    """Draw the true values that are known."""
+    if across is not None:
+        panel.axvline(across, color=TRUTH_COLOUR)
+    if upright is not None:
+        panel.axhline(upright, color=TRUTH_COLOUR)
 
 
 def draw_trace(result: Result) -> Figure:

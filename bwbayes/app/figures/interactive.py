@@ -10,9 +10,6 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from base64 import b64encode
-from dataclasses import dataclass
-from hashlib import sha256
 from importlib.resources import files
 from typing import Any
 
@@ -33,7 +30,7 @@ from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
 
-from bwbayes.app.figures.loop import along
+from bwbayes.app.figures.loop import along, one_way
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
     BAND_NAMES,
@@ -44,17 +41,18 @@ from bwbayes.app.figures.style import (
     starts,
     title,
 )
+from bwbayes.app.report.page import Plots, Script
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.bands import Bands, Kind
 from bwbayes.results.result import Result
 
-__all__ = ["Script", "draw", "scripts"]
+__all__ = ["draw", "made", "scripts"]
 
 # Stretches of a time series, each with up to six samples: more in all than a screen has pixels.
-STRETCHES = 700
+STRETCHES = 500
 
 # A loop keeps one in so many of the points that its picture has.
-ONE_IN = 2
+ONE_IN = 4
 
 # A loop shows one reading in each cell of a grid of so many by so many.
 CELLS = 200
@@ -67,16 +65,10 @@ LOOP_HEIGHT = 430
 FONT_SIZE = "13px"
 
 
-@dataclass(frozen=True)
-class Script:
-    """A script of the page, and the digest by which the page allows it and no other."""
-
-    text: Markup
-
-    @property
-    def digest(self) -> str:
-        """The SHA-256, as a Content-Security-Policy names it."""
-        return "sha256-" + b64encode(sha256(self.text.encode()).digest()).decode("ascii")
+def made(result: Result) -> Plots:
+    """Return a run's plots and, if there are any, the scripts that draw them."""
+    plots = draw(result) if result.outcome.converged else {}
+    return Plots(plots, scripts() if plots else [])
 
 
 def scripts() -> list[Script]:
@@ -282,11 +274,8 @@ def _ribbon(bands: Bands, at: IntArray, kind: Kind) -> dict[str, list[FloatArray
     """Return the corners of a band, one polygon from each turning point to the next."""
     voltage = bands.voltage[at].astype(np.float32)
     lower, upper = (edge[kind, LEVEL][at].astype(np.float32) for edge in (bands.lower, bands.upper))
-    rising = np.diff(voltage) > 0
-    turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
     xs, ys = [], []
-    for first, last in itertools.pairwise([0, *turns, at.size - 1]):
-        part = slice(first, last + 1)
+    for part in one_way(bands.voltage[at]):
         xs.append(np.concatenate([voltage[part], voltage[part][::-1]]))
         ys.append(np.concatenate([lower[part], upper[part][::-1]]))
     return {"x": xs, "y": ys}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ from bwbayes.app.figures.style import (
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.bands import Bands, Kind
 
-__all__ = ["along", "draw_loop"]
+__all__ = ["along", "draw_loop", "one_way"]
 
 SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
 
@@ -90,17 +90,26 @@ def along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
 
 
 def _ribbon(x: FloatArray, lower: FloatArray, upper: FloatArray, kind: Kind) -> PolyCollection:
-    """Return a band along a path that may turn back: one quadrilateral from sample to sample.
+    """Return a band along a path that may turn back: a polygon from each turn to the next.
 
     Opaque, because what overlaps where the path turns must not look like a denser band.
     """
-    corners = ((x[:-1], lower[:-1]), (x[1:], lower[1:]), (x[1:], upper[1:]), (x[:-1], upper[:-1]))
-    # One array goes faster than the sequence of arrays that the type asks for.
-    vertices: Any = np.moveaxis(np.asarray(corners), 2, 0)
     colour = BAND_COLOURS[kind]
+    corners = [
+        np.stack([np.append(x[part], x[part][::-1]), np.append(lower[part], upper[part][::-1])], 1)
+        for part in one_way(x)
+    ]
     return PolyCollection(
-        vertices, facecolor=colour, edgecolor=colour, linewidth=0.4, label=BAND_NAMES[kind]
+        corners, facecolor=colour, edgecolor=colour, linewidth=0.4, label=BAND_NAMES[kind]
     )
+
+
+def one_way(voltage: FloatArray) -> list[slice]:
+    """Return the stretches of a voltage from turn to turn, each with the samples at its ends."""
+    rising = np.diff(voltage) > 0
+    turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
+    edges = [0, *turns.tolist(), voltage.size - 1]
+    return [slice(first, last + 1) for first, last in itertools.pairwise(edges)]
 
 
 def _zoom(whole: Axes, tip: Axes, bands: Bands) -> None:

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.mathtext import MathTextParser
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.bands import Bands, Kind
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = [
     "BAND_COLOURS",
@@ -44,7 +45,7 @@ __all__ = [
 
 STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
-    "savefig.dpi": 150,
+    "savefig.dpi": 120,
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "mathtext.fontset": "dejavusans",
@@ -97,6 +98,8 @@ def plain(text: str) -> str:
 
 def axis_label(parameter: Parameter) -> str:
     """Return a parameter's symbol and unit for an axis; its name if the symbol is no mathtext."""
+    from matplotlib.mathtext import MathTextParser  # noqa: PLC0415  # pages need units alone
+
     symbol = f"${parameter.label}$"
     try:
         MathTextParser("path").parse(symbol)

@@ -36,15 +36,15 @@ def drawn(path: Path) -> tuple[Problem, FloatArray]:
 
 
 def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
-    """Return the voltages that may be used: those given, or those of the record, V.
+    """Return the voltages that may be used: those given, or those of all that was fitted, V.
 
     Raises
     ------
     InputError
         They are none.
     """
-    voltage = problem.record.voltage
-    low, high = given or (float(np.min(voltage)), float(np.max(voltage)))
+    ranges = np.array([record.range_voltage for record in problem.records.values()])
+    low, high = given or (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
     return Span(low, high)

@@ -19,8 +19,10 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, ModelConfig, dump
 from bwbayes.app.config.models import slug
+from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.records import training_records
 from bwbayes.app.report.comparison_report import render
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import scoring
@@ -32,6 +34,7 @@ from bwbayes.comparison.choice import Comparison, choose
 from bwbayes.comparison.evidence import evidence
 from bwbayes.comparison.future import future, joint_log_score
 from bwbayes.comparison.table import numbers, table
+from bwbayes.data import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.table import Table
@@ -113,9 +116,10 @@ def compare_models(
         The config, its records or a folder cannot be used, or a folder has another run.
     """
     _require_free(out, overwrite)
-    plain = resolve(config.model_copy(update={"parameters": {}, "truth": {}}), where)
+    _, wholes = joined(config, training_records(config, where, {})[0])
+    records = list(wholes.values())
     problems = {
-        name: resolve(_with_model(config, model, name, plain), where)
+        name: resolve(_with_model(config, model, name, records), where)
         for name, model in models.items()
     }
     runs = []
@@ -131,15 +135,19 @@ def compare_models(
     return made
 
 
-def _with_model(config: Config, model: ModelConfig, name: str, plain: Problem) -> Config:
-    """Return the config with another model, and of its parameters those that this model has."""
-    actuator = actuator_of(model, plain.record)
-    names = Table(actuator, noise_model(model.noise, plain.record.interval)).names
-    changes = {
+def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
+    """Return the config with another model, and of what it says of parameters what that has."""
+    actuator = actuator_of(model, records[0], records)
+    names = Table(actuator, noise_model(model.noise, records[0].interval)).names
+    known = {
         key: {p: given for p, given in getattr(config, key).items() if _plain(p) in names}
         for key in ("parameters", "truth")
     }
-    return config.model_copy(update={"model": model, "name": name, **changes})
+    scopes = {
+        key: [p for p in getattr(model, key) if p in names] for key in ("per_record", "shared")
+    }
+    changes = {"model": model.model_copy(update=scopes), "name": name, **known}
+    return config.model_copy(update=changes)
 
 
 def _plain(name: str) -> str:

@@ -8,12 +8,13 @@ parameter band's width along a drive; the best goes into a file for the signal g
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -21,18 +22,19 @@ from rich.table import Table
 from bwbayes.app.config.config import SignalConfig
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.proposal import read_recognised
+from bwbayes.app.figures import save_one
+from bwbayes.app.figures.design import draw_design
+from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
 from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
-from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import finished
+from bwbayes.app.report.design_report import render
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.comparison.design import Promise, promises, ranked
+from bwbayes.comparison.design import Asked, Promise, promises, ranked
 from bwbayes.data import Record, write_record
 from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal, signal_names
-from bwbayes.errors import InputError, NotConvergedError
-from bwbayes.model.drive import time_between_turns
+from bwbayes.errors import InputError
+from bwbayes.model.drive import time_between_turns, turning_points
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.outputs import write_summary
-from bwbayes.sampling.sampler import draws
 
 __all__ = [
     "PRESET",
@@ -40,11 +42,14 @@ __all__ = [
     "candidates_of",
     "design",
     "design_draws",
+    "liveliest",
     "preset",
     "promised",
 ]
 
 PRESET = "standard"
+
+FILES = ("best.csv", "design.html", "design.json")
 
 # A decaying drive loses all but this part of its amplitude by its end.
 LEFT = 0.1
@@ -74,7 +79,7 @@ def design(
     path
         The run's folder.
     out
-        Where ``design.json`` and ``best.csv`` go.
+        Where ``best.csv``, ``design.json`` and the page ``design.html`` with its pictures go.
     console
         Where the table goes.
     candidates
@@ -93,15 +98,10 @@ def design(
     NotConvergedError
         The run has not converged.
     """
-    for name in ("design.json", "best.csv"):
-        if (out / name).exists() and not overwrite:
-            raise InputError(f"{out / name}: exists; choose another --out, or give --overwrite")
+    refuse_existing([out / name for name in FILES], overwrite)
     if (parameter is None) == (drive is None):
         raise InputError("design: give either --parameter or --drive")
-    problem, chain, outcome = finished(RunFolder.open(path))
-    if not outcome.converged:
-        raise NotConvergedError(f"{path}: has not converged, so nothing is known to start from")
-    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    problem, flat = drawn(path)
     amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
     signals = candidates_of(candidates, problem, amplifier)
     target = parameter if drive is None else _drive(drive, problem)
@@ -112,28 +112,49 @@ def design(
             f"design: the amplifier can make none of the candidates; {made[0].name} "
             f"{made[0].refused}"
         )
-    best = Record(signals[made[0].name], None, problem.record.interval, voltage_is="command")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_record(best, out / "best.csv")
-        write_summary(
-            out / "design.json",
-            {
-                "target": parameter or drive,
-                "best": made[0].name,
-                "amplifier": asdict(amplifier),
-                "candidates": [asdict(one) for one in made],
-            },
-        )
-    except OSError as error:
-        raise InputError(f"{out}: {error.strerror}; choose another folder with --out") from None
-    table = Table("candidate", f"sd left of {escape(str(parameter or drive))}", "remark")
+    interval = problem.records[liveliest(problem)].interval
+    asked = Asked(path.name, parameter, drive, amplifier, signals, interval)
+    write(asked, made, out)
+    table = Table("candidate", asked.left, "remark", box=box.SIMPLE_HEAD)
     for one in made:
         left = "-" if one.refused else f"{one.left:.1%} ± {one.error:.1%}"
         table.add_row(escape(one.name), left, escape(one.refused))
     console.print(table)
     console.print(f"wrote {out / 'best.csv'}: {made[0].name}", highlight=False, soft_wrap=True)
+    console.print(f"report: {out / 'design.html'}", highlight=False, soft_wrap=True)
     return made
+
+
+def write(asked: Asked, made: Sequence[Promise], out: Path) -> None:
+    """Write the best signal's file, the page and the numbers to a folder.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    best = Record(asked.signals[made[0].name], None, asked.interval, voltage_is="command")
+    command, page, numbers = (out / name for name in FILES)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_record(best, command)
+        pictures = {}
+        for name, figure in draw_design(asked, made).items():
+            picture = out / f"{name}.png"
+            save_one(figure, picture)
+            pictures[name] = picture.read_bytes()
+        page.write_text(render(asked, made, pictures), encoding="utf-8")
+        write_summary(
+            numbers,
+            {
+                "target": asked.target,
+                "best": made[0].name,
+                "amplifier": asdict(asked.amplifier),
+                "candidates": [asdict(one) for one in made],
+            },
+        )
+    except OSError as error:
+        raise InputError(f"{out}: {error.strerror}; choose another folder with --out") from None
 
 
 def design_draws(
@@ -156,8 +177,8 @@ def design_draws(
     target
         A parameter's name, or a drive (samples,), V, whose parameter band is to be narrow.
     candidates
-        Voltages (samples,) by name, V, at the fitted record's interval, from rest; by default the
-        preset.
+        Voltages (samples,) by name, V, at the fitted record's interval (of several that whose
+        voltage turns most), from rest; by default the preset.
     voltage, slew, current, capacitance
         What the amplifier can do: V, V/s, A, F.
 
@@ -184,11 +205,16 @@ def promised(
 ) -> list[Promise]:
     """Return what signals (samples,) promise, the best first."""
     source = generator(problem.config.seed, "design")
-    # Of several records, what all of them taught of the actuator, seen from the first.
-    first = next(iter(problem.records))
-    posterior = problem.posterior.alone(first)
-    its = problem.posterior.its(flat, first)
+    # Of several records, what all of them taught of the actuator, seen from one.
+    name = liveliest(problem)
+    posterior = problem.posterior.alone(name)
+    its = problem.posterior.its(flat, name)
     return ranked(promises(posterior, its, signals, target, amplifier, source))
+
+
+def liveliest(problem: Problem) -> str:
+    """Return the name of the fitted record whose voltage turns most: the new one is to be alike."""
+    return max(problem.records, key=lambda name: turning_points(problem.records[name].voltage).size)
 
 
 def amplifier_of(
@@ -198,21 +224,22 @@ def amplifier_of(
     current: float | None,
     capacitance: float | None,
 ) -> Limits:
-    """Return the amplifier; by default with the voltages of the fitted record alone."""
-    known = problem.record.voltage
-    low, high = voltage or (float(np.min(known)), float(np.max(known)))
-    return Limits(low, high, np.inf if slew is None else slew, current, capacitance)
+    """Return the amplifier; by default with the voltages that were fitted alone."""
+    if voltage is None:
+        span = limits_of(problem, None)
+        voltage = span.low, span.high
+    return Limits(*voltage, np.inf if slew is None else slew, current, capacitance)
 
 
 def candidates_of(candidates: str, problem: Problem, amplifier: Limits) -> dict[str, FloatArray]:
-    """Return the candidates' voltages (samples,) by name, V, at the fitted record's interval.
+    """Return the candidates' voltages (samples,) by name, V, at the liveliest record's interval.
 
     Raises
     ------
     InputError
         A file that cannot be read, or has no signal.
     """
-    rate = 1 / problem.record.interval
+    rate = 1 / problem.records[liveliest(problem)].interval
     given = candidates != PRESET
     waveforms = _from_file(Path(candidates)) if given else preset(problem, amplifier)
     return {name: waveform.sample(rate)[1] for name, waveform in waveforms.items()}
@@ -221,10 +248,10 @@ def candidates_of(candidates: str, problem: Problem, amplifier: Limits) -> dict[
 def preset(problem: Problem, amplifier: Limits) -> dict[str, Waveform]:
     """Return sines and triangles, steady and decaying, small and slow, and a staircase.
 
-    They are as long as the fitted record, about the middle of the amplifier's range, and turn as
-    often as the fitted drive, or as often as the amplifier allows.
+    They are as long as the fitted record, of several the liveliest, about the middle of the
+    amplifier's range, and turn as often as its drive, or as often as the amplifier allows.
     """
-    record = problem.record
+    record = problem.records[liveliest(problem)]
     duration = record.duration
     half, middle = (amplifier.high - amplifier.low) / 2, (amplifier.high + amplifier.low) / 2
     usual = 0.5 / time_between_turns(record.voltage, record.interval)
@@ -271,13 +298,13 @@ def _from_file(path: Path) -> dict[str, Waveform]:
 
 
 def _drive(name: str, problem: Problem) -> FloatArray:
-    """Return the voltage of a signal's name or of a record's file, at the fitted interval."""
-    rate = 1 / problem.record.interval
+    """Return the voltage of a signal's name or of a record's file, at the liveliest's interval."""
+    interval = problem.records[liveliest(problem)].interval
     if name in signal_names():
-        return signal(name).sample(rate)[1]
+        return signal(name).sample(1 / interval)[1]
     record = read_recognised(Path(name))
-    if not np.isclose(record.interval, problem.record.interval, rtol=1e-6):
-        times = np.arange(0.0, record.duration, problem.record.interval)
+    if not np.isclose(record.interval, interval, rtol=1e-6):
+        times = np.arange(0.0, record.duration, interval)
         since = record.interval * np.arange(record.samples)
         along: FloatArray = np.interp(times, since, record.voltage)
         return along

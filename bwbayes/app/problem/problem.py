@@ -16,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from bwbayes.app.config.config import ALONE, Config, RecordConfig
+from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, explicit_model
 from bwbayes.app.problem.parameters import (
     as_config,
@@ -28,6 +29,7 @@ from bwbayes.app.problem.records import (
     findings_of,
     generator,
     other_record,
+    require_different,
     sampled_waveform,
     start_of,
     training_records,
@@ -147,7 +149,9 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         warnings.simplefilter("always", InputWarning)
         given = records or {}
         fitted, stand = training_records(config, folder, given)
+        config, fitted = joined(config, fitted)
         windows = {name: windows_of(config, name, record) for name, record in fitted.items()}
+        require_different(fitted, windows)
         others = {
             name: other_record(config, name, folder, fitted, given.get(name))
             for name, validation in config.validation.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.stand import planned, stand_of
 from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect
-from bwbayes.data.record import require_readable
+from bwbayes.data.record import Window, require_readable
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import (
     Carrier,
@@ -38,10 +39,12 @@ __all__ = [
     "findings_of",
     "generator",
     "other_record",
+    "require_different",
     "sampled_waveform",
     "start_of",
     "training_records",
     "unlike",
+    "whole",
     "windows_of",
 ]
 
@@ -99,14 +102,22 @@ def training_records(
         purpose = "record" if name == ALONE else f"record {name}"
         made = stand.run(waveform, generator(config.seed, purpose))
         read[name] = _named(made, config.records[name].signal)
-    records = {name: _cut(config.records[name], record) for name, record in read.items()}
+    records = {
+        name: _cut(config.records[name], record, place_of(name)) for name, record in read.items()
+    }
     for name, record in records.items():
         require_readable(record, place_of(name))
     return records, stand
 
 
-def _cut(source: RecordConfig, record: Record) -> Record:
+def _cut(source: RecordConfig, record: Record, place: str) -> Record:
     """Leave out the readings that a config leaves out."""
+    if source.outliers:
+        rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
+        if rows.min() < 0 or rows.max() >= record.samples:
+            end = record.start + record.duration
+            raise InputError(f"{place}.outliers: a time outside of {record.start:g} to {end:g} s")
+        record = record.without(rows.astype(np.int64))
     if source.exclude is not None:
         record = record.exclude([(window[0], window[1]) for window in source.exclude])
     if source.start is not None or source.stop is not None:
@@ -181,6 +192,12 @@ def _named(record: Record, wanted: str | SignalConfig | None) -> Record:
     return replace(record, origin=f"{record.origin}, {name} signal")
 
 
+def whole(record: Record) -> Window:
+    """Return the window in s of all readings of a record."""
+    first, last = np.flatnonzero(record.has_reading)[[0, -1]]
+    return float(record.time[first]), float(record.time[last]) + record.interval
+
+
 def windows_of(config: Config, name: str, record: Record) -> Windows:
     """Return the windows of a training record.
 
@@ -196,10 +213,17 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
         if v.window and not v.another and v.of in (name, None)
     }
     if source.train is None:
-        first, last = np.flatnonzero(record.has_reading)[[0, -1]]
-        train = [(float(record.time[first]), float(record.time[last]) + record.interval)]
+        train = [whole(record)]
     else:
         train = [(window[0], window[1]) for window in source.train]
+    for where, edges in (
+        *((f"{place}.train", one) for one in train),
+        *((f"validation.{n}.window", (one[0], one[1])) for n, one in held_out.items()),
+    ):
+        try:
+            record.window_slice(*edges)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
     try:
         split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
     except InputError as error:
@@ -214,6 +238,27 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
                 f"start, exclude and decimate in [{place}]"
             )
     return Windows(split.training, dict(zip(held_out, split.held_out, strict=True)))
+
+
+def require_different(records: Mapping[str, Record], windows: Mapping[str, Windows]) -> None:
+    """Refuse readings that would count twice: one record under two names.
+
+    Raises
+    ------
+    InputError
+        The same measurement is fitted twice, in windows that overlap.
+    """
+    for (name, one), (other, two) in combinations(records.items(), 2):
+        overlap = any(
+            a.start < b.stop and b.start < a.stop
+            for a in windows[name].training
+            for b in windows[other].training
+        )
+        if overlap and one.sha256 == two.sha256:
+            raise InputError(
+                f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
+                "would count twice; remove one, or give them other windows"
+            )
 
 
 def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:

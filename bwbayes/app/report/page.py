@@ -13,13 +13,15 @@ import struct
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from typing import NamedTuple
 from urllib.parse import quote
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-__all__ = ["Picture", "Table", "picture", "template"]
+__all__ = ["Picture", "Plots", "Script", "Table", "picture", "template"]
 
 # What a cell with a number begins with, or what stands for a number that is not known.
 NUMBER = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
@@ -65,6 +67,28 @@ def picture(
     known = png.startswith(PNG_MARK) and len(png) >= 24
     width, height = struct.unpack(">2I", png[16:24]) if known else (0, 0)
     return Picture(name, title, caption, alt or title, source, width, height, plot)
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script of the page, and the digest by which the page allows it and no other."""
+
+    text: Markup
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256, as a Content-Security-Policy names it."""
+        return "sha256-" + b64encode(sha256(self.text.encode()).digest()).decode("ascii")
+
+
+class Plots(NamedTuple):
+    """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
+
+    What makes either is ``bwbayes.app.figures.interactive``.
+    """
+
+    drawn: Mapping[str, Markup]
+    scripts: Sequence[Script]
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ says nothing of parameters or displacement.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
-from bwbayes.app.report.page import Picture, picture, template
+from bwbayes.app.report.page import Picture, Plots, picture, template
 from bwbayes.app.report.words import covered
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -30,7 +30,8 @@ LEVEL = 95  # %, of the bands that the answer speaks of
 def render(
     result: Result,
     summary: Mapping[str, Any],
-    pictures: Mapping[str, bytes] | Callable[[], Mapping[str, bytes]],
+    pictures: Mapping[str, bytes],
+    plots: Plots | None = None,
 ) -> str:
     """Return the report's page.
 
@@ -43,18 +44,19 @@ def render(
         ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
         ``go_on``, the command that goes on.
     pictures
-        PNG files by the name of their figure, in their order, or what returns them: it is called
-        last.
+        PNG files by the name of their figure, in their order.
+    plots
+        What :func:`bwbayes.app.figures.interactive.made` returns of the run, if that was called.
     """
-    from bwbayes.app.figures import interactive  # noqa: PLC0415  # bokeh is slow to load
+    if plots is None:
+        from bwbayes.app.figures import interactive  # noqa: PLC0415  # bokeh is slow to load
 
+        plots = interactive.made(result)
     converged = result.outcome.converged
     check = result.outcome.check
-    plots = interactive.draw(result) if converged else {}
-    drawn = pictures() if callable(pictures) else pictures
     shown = {
-        name: picture(png, name, *caption(name), plots.get(name, ""))
-        for name, png in drawn.items()
+        name: picture(png, name, *caption(name), plots.drawn.get(name, ""))
+        for name, png in pictures.items()
         if converged or name in OF_THE_CHAIN
     }
     held_out_first = sorted(result.bands, key=lambda bands: bands.training)
@@ -88,7 +90,7 @@ def render(
             if parameter.declared is not None and parameter.declared.stated_bounds
         ],
         pictures=shown,
-        scripts=interactive.scripts() if any(one.plot for one in shown.values()) else [],
+        scripts=plots.scripts if any(one.plot for one in shown.values()) else [],
         evidence=_in_order(shown, [f"bands_{one.name}" for one in held_out_first]),
         facts=[*result.facts.items(), *_circumstances(summary)],
     )

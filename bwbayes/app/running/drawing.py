@@ -1,20 +1,23 @@
 """Draw a run's pictures in a process beside this one, while this one predicts and writes.
 
-The figures of the draws are drawn while predictions are made, those of the predictions while the
-draws and bands are written. The pictures are the same as drawn in one process.
+Each picture is begun as soon as what it shows is known: the draws before predictions are made, the
+bands before they are judged. The pictures are the same as drawn in one process.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+import sys
+import threading
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
-from bwbayes.app.figures import Drawings, of_draws, of_predictions, pictures, save_pictures
-from bwbayes.app.running.workers import executor
+from bwbayes.app.figures import Drawing, drawings, picture_of, prepare, save_pictures
+from bwbayes.app.report.page import Plots
+from bwbayes.app.running.workers import Processes, ended
 from bwbayes.results.result import Result
 
 __all__ = ["Beside", "beside"]
@@ -25,31 +28,37 @@ class Beside:
 
     def __init__(self, pool: Executor) -> None:
         self.pool = pool
-        self.early: Future[dict[str, bytes]] | None = None
-        pool.submit(_prepare)
+        self.pictured: dict[str, Future[bytes]] = {}
+        self.plotted: Future[Plots] | None = None
+        pool.submit(prepare)
 
-    def begin(self, result: Result) -> None:
-        """Begin with the figures of the draws; predictions may be missing yet."""
-        self.early = self.pool.submit(_drawn, of_draws, result)
+    def draw(self, result: Result) -> None:
+        """Begin with all that can be seen of a result, but for what was begun before."""
+        for name, draw in drawings(result).items():
+            if name not in self.pictured:
+                self.pictured[name] = self.pool.submit(picture_of, draw)
+        if self.plotted is None and result.bands:
+            self.plotted = self.pool.submit(_plots_of, result)
 
-    def pictures(self, result: Result, folder: Path) -> Callable[[], dict[str, bytes]]:
-        """Go on with the figures of predictions.
+    def pictures(self, result: Result, folder: Path) -> dict[str, bytes]:
+        """Wait until all are drawn, write them to the folder, and return PNG by name."""
+        self.draw(result)
+        every = {name: self._picture(name, draw) for name, draw in drawings(result).items()}
+        save_pictures(every, folder)
+        return every
 
-        What it returns waits until all are drawn, writes them to the folder, and returns PNG by
-        name.
-        """
-        early = self.early or self.pool.submit(_drawn, of_draws, result)
-        late = self.pool.submit(_drawn, of_predictions, result)
+    def plots(self, result: Result) -> Plots:
+        """Wait until the plots to zoom and hover are made, and return them."""
+        try:
+            return _plots_of(result) if self.plotted is None else self.plotted.result()
+        except BrokenProcessPool:
+            return _plots_of(result)
 
-        def drawn() -> dict[str, bytes]:
-            try:
-                every = late.result() | early.result()
-            except BrokenProcessPool:  # nothing is lost that this process cannot draw
-                every = pictures(of_predictions(result) | of_draws(result))
-            save_pictures(every, folder)
-            return every
-
-        return drawn
+    def _picture(self, name: str, draw: Drawing) -> bytes:
+        try:
+            return self.pictured[name].result()
+        except BrokenProcessPool:  # nothing is lost that this process cannot draw
+            return picture_of(draw)
 
 
 @contextmanager
@@ -58,14 +67,13 @@ def beside(workers: int | None, *, asked: bool) -> Iterator[Beside | None]:
     if not asked or 1 in (workers, os.cpu_count()):
         yield None
         return
-    with executor(1, how="processes") as pool:
+    # What is loaded here need not be loaded there, where a process may be copied while it runs.
+    copied = sys.platform == "linux" and threading.active_count() == 1
+    with ended(Processes(1, "fork" if copied else "spawn")) as pool:
         yield Beside(pool)
 
 
-def _prepare() -> None:
-    """Load what is slow to load, before there is anything to draw."""
-    import corner  # noqa: F401, PLC0415
+def _plots_of(result: Result) -> Plots:
+    from bwbayes.app.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
 
-
-def _drawn(which: Callable[[Result], Drawings], result: Result) -> dict[str, bytes]:
-    return pictures(which(result))
+    return interactive.made(result)

@@ -11,44 +11,34 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.figures import draw_all, save
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.report.report import render
+from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.drawing import Beside, beside
-from bwbayes.app.running.facts import facts_of, stepped
-from bwbayes.app.running.fingerprint import fingerprint, require_same, version_remarks, versions
+from bwbayes.app.running.fingerprint import fingerprint, require_same, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import judged, predictions, scoring
+from bwbayes.app.running.predictions import judged, predictions
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import conflict, pointfit
+from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results import agreement, identifiability, innovations
-from bwbayes.results.learned import learned
-from bwbayes.results.loops import measure_loops
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
-from bwbayes.results.prediction import thinned
-from bwbayes.results.refit import without_start
-from bwbayes.results.replicated import replicated
 from bwbayes.results.result import Result, summary
-from bwbayes.results.scores import score
-from bwbayes.results.steps import measure_steps
-from bwbayes.results.verdict import Background
-from bwbayes.sampling.sampler import Outcome, draws, first_chain, log_densities, sample
+from bwbayes.sampling.sampler import Outcome, first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
 __all__ = [
@@ -107,10 +97,11 @@ def carry_on(
     engine: Engine | None = None,
     how: str | Executor | None = None,
     apart: bool = False,
+    show: Callable[[Problem], None] | None = None,
 ) -> Result:
     """Finish a run and write its files, as :func:`go_on` does; return the result."""
     to = partial(go_on, ess=ess, steps=steps, engine=engine)
-    return to(folder, console, workers=workers, how=how, apart=apart).result
+    return to(folder, console, workers=workers, how=how, apart=apart, show=show).result
 
 
 def go_on(
@@ -124,6 +115,7 @@ def go_on(
     files: bool = True,
     how: str | Executor | None = None,
     apart: bool = False,
+    show: Callable[[Problem], None] | None = None,
 ) -> Run:
     """Finish a run.
 
@@ -146,6 +138,8 @@ def go_on(
         Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
     apart
         Draw in a process of its own, if there may be several: sooner, and the same pictures.
+    show
+        Is called with the problem before anything is done with it.
 
     Raises
     ------
@@ -153,11 +147,13 @@ def go_on(
         The folder's files do not fit together, or another process is writing them.
     """
     begun = time.monotonic()
-    drawing = beside(workers, asked=apart and files)
-    with folder.locked(), one_thread(), drawing as artist:
+    # First of all: it goes on from this process as it is now.
+    with beside(workers, asked=apart and files) as artist, folder.locked(), one_thread():
         if any(one is not None for one in (ess, steps, engine)):
             _retarget(folder, ess, steps, engine)
         problem = load_run(folder)
+        if show is not None:
+            show(problem)
         with (
             _chain(folder, problem, console, engine) as chain,
             executor(workers, problem.posterior.engine, how) as pool,
@@ -267,91 +263,6 @@ def _retarget(
     draft.replace(folder.config)
 
 
-def assemble(
-    problem: Problem, chain: ChainFile, outcome: Outcome, artist: Beside | None = None
-) -> Result:
-    """Put a result together: draws, remarks and, if the chain has converged, predictions."""
-    posterior = problem.posterior
-    sampled = draws(posterior, chain)
-    flat = sampled.reshape(-1, sampled.shape[-1])
-    remarks = [
-        *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
-        *problem.remarks,
-        *outcome.remarks,
-        *conflict.conflicts(posterior.prior, flat, problem.defaults),
-        *identifiability.remarks(posterior, chain.point, flat),
-    ]
-    _, alone, its = next(posterior.each(flat))
-    columns = alone.table.columns(alone.prior.theta(its))
-    remarks += alone.only.actuator.hysteresis.remarks(columns, alone.names)
-    result = Result(
-        name=problem.config.name or "run",
-        outcome=outcome,
-        parameters=problem.parameters,
-        draws=sampled,
-        log_density=log_densities(chain),
-        moves=chain.moves("sampling"),
-        facts=facts_of(problem, chain),
-        remarks=tuple(remarks),
-        truth=problem.config.truth,
-    )
-    if artist is not None:
-        artist.begin(result)
-    if not outcome.converged:
-        return result
-    chosen = thinned(flat, generator(problem.config.seed, "draws"))
-    bands = predictions(problem, result)
-    best = flat[int(np.argmax(result.log_density))]
-    series = {
-        name: innovations.innovations(alone, one[0], problem.records[name].start)
-        for name, alone, one in posterior.each(best[np.newaxis])
-    }
-    # By a second point fit, without a record's start.
-    source = generator(problem.config.seed, "without start")
-    some = thinned(flat, source)
-    moved = {
-        name: without_start(
-            posterior,
-            some,
-            source,
-            record.start,
-            record=name,
-            seen=any(one.kind == "switch-on transient" for one in problem.findings[name]),
-        )
-        for name, record in problem.records.items()
-    }
-    begin = {name: record.start for name, record in problem.records.items()}
-    compared = agreement.agreements(
-        posterior, chain.point, generator(problem.config.seed, "agreement"), begin
-    )
-    several = len(problem.records) > 1
-    odd = [
-        f"{name}: {remark}" if several else remark
-        for name, one in series.items()
-        for remark in innovations.remarks(one)
-    ]
-    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
-    return replace(
-        result,
-        bands=bands,
-        scores={
-            one.name: score(one, scoring(problem.config.seed, one))
-            for one in bands
-            if one.name in verdicts
-        },
-        verdicts=verdicts,
-        innovations=series,
-        loops=measure_loops(posterior, chosen),
-        steps=measure_steps(posterior, chosen, stepped(problem)),
-        agreement=compared,
-        learned=learned(posterior.prior, sampled, result.log_density, source),
-        replicated={
-            one.name: replicated(posterior, chosen, source, one.name) for one in posterior.datasets
-        },
-        remarks=(*result.remarks, *agreement.remarks(compared), *odd),
-    )
-
-
 def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
     """Return the log likelihood of each draw, nats, shaped as ``result.log_density``."""
     prior = posterior.prior
@@ -387,13 +298,17 @@ def write_files(
     """Write all files of a run; the summary last, as the sign that all is done."""
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
-    apart = None if artist is None else artist.pictures(result, figures)
+    if artist is not None:
+        artist.draw(result)
     numbers = numbers_of(folder, problem, result, seconds)
     density = log_likelihood(problem.posterior, result)
     write_posterior(folder.path / "posterior.nc", result, density, problem.records)
     (folder.path / "bands.csv").unlink(missing_ok=True)
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)
-    page = render(result, numbers, apart or (lambda: save(draw_all(result), figures)))
+    if artist is None:
+        page = render(result, numbers, save(draw_all(result), figures))
+    else:
+        page = render(result, numbers, artist.pictures(result, figures), artist.plots(result))
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

@@ -11,12 +11,13 @@ import os
 import pickle
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import cloudpickle
 from threadpoolctl import threadpool_limits
@@ -24,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 
-__all__ = ["KINDS", "Processes", "executor", "one_thread", "side_by_side"]
+__all__ = ["KINDS", "Processes", "ended", "executor", "one_thread", "side_by_side"]
 
 
 # What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
@@ -76,8 +77,13 @@ def executor(
     if kind == "local":
         kind = "processes" if count > 1 and engine == "numpy" else "threads"
         count = count if engine == "numba" or kind == "processes" else 1
-    own: Processes | ThreadPoolExecutor
-    own = Processes(count) if kind == "processes" else ThreadPoolExecutor(count)
+    with ended(Processes(count) if kind == "processes" else ThreadPoolExecutor(count)) as own:
+        yield own
+
+
+@contextmanager
+def ended(own: Executor) -> Iterator[Executor]:
+    """Give an executor, and end it when all is done, or at once if that is interrupted."""
     try:
         yield own
     except BaseException:
@@ -131,16 +137,25 @@ class Processes(Executor):
 
     Every call here is a pure function, or goes on from where it stands on disk, so a second time
     gives the same. A call under which processes died ``TRIES`` times is given up.
+
+    Parameters
+    ----------
+    count
+        How many.
+    method
+        "spawn" starts Python in each; "fork" copies this process as it is, at once and with all
+        that it has loaded, which only a process without other threads may do. Those that replace
+        others are spawned.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, method: Literal["spawn", "fork"] = "spawn") -> None:
         self.count = count
         self.lock = threading.Lock()
         self.closed = False
         # Pools that broke are kept: Python's end of one waits for ever for its own lock if the last
         # reference to it goes meanwhile.
         self.broken: list[ProcessPoolExecutor] = []
-        self.pool = self._started()
+        self.pool = self._started(method)
 
     @property
     def processes(self) -> list[int]:
@@ -166,17 +181,20 @@ class Processes(Executor):
             self.closed = True
         self.pool.shutdown(wait=wait, cancel_futures=cancel_futures)
 
-    def _started(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
+    def _started(self, method: str) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context(method)
         pool = ProcessPoolExecutor(self.count, mp_context=context, initializer=_settle)
-        _start(pool, self.count)
+        with warnings.catch_warnings():
+            # Python warns of any thread; those of the linear algebra library stop for a fork.
+            warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)
+            _start(pool, self.count)
         return pool
 
     def _replace(self, broken: ProcessPoolExecutor) -> None:
         """Start processes in place of those, if nobody has."""
         if self.pool is broken:
             self.broken.append(broken)
-            self.pool = self._started()
+            self.pool = self._started("spawn")
 
     def _send(self, future: Future[Any], call: bytes, tried: int) -> None:
         """Make a call, once more if its process dies."""

@@ -44,8 +44,11 @@ __all__ = ["sums"]
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
 
+# Fewer until the filter has settled and forgotten the start, which is looked at after each piece.
+SHORT_PIECE = 16
+
 # What is below this part of its size at the start adds nothing.
-FORGOTTEN = 1e-20
+FORGOTTEN = 1e-18
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -226,8 +229,9 @@ def _group(
         left[offset + k], series[offset + k] = lags[k, 2], 1 + offset + free + k
     now, settled, heard, tracked = 0, False, True, False
     while now < voltage.size:
-        last = min(now + PIECE, voltage.size)
-        plain = settled and tracked and not heard and skipped[now] == 0.0
+        steady = settled and tracked and not heard
+        last = min(now + (PIECE if steady else SHORT_PIECE), voltage.size)
+        plain = steady and skipped[now] == 0.0
         if plain:
             # As far as every sample has a reading.
             end = now

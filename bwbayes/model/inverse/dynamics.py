@@ -53,6 +53,11 @@ def undone(
         later: FloatArray = lfilter(denominator, numerator[1:], forced)[1:]
         last = later[-1:] if later.size else np.zeros(1)
         return np.concatenate([later, last])
+    if numerator.size == denominator.size == 1:
+        return np.asarray(forced / numerator[0])
+    # Then no zero lies outside of the unit circle; to look for them takes as long as the filter.
+    if np.abs(numerator[1:]).sum() < numerator[0]:
+        return np.asarray(lfilter(denominator, numerator, forced))
     zeros = np.roots(numerator)
     outside = zeros[np.abs(zeros) > 1]
     if not outside.size:

@@ -1,30 +1,80 @@
-"""Many n = 1 Bouc-Wen models read backwards side by side, sample by sample.
+"""Many models read backwards side by side.
 
 One model is inverted fastest along whole stretches. Of a thousand draws each has its own voltage
-and its own turns, and then one sample of all of them at a time is several times faster.
+and its own turns, and then one sample of all of them at a time is many times faster:
+:func:`followed`, for whatever has a step. n = 1 Bouc-Wen models, :func:`voltages`, go even some
+samples at a time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.model.inverse.stepped import DriveStep
 
-__all__ = ["able", "voltages"]
+__all__ = ["able", "followed", "voltages"]
 
 # Stands for a rate of zero, 1/V.
 TINY = 1e-100
 
-# Newton's steps double the digits: after one below this part of 1/c, V, all of them are right.
+# A step of Newton's below this part of 1/c, V, doubles the digits to more than there are.
 CLOSE = 1e-8
 
-# Samples that are turned round at a time.
-PIECE = 64
+# Samples that are turned round at a time, those of them that are looked for at once, and the steps
+# that these get.
+SLAB, PIECE, STEPS = 64, 16, 2
 
-# Rounds of Newton; two are usual.
+# Rounds where these do not do; three are usual.
 ROUNDS = 50
+
+
+# Newton's rounds for a sample of all models; three are usual. A drive is met to this part of it.
+NEWTON, MET = 30, 4e-15
+
+
+def followed(
+    shaped: DriveStep, drive: FloatArray, memory: FloatArray, start: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the voltages (models, samples), V, of drives, and tell which models' are right.
+
+    Each next voltage is where Newton's rule meets the drive; models with which it does not, or
+    whose drive falls with the voltage there, are left out from there on.
+
+    Parameters
+    ----------
+    shaped
+        Hysteresis and gain.
+    drive
+        (models, samples), um.
+    memory, start
+        That of the steps (models, any), and the voltages (models,), V, where the paths start.
+    """
+    result = np.empty_like(drive)
+    close = MET * np.max(np.abs(drive), axis=1)
+    right = np.ones(start.size, dtype=np.bool_)
+    u, moved = start, np.zeros_like(start)
+    for first in range(0, drive.shape[1], SLAB):
+        asked = drive[:, first : first + SLAB].T.copy()
+        for t, goal in enumerate(asked):
+            guess = u + moved
+            for _ in range(NEWTON):
+                w, slope, after = shaped.go(memory, guess)
+                off = np.where(right, w - goal, 0.0)
+                far = np.abs(off) > close
+                if not far.any():
+                    break
+                right &= slope > 0
+                guess = guess - np.where(right, off / np.where(slope > 0, slope, 1.0), 0.0)
+            right &= ~far & (slope > 0)
+            moved = np.where(right, guess - u, 0.0)
+            u, memory = guess, after
+            asked[t] = u
+        result[:, first : first + SLAB] = asked.T
+    return result, right
 
 
 def able(column: Mapping[str, FloatArray], state: FloatArray) -> BoolArray:
@@ -48,6 +98,7 @@ def voltages(
     drive: FloatArray,
     state: FloatArray,
     start: float | None,
+    out: FloatArray | None = None,
 ) -> FloatArray:
     """Return the voltages (models, samples), V, at which d u − h is the drive.
 
@@ -61,77 +112,148 @@ def voltages(
         h (models,), um, where the path starts.
     start
         The voltage, V, at which it starts; None: at the first sample, whatever its voltage.
+    out
+        Where the voltages go, if not to an array of their own; it may be the drive.
 
     Notes
     -----
-    From one sample to the next, in direction s and with g = s h, v = |Δu| solves
-    d v − (α/c − g) (1 − exp(−c v)) = s Δw with c = β − γ while g < 0 and c = β + γ from there on.
-    Its left side is convex, or concave where h is beyond the ceiling, and rises with v, so that
-    Newton's method finds v from anywhere; it starts from the parabola that touches at v = 0.
+    From one sample to a later one, in direction s and with g = s h, v = |Δu| solves
+    d v − (α/c − g) (1 − exp(−c v)) = s Δw with c = β − γ while g < 0 and c = β + γ from there on,
+    by Newton's rule. That holds for some samples in a row, whose voltages are found together;
+    models that turn among them, or whose g passes zero, go from each sample to the next.
     """
     d, alpha, beta = (column[name] for name in ("d", "alpha", "beta"))
     gamma = column.get("gamma", np.zeros_like(beta))
-    against, ahead = np.maximum(beta - gamma, TINY), np.maximum(beta + gamma, TINY)
-    close = CLOSE / float(np.max(np.maximum(against, ahead)))
+    model = _Models(d, alpha, np.maximum(beta - gamma, TINY), np.maximum(beta + gamma, TINY))
     u = (drive[:, 0] + state) / d if start is None else np.full(d.size, start)
-    before = d * u - state
-    result = np.empty_like(drive)
-    h = state
-    # A sample of all models lies together, in pieces that a processor's cache holds.
-    for first in range(0, drive.shape[1], PIECE):
-        goals = drive[:, first : first + PIECE].T.copy()
-        for t, goal in enumerate(goals):
-            change = goal - before
-            s = np.where(change < 0, -1.0, 1.0)
-            g, rise = s * h, np.abs(change)
-            behind = g < 0
-            v = _moved(d, alpha, np.where(behind, against, ahead), g, rise, close)
-            u = u + s * v
-            h = d * u - goal
-            crossed = behind & (s * h > 0)
-            if crossed.any():
-                _cross(crossed, (d, alpha, against, ahead), (s, g, rise, v), u, close)
-                h = d * u - goal
-            before = goal.copy()
-            goals[t] = u
-        result[:, first : first + PIECE] = goals.T
+    result = np.empty_like(drive) if out is None else out
+    before, h = d * u - state, state
+    for first in range(0, drive.shape[1], SLAB):
+        # A sample of all models lies together.
+        slab = drive[:, first : first + SLAB].T.copy()
+        for start_of in range(0, len(slab), PIECE):
+            asked = slab[start_of : start_of + PIECE]
+            made, exact = _ahead(model, asked, before, u, h)
+            rows = np.flatnonzero(~exact)
+            if rows.size:
+                some = _Models(*(one[rows] for one in model))
+                made[:, rows] = _one_by_one(some, asked[:, rows], before[rows], u[rows], h[rows])
+            before, u = asked[-1].copy(), made[-1]
+            h = d * u - before
+            asked[:] = made
+        result[:, first : first + SLAB] = slab.T
     return result
 
 
-def _moved(
-    d: FloatArray,
-    alpha: FloatArray,
-    rate: FloatArray,
-    g: FloatArray,
-    rise: FloatArray,
-    close: float,
+class _Models(NamedTuple):
+    """d and α, um/V, and c while g = s h is below zero and above, 1/V, each (models,)."""
+
+    d: FloatArray
+    alpha: FloatArray
+    against: FloatArray
+    ahead: FloatArray
+
+
+def _ahead(
+    model: _Models, asked: FloatArray, before: FloatArray, u: FloatArray, h: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the voltages (samples, models) of drives that go one way, and whose are exact.
+
+    Before them the drive was ``before``, with a voltage u and h, (models,).
+    """
+    d, alpha, against, ahead = model
+    s = np.copysign(1.0, asked[-1] - before)
+    g = s * h
+    behind = g < 0
+    rate = np.where(behind, against, ahead)
+    curved = alpha - rate * g
+    rise = asked - before
+    rise *= s
+    exact = (rise[0] >= 0) & (np.diff(rise, axis=0).min(axis=0, initial=0.0) >= 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        v, last = _moved(d, rate, curved, rise, STEPS)
+        exact &= np.abs(last).max(axis=0) * rate <= CLOSE
+    v *= s
+    v += u
+    exact &= ~behind | (s * (d * v[-1] - asked[-1]) <= 0)
+    return v, exact
+
+
+def _one_by_one(
+    model: _Models, asked: FloatArray, before: FloatArray, u: FloatArray, h: FloatArray
 ) -> FloatArray:
-    """Return how far the voltages (models,) go, V, all with one rate each."""
-    missing = alpha / rate - g
-    curved = rate * missing
-    slope = d - curved
-    v = 2 * rise / (slope + np.sqrt(np.maximum(slope * slope + 2 * rate * curved * rise, 0.0)))
-    for _ in range(ROUNDS):
-        gone = np.expm1(-rate * v)
-        step = (d * v + missing * gone - rise) / (slope - curved * gone)
-        v = v - step
-        if np.max(np.abs(step)) <= close:
-            break
-    return v
+    """Return the voltages (samples, models) of any drives, as :func:`_ahead`."""
+    d, alpha, against, ahead = model
+    made = np.empty_like(asked)
+    for t, goal in enumerate(asked):
+        change = goal - before
+        s = np.copysign(1.0, change)
+        g = s * h
+        behind = g < 0
+        rate = np.where(behind, against, ahead)
+        rise = np.abs(change)
+        v, _ = _moved(d, rate, alpha - rate * g, rise, ROUNDS)
+        u = u + s * v
+        h = d * u - goal
+        rows = np.flatnonzero(behind & (s * h > 0))
+        if rows.size:
+            # Their rate changes where g passes zero.
+            some = _Models(*(one[rows] for one in model))
+            u[rows] += s[rows] * (_across(some, g[rows], rise[rows]) - v[rows])
+            h = d * u - goal
+        made[t], before = u, goal
+    return made
 
 
-def _cross(
-    crossed: BoolArray,
-    model: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    step: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    u: FloatArray,
-    close: float,
-) -> None:
-    """Correct the voltages of models whose g passes zero within a step: its rate changes there."""
-    rows = np.flatnonzero(crossed)
-    d, alpha, against, ahead = (one[rows] for one in model)
-    s, g, rise, v = (one[rows] for one in step)
+def _across(model: _Models, g: FloatArray, rise: FloatArray) -> FloatArray:
+    """Return how far the voltages (models,) go, V, from g below zero to above."""
+    d, alpha, against, ahead = model
     crossing = np.log1p(-g * against / alpha) / against
     late = np.maximum(rise - (d * crossing + g), 0.0)
-    beyond = _moved(d, alpha, ahead, np.zeros_like(g), late, close)
-    u[rows] += s * (crossing + beyond - v)
+    return crossing + _moved(d, ahead, alpha, late, ROUNDS)[0]
+
+
+def _moved(
+    d: FloatArray, rate: FloatArray, curved: FloatArray, rise: FloatArray, rounds: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return v ≥ 0, V, at which d v − k (1 − exp(−c v))/c is the rise, and the last step to it.
+
+    ``curved`` is k, (models,), the rise (samples, models) or (models,). What rises with v is
+    convex, or concave where h is beyond the ceiling, so that Newton's rule finds v from anywhere;
+    it starts near the parabola that touches at v = 0, and with a step of Halley's.
+    """
+    slope = d - curved
+    curve, minus, missing = rate * curved, -rate, curved / rate
+    v = rise / slope
+    near = (2 * curve / slope) * v
+    bent = (rate / 3) * v
+    bent *= near
+    near += 1
+    np.maximum(near, 0.0, out=near)
+    np.sqrt(near, out=near)
+    near += 1
+    bent += 4
+    v *= bent
+    v /= near
+    v *= 0.5
+    gone, step, steep = np.empty_like(v), near, bent
+    for done in range(rounds):
+        np.multiply(minus, v, out=gone)
+        np.expm1(gone, out=gone)
+        np.multiply(d, v, out=step)
+        np.multiply(curved, gone, out=steep)
+        np.subtract(slope, steep, out=steep)
+        step -= rise
+        step += missing * gone
+        step /= steep
+        if done == 0:
+            gone += 1
+            gone *= 0.5 * curve
+            gone *= step
+            gone /= steep
+            np.subtract(1.0, gone, out=gone)
+            step /= gone
+        v -= step
+        if rounds > STEPS and np.max(np.abs(step) * rate) <= CLOSE:
+            break
+    return v, step

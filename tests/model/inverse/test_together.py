@@ -14,9 +14,11 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.inverse.chain import MANY, inverse
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.together import able, voltages
+from bwbayes.model.inverse.stepped import DriveStep, step_of
+from bwbayes.model.inverse.together import able, followed, voltages
 from bwbayes.model.linear import Hold
 from bwbayes.model.operators.backlash_like import BacklashLike
+from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
 
 
@@ -128,3 +130,50 @@ def test_limits_hold_for_all_of_them() -> None:
     assert np.max(np.abs(nearest)) <= 40.0
     alone = inverse(actuator, theta[7], smooth(), limits=limits, nearest=True)[0]
     np.testing.assert_allclose(nearest[7], alone, atol=CLOSE * 80)
+
+
+@pytest.mark.parametrize("name", [one for one in cases.ACTUATORS if "all" not in one])
+@pytest.mark.parametrize("from_rest", [True, False])
+def test_whatever_has_a_step_goes_side_by_side_as_alone(name: str, from_rest: bool) -> None:
+    """With gain and creep; some of them by themselves, and what they make is the reference."""
+    actuator = cases.actuator(name)
+    theta = cases.theta(actuator, MANY, name)
+    asked = smooth(120)
+    together = inverse(actuator, theta, asked, from_rest=from_rest)
+    for row in (0, 3, MANY - 1):
+        alone = inverse(actuator, theta[row], asked, from_rest=from_rest)[0]
+        np.testing.assert_allclose(together[row], alone, rtol=0, atol=CLOSE * np.ptp(alone))
+        made = actuator.displacement(theta[row], together[row], from_rest=from_rest)[0]
+        np.testing.assert_allclose(made, asked, rtol=0, atol=CLOSE * np.ptp(asked))
+
+
+def test_plays_go_on_from_a_state_side_by_side() -> None:
+    """Loops that are closed and open, as all models' voltage left them."""
+    actuator = cases.actuator("plays, lag, gain")
+    theta = cases.theta(actuator, MANY, "plays")
+    before = np.concatenate([np.linspace(a, b, 20) for a, b in ((0, 60), (60, -30), (-30, 10))])
+    y, state = actuator.advance(theta, before, from_rest=True)
+    asked = y[:, -1:] + smooth(100, 10.0)
+    together = inverse(actuator, theta, asked, state)
+    for row in (0, 7):
+        _, its = actuator.advance(theta[row], before, from_rest=True)
+        made = actuator.advance(theta[row], together[row], its)[0][0]
+        np.testing.assert_allclose(made, asked[row], rtol=0, atol=CLOSE * np.ptp(asked))
+
+
+def test_models_that_are_not_followed_are_told() -> None:
+    """Where the drive falls with the voltage: the others go on, and none of them is disturbed."""
+    actuator = Actuator("none", span=SPAN)
+    theta = scattered(actuator, 4)
+    columns = actuator.columns(theta)
+    columns["initial"][:] = 0.0
+    columns["d"][1] = 0.9 * columns["alpha"][1]
+    drive = np.tile(smooth(150), (4, 1))
+    shaped = DriveStep(step_of(actuator.hysteresis, columns), None, columns)
+    memory = shaped.step.demagnetised()
+    made, right = followed(shaped, drive, memory, np.zeros(4))
+    assert [True, False, True, True] == right.tolist()
+    some = np.flatnonzero(right)
+    here = {name: values[some] for name, values in columns.items()}
+    expected = voltages(here, drive[some], np.zeros(3), 0.0)
+    np.testing.assert_allclose(made[some], expected, rtol=0, atol=CLOSE * np.ptp(expected))

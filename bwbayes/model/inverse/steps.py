@@ -1,34 +1,32 @@
-"""Hysteresis a sample at a time, each model with a voltage of its own, as a controller needs it.
+"""Hysteresis a sample at a time, each model with a voltage of its own.
 
-A simulation gives all models one voltage that is known beforehand. In a closed loop each has its
-own, and the next one hangs on what the last one did. Here an operator says what its displacement
-would be if the voltage went straight from where it stands to somewhere else, and how steep it is
-there. That takes a bounded time, whatever was before; operators whose memory grows with the
-voltage's past have no such step, and are refused.
+A simulation gives all models one voltage that is known beforehand. In a closed loop, and read
+backwards, each has its own, and the next one hangs on what the last one did. Here an operator says
+what its displacement would be if the voltage went straight from where it stands to somewhere else,
+and how steep it is there. That takes a bounded time, whatever was before; operators whose memory
+grows with the voltage's past, or that are integrated, have no such step, and are refused.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
-from bwbayes.model.declaration import Values
-from bwbayes.model.operator import Operator
-from bwbayes.model.operators.backlash_like import BacklashLike
-from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.operators.maxwell_slip import MaxwellSlip
-from bwbayes.model.operators.prandtl_ishlinskii import Plays, threshold_volts
+from bwbayes.model.operator import Span
 
-__all__ = ["STEPPED", "Gone", "HysteresisStep", "LinearStep", "PlaysStep", "step_of"]
-
-# Names, as a config has them, of the operators that have a step.
-STEPPED = ("bouc-wen with n = 1", "backlash-like", "plays", "maxwell-slip")
+__all__ = [
+    "Gone",
+    "HysteresisStep",
+    "LinearStep",
+    "PlaysStep",
+    "not_zero",
+    "of_one_state",
+    "relaxed",
+]
 
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
@@ -58,8 +56,15 @@ class HysteresisStep(ABC):
         """Return what is once the voltage has gone there; the memory that is given stays."""
 
     @abstractmethod
-    def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """Return bounds of dw/du that hold on every path from the demagnetised state."""
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return the memory (models, any) of what the operator itself remembers."""
+
+    @abstractmethod
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
+        """Return bounds of dw/du that hold on every path from the demagnetised state.
+
+        The path keeps within limits, V.
+        """
 
     @abstractmethod
     def coefficients(self) -> dict[str, Any]:
@@ -91,21 +96,15 @@ class LinearStep(HysteresisStep):
         """Return zero volts and h = 0, (models, 2)."""
         return np.zeros((self.d.size, 2))
 
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return voltage and h."""
+        return of_one_state(memory)
+
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return d u − h, its slope d − α + c g, and the voltage with h."""
         direction = np.where(voltage < memory[:, 0], -1.0, 1.0)
         travel = np.abs(voltage - memory[:, 0])
-        g = direction * memory[:, 1]
-        against, ahead = self._rates
-        below = np.minimum(g, 0.0)
-        # The travel to zero; a start above it has none.
-        crossing = np.log1p(-below * against / self.alpha) / against
-        early = np.minimum(travel, crossing)
-        g = g - (below - self.alpha / against) * -np.expm1(-against * early)
-        g = np.where(travel < crossing, g, np.maximum(g, 0.0))
-        late = travel - early
-        rate = np.where(travel < crossing, against, ahead)
-        g = g - (g - self.alpha / ahead) * -np.expm1(-ahead * late)
+        g, rate = relaxed(direction * memory[:, 1], travel, self.alpha, *self._rates)
         h = direction * g
         slope = self.d - self.alpha + rate * g
         return Gone(self.d * voltage - h, slope, np.stack([voltage, h], axis=1))
@@ -113,11 +112,9 @@ class LinearStep(HysteresisStep):
     @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:
         """The rates c below zero and above, not exactly zero."""
-        rates = self.beta - self.gamma, self.beta + self.gamma
-        against, ahead = (np.where(np.abs(rate) < TINY, TINY, rate) for rate in rates)
-        return against, ahead
+        return not_zero(self.beta - self.gamma), not_zero(self.beta + self.gamma)
 
-    def slopes(self) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d − max(α, 2 α β / (β + γ)) and d: h is steepest just after a turn."""
         with np.errstate(divide="ignore", invalid="ignore"):
             turned = 2 * self.alpha * self.beta / (self.beta + self.gamma)
@@ -153,15 +150,25 @@ class PlaysStep(HysteresisStep):
         """Return all plays at zero, (models, plays)."""
         return np.zeros_like(self.weights)
 
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return where the extrema that count, and the voltage, have left the plays."""
+        plays = self.demagnetised()
+        for one in memory.extrema:
+            plays = self._moved(plays, np.array(one.voltage if one.own is None else one.own))
+        return self._moved(plays, np.array(memory.voltage))
+
+    def _moved(self, plays: FloatArray, voltage: FloatArray) -> FloatArray:
+        target = voltage[..., np.newaxis]
+        return np.maximum(target - self.thresholds, np.minimum(target + self.thresholds, plays))
+
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return w, the slope d + Σ w_j of those plays that are moved, and all plays."""
-        target = voltage[:, np.newaxis]
-        plays = np.maximum(target - self.thresholds, np.minimum(target + self.thresholds, memory))
+        plays = self._moved(memory, voltage)
         carried = np.where(plays != memory, self.weights, 0.0)
         w = self.slope * voltage + np.einsum("mj,mj->m", self.weights, plays)
         return Gone(w, self.slope + carried.sum(axis=1), plays)
 
-    def slopes(self) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d, and d + Σ w_j."""
         return self.slope, self.slope + self.weights.sum(axis=1)
 
@@ -175,40 +182,29 @@ class PlaysStep(HysteresisStep):
         }
 
 
-def step_of(operator: Operator, column: Values) -> HysteresisStep:
-    """Return the step of an operator, for models given by their columns (models,).
+def relaxed(
+    g: FloatArray, travel: FloatArray, alpha: FloatArray, against: FloatArray, ahead: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return g = s h (models,) after a travel (models,), V, in direction s, and the rate c then.
 
-    Raises
-    ------
-    InputError
-        The operator has no step of bounded time; the text says which have.
+    dg/dv = α − c g, with the rate c ``against`` for g < 0 and ``ahead`` from there on, 1/V.
     """
-    match operator:
-        case BoucWen():
-            if np.any(column["exponent"] != 1.0):
-                raise _refused("bouc-wen with another exponent than 1")
-            return LinearStep(*(column[name] for name in ("d", "alpha", "beta", "gamma")))
-        case BacklashLike():
-            d, alpha, beta = (column[name] for name in ("d", "alpha", "beta"))
-            return LinearStep(d, alpha, beta, np.zeros_like(beta))
-        case Plays():
-            return _plays(operator.thresholds, "weight", column, held=0.0)
-        case MaxwellSlip():
-            return _plays(operator.thresholds, "alpha", column, held=1.0)
-    raise _refused(type(operator).__name__)
+    below = np.minimum(g, 0.0)
+    # The travel to zero; a start above it has none.
+    crossing = np.log1p(-below * against / alpha) / against
+    early = np.minimum(travel, crossing)
+    g = g - (below - alpha / against) * -np.expm1(-against * early)
+    g = np.where(travel < crossing, g, np.maximum(g, 0.0))
+    late = travel - early
+    rate = np.where(travel < crossing, against, ahead)
+    return g - (g - alpha / ahead) * -np.expm1(-ahead * late), rate
 
 
-def _plays(
-    thresholds: int | tuple[float, ...], name: str, column: Mapping[str, FloatArray], held: float
-) -> PlaysStep:
-    """Return plays; what the elements hold back of d, or a part of it, is not in their slope."""
-    volts = threshold_volts(thresholds, column)
-    weights = np.stack([column[f"{name}_{j + 1}"] for j in range(volts.shape[1])], axis=1)
-    return PlaysStep(column["d"] - held * weights.sum(axis=1), weights, volts)
+def not_zero(rate: FloatArray) -> FloatArray:
+    """Return rates of which none is exactly zero."""
+    return np.where(np.abs(rate) < TINY, TINY, rate)
 
 
-def _refused(what: str) -> InputError:
-    return InputError(
-        f"hysteresis: {what} has no step of bounded time for a controller; those that have one "
-        f"are {', '.join(STEPPED)}"
-    )
+def of_one_state(memory: Any) -> FloatArray:
+    """Return voltage and state (models, 2) of an operator that remembers these alone."""
+    return np.stack(np.broadcast_arrays(memory.voltage, memory.state), axis=1).astype(np.float64)

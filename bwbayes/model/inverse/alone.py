@@ -1,0 +1,237 @@
+"""One actuator read backwards, along stretches that go one way.
+
+The offset is taken off, creep and dynamics are undone, and what is left, the drive, is what
+hysteresis and gain must make. It turns where the voltage does, so that each stretch is one search,
+or one closed form, for all of its samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator, State
+from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.inverse.dynamics import undone
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.inverse.stretch import reached
+from bwbayes.model.linear import Recursion, Sections
+from bwbayes.model.operator import UNIT
+
+__all__ = ["One", "Path"]
+
+# Samples that are searched for together; operators that integrate follow as many.
+LONGEST = 2048
+
+# Steps of the drive below this part of its range are rounding: they turn nothing.
+QUANTUM = 1e-13
+
+# A voltage beyond so many times what a straight line would need is not looked for.
+FARTHEST = 30.0
+
+# Rounds in which creep and drive are made to agree, and the part of the range to which they do.
+ROUNDS, AGREED = 200, 1e-14
+
+# Rounds whose changes are so many times the displacement do not come back.
+RUNAWAY = 1e3
+
+
+@dataclass(frozen=True)
+class Path:
+    """Where one model's voltage may go: between low and high, V, at most ``step`` a sample."""
+
+    low: float
+    high: float
+    step: float = math.inf
+
+
+class One:
+    """One model that is read backwards."""
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        column: Mapping[str, FloatArray],
+        from_rest: bool,
+        state: State | None,
+        slope: float,
+    ) -> None:
+        self.actuator, self.column, self.state = actuator, column, state
+        self.span = actuator.span or UNIT
+        self.from_rest = from_rest
+        self.slope = slope
+
+    def voltage(
+        self, displacement: FloatArray, limits: Limits, nearest: bool, made: FloatArray | None
+    ) -> FloatArray:
+        """Return the voltage (samples,) for a displacement; without limits it may be known."""
+        drive = displacement - self.column["offset"][0]
+        anything = self.anywhere(float(np.max(np.abs(drive))))
+        voltage = self._undone(drive, anything) if made is None else made
+        edges = (voltage <= anything.low) | (voltage >= anything.high)
+        if edges.any() and not nearest:
+            sample = int(np.argmax(edges))
+            raise InputError(
+                f"reference: no voltage gives {displacement[sample]:.6g} um at "
+                f"{sample * self.actuator.interval:.6g} s; make it smaller, or ask for the nearest "
+                "command"
+            )
+        if not nearest:
+            limits.require(voltage, displacement, self.actuator.interval)
+            return voltage
+        step = limits.rate * self.actuator.interval
+        low, high = max(limits.low, anything.low), min(limits.high, anything.high)
+        slow = bool((np.abs(np.diff(voltage)) <= step).all())
+        if slow and (voltage >= low).all() and (voltage <= high).all():
+            return voltage
+        return self._undone(drive, Path(low, high, math.inf if slow else step))
+
+    def anywhere(self, peak: float) -> Path:
+        """Return a range of voltages that is wide for displacements up to a peak, um."""
+        size = peak / self.slope if self.slope > 0 else 1.0
+        most = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
+        return Path(-most, most)
+
+    def drive(
+        self, displacement: FloatArray, sections: Sections, path: Path | None = None
+    ) -> FloatArray:
+        """Return the drive (samples,) with which dynamics and creep make a displacement.
+
+        Creep that grows with the voltage needs to know where the voltage may go.
+        """
+        dynamics, *lags = sections.recursions
+        creep = self.actuator.creep
+        if creep is None:
+            return self._driven(displacement, dynamics)
+        states = sections.begin(None) if self.state is None else self.state.filter
+        strengths = [float(gain[0]) for gain in sections.gains[1:]]
+        drive = displacement / (1 + sum(strengths))
+        close = AGREED * float(np.max(np.abs(displacement)))
+        for _ in range(ROUNDS):
+            crept = drive[np.newaxis]
+            if creep.growing:
+                assert path is not None
+                crept = creep.drive(self.column, crept, self._static(drive, path))
+            left = displacement.copy()
+            for number, (lag, strength) in enumerate(zip(lags, strengths, strict=True), 1):
+                rest = crept[0, 0] if self.state is None else self.state.rest[number][0]
+                moved = lag.run(crept - rest, states[number].copy())[0]
+                left -= strength * (rest + moved)
+            before, drive = drive, self._driven(left, dynamics)
+            change = float(np.max(np.abs(drive - before)))
+            if change <= close:
+                return drive
+            if not change < RUNAWAY * float(np.max(np.abs(displacement))):
+                break
+        raise InputError(
+            f"reference: creep of {sum(strengths):.3g} of the drive cannot be undone; check the "
+            "model's creep and gain"
+        )
+
+    def _driven(self, displacement: FloatArray, dynamics: Recursion) -> FloatArray:
+        """Return the drive (samples,) with which the dynamics alone make a displacement."""
+        if self.state is None:
+            return np.asarray(displacement[0] + undone(dynamics, displacement - displacement[0]))
+        rest = self.state.rest[0][0]
+        return np.asarray(rest + undone(dynamics, displacement - rest, self.state.filter[0]))
+
+    def _undone(self, displacement: FloatArray, path: Path) -> FloatArray:
+        """Undo dynamics and creep, then what is left."""
+        sections = self.actuator.sections(self.column)
+        return self._static(self.drive(displacement, sections, path), path)
+
+    def begun(self, drive: float, path: Path) -> tuple[float, Any]:
+        """Return the voltage where the path starts, V, and the operator's memory there.
+
+        It is known, but for a record that starts in any state: then it is the one that the first
+        sample of the drive needs.
+        """
+        if self.state is not None:
+            memory = self.state.hysteresis
+            return float(getattr(memory, "voltage", math.nan)), memory
+        if self.from_rest:
+            return 0.0, self._begin(0.0, from_rest=True)
+        start = self._first(drive, path)
+        return start, self._begin(start, from_rest=False)
+
+    def _static(self, drive: FloatArray, path: Path) -> FloatArray:
+        """Return the voltage (samples,) with which hysteresis and gain make a drive (samples,)."""
+        quantum = QUANTUM * float(np.ptp(drive))
+        if quantum > 0:
+            drive = drive[0] + quantum * np.round((drive - drive[0]) / quantum)
+        result = np.empty_like(drive)
+        start, memory = self.begun(float(drive[0]), path)
+        done = int(self.state is None and not self.from_rest)
+        result[:done] = start
+        whole = Path(path.low, path.high)
+        here, memory = self._along(np.array([start]), memory)
+        joined = np.concatenate([here, drive[done:]])
+        longest = LONGEST if math.isinf(path.step) else 1
+        for first, last, _ in monotone_stretches(joined, longest):
+            if last == first:
+                continue
+            limit = whole
+            # The first voltage of a record is not a step from anything.
+            if first + done > 0 or self.state is not None:
+                limit = Path(max(path.low, start - path.step), min(path.high, start + path.step))
+            part = self._stretch(
+                joined[first + 1 : last + 1], float(here[-1]), start, memory, limit
+            )
+            result[done + first : done + last] = part
+            here, memory = self._along(part, memory)
+            start = float(part[-1])
+        return result
+
+    def _stretch(
+        self, target: FloatArray, here: float, start: float, memory: Any, path: Path
+    ) -> FloatArray:
+        """Return the voltages along one stretch from ``start``, where the drive is ``here``."""
+        s = math.copysign(1.0, float(target[-1]) - here)
+        edge = path.high if s > 0 else path.low
+        # After a limit was met the drive may not be where it was asked to be.
+        goal = here + s * np.maximum(s * (target - here), 0.0)
+        if goal[-1] == here or s * (edge - start) <= 0:
+            return np.full(target.shape, start)
+        if self.actuator.gain is None:
+            operator = self.actuator.hysteresis
+            return operator.inverse(self.column, goal, memory, start, edge)
+        asked = abs(float(goal[-1]) - here)
+        first = asked / self.slope if self.slope > 0 else 1.0
+        return reached(lambda u: self._along(u, memory)[0], goal, start, edge, first)
+
+    def _along(self, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
+        """Return the drive (samples,) along a voltage, and the operator's memory after it."""
+        drive, after = self.actuator.hysteresis.advance(self.column, voltage, memory)
+        if self.actuator.gain is not None:
+            drive = drive + self.actuator.gain.displacement(self.column, voltage)
+        return drive[0], after
+
+    def _begin(self, voltage: float, *, from_rest: bool) -> Any:
+        operator = self.actuator.hysteresis
+        return operator.begin(self.column, voltage, self.span, from_rest=from_rest)
+
+    def _first(self, drive: float, path: Path) -> float:
+        """Return the first voltage, at which the state is what θ's initial one says."""
+
+        def off(voltage: float) -> float:
+            at = self._begin(voltage, from_rest=False)
+            return float(self._along(np.array([voltage]), at)[0][0]) - drive
+
+        low, high = path.low, path.high
+        middle = min(max(self.span.middle, low), high)
+        s = -1.0 if off(middle) > 0 else 1.0
+        reach = max(self.span.half, abs(off(middle)) / self.slope if self.slope > 0 else 0.0, 1e-9)
+        edge = high if s > 0 else low
+        while s * (edge - middle) > reach and s * off(middle + s * reach) < 0:
+            reach = 2 * reach
+        far = middle + s * min(reach, abs(edge - middle))
+        if s * off(far) < 0:
+            return far
+        return float(brentq(off, middle, far, xtol=1e-15 * max(abs(far), 1.0), rtol=1e-14))

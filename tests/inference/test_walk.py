@@ -1,0 +1,96 @@
+"""The compiled walk along a voltage gives the actuator's displacement, in pieces of any size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.inference.compiled.walk import walk
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.bouc_wen import BoucWen
+from tests.inference.test_compiled_extrema import COMPILED
+from tests.inference.test_gain_and_creep import GAIN, PARTS
+from tests.inference.test_likelihood import moving
+from tests.inference.test_stages import OPERATORS, models
+from tests.model.operators.differential import SPAN, paths
+from tests.model.operators.test_memory import CASES
+
+# Not of one length, and one of them a sample.
+CUTS = (0, 1, 65, 130, 137, 200)
+
+
+def assert_walks_as(actuator: Actuator, theta: FloatArray, voltage: FloatArray, seed: int) -> None:
+    """Compare with NumPy's displacement, of a start in motion."""
+    sections = actuator.sections(actuator.columns(theta))
+    unrest = np.random.default_rng(seed).normal(0, 5, (len(theta), sections.unknowns))
+    expected = actuator.advance(theta, voltage, unrest=unrest)[0]
+    begun = walk(actuator, theta, voltage, unrest)
+    assert begun is not None
+    edges = [cut for cut in CUTS if cut < voltage.size] + [voltage.size]
+    got = np.hstack([begun.to(last) for _, last in pairwise(edges)])
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    assert (np.abs(got - expected) <= 1e-11 * size).all()
+
+
+@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
+@pytest.mark.parametrize("hold", ["first", "zero"])
+@pytest.mark.parametrize("gain", [None, GAIN])
+@pytest.mark.parametrize("count", [1, LANES + 3])
+def test_bouc_wen_walks_as_with_numpy(dynamics: str, hold: Hold, gain: Any, count: int) -> None:
+    fixed = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
+    posterior = moving("white", dynamics, fixed, hold=hold, parts={"gain": gain})
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), count))
+    only = posterior.only
+    assert_walks_as(only.actuator, only.table.actuator(theta), only.voltage, count)
+    compiled = replace(posterior, engine="numba").simulate(theta)
+    np.testing.assert_allclose(compiled, posterior.simulate(theta), rtol=0, atol=1e-9)
+
+
+def as_theta(actuator: Actuator, column: dict[str, FloatArray]) -> FloatArray:
+    """Return θ (models, parameters) of an operator's columns, with a lag and an offset."""
+    known = {"lag": np.array(0.01), "offset": np.array(3.0)} | column
+    return np.stack([np.resize(known[name], LANES) for name in actuator.parameters], axis=1)
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize("path", paths())
+def test_operators_of_one_state_walk_as_with_numpy(name: str, path: str) -> None:
+    actuator = Actuator("lag", "first", 1e-3, OPERATORS[name], span=SPAN)
+    column = models(OPERATORS[name], 2)
+    assert_walks_as(actuator, as_theta(actuator, column), paths()[path], 1)
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_operators_that_remember_extrema_walk_as_with_numpy(name: str) -> None:
+    actuator = Actuator("lag", "first", 1e-3, CASES[name].operator, span=SPAN)
+    for voltage in paths().values():
+        assert_walks_as(actuator, as_theta(actuator, dict(CASES[name].column)), voltage, 1)
+
+
+@pytest.mark.parametrize(
+    ("operator", "parts", "values"),
+    [
+        (BoucWen(), {"creep": PARTS["creep"]["creep"]}, {}),
+        (BoucWen(passive=False), {}, {"gamma": 0.03}),
+        (BoucWen(), {}, {"exponent": 1.5}),
+    ],
+    ids=["creep", "not passive", "exponent"],
+)
+def test_what_has_no_stage_is_left_to_numpy(
+    operator: Operator, parts: dict[str, Any], values: dict[str, float]
+) -> None:
+    posterior = moving("white", "none", parts={"hysteresis": operator, **parts})
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 3))
+    actuator = posterior.only.actuator
+    model = posterior.only.table.actuator(theta)
+    for name, value in values.items():
+        model[1, actuator.parameters.index(name)] = value
+    assert walk(actuator, model, posterior.only.voltage) is None
