@@ -18,7 +18,9 @@ and a bias on the draws (sds three tenths too small are seen nearly always, sds 
 times in 100, a bias of 0.3 sd 96 times). Coverages of the 18 bands are held to the spread between
 replicates: by chance one in 100 sound calibrations has one that is off by more (Bonferroni's
 bound). ``-m slow`` makes 150 replicates of this, and with default priors for all with the lag, the
-second order, a free exponent, and the lag with little noise.
+second order, and the lag with little noise; and with a free exponent beside known hysteresis, for
+four seconds of a record do not tell an exponent, a loop and its shape of which nothing is known:
+three of three such chains had not converged after 3,000 steps.
 """
 
 from __future__ import annotations
@@ -93,7 +95,7 @@ VARIANTS = {
     "second order": ("second-order", "mass = { fixed = 300.0 }\nstiffness = { fixed = 4.1e5 }\n"),
     "free exponent": (
         "lag",
-        'exponent = { prior = { distribution = "lognormal", median = 1.5, sigma = 0.3 } }\n',
+        KNOWN + 'exponent = { prior = { distribution = "lognormal", median = 1.5, sigma = 0.3 } }\n',
     ),
     "little noise": (
         "lag",

@@ -273,7 +273,8 @@ def compensate(
         is slow enough not to show its dynamics, that is where the expected squared error is least;
         it is taken only if it is less.
     from_rest
-        The actuator starts demagnetised at zero volts; otherwise in a state that nothing tells.
+        The actuator starts demagnetised at zero volts; otherwise it has waited at the first voltage
+        until it stood still, in a state of its hysteresis that nothing tells.
     limits, nearest
         The amplifier's, and whether to come as near as they allow; see
         :func:`~bwbayes.model.inverse.chain.inverse`.
@@ -291,7 +292,7 @@ def compensate(
         raise InputError(f"limit: {limit:g} um; must be positive")
     hold = posterior.only.actuator.hold
     seed = int(generator.integers(2**62))
-    task = _Task(posterior, draws, reference, Start(from_rest, False), hold, seed)
+    task = _Task(posterior, draws, reference, Start(from_rest, False, settled=True), hold, seed)
     linear = _linear(posterior, task.asked, limits or Limits())
     begun = task.begun(linear)
     actuator, model = begun.actuators[-1], begun.model.mean(axis=0)

@@ -28,6 +28,7 @@ from bwbayes.control.sampled import (
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS
 
 __all__ = ["Exported", "exported"]
 
@@ -99,7 +100,7 @@ class Exported:
             "inverse": self.without_inverse is None,
             "without_inverse": self.without_inverse,
             "parts": {
-                "hysteresis": self.model.step.coefficients()["kind"],
+                "hysteresis": self._called,
                 "gain": list(actuator.gain.terms) if actuator.gain else [],
                 "dynamics": actuator.dynamics,
                 "creep_times_s": list(actuator.creep.times) if actuator.creep else [],
@@ -139,7 +140,7 @@ class Exported:
             finalize=_in_c,
         )
         actuator, hysteresis = self.model.actuator, self.model.step.coefficients()
-        parts = [hysteresis["kind"], f"dynamics {actuator.dynamics}"]
+        parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] if actuator.gain else []
         parts += ["creep"] if actuator.creep else []
         return environment.get_template("actuator.c.j2").render(
@@ -162,6 +163,12 @@ class Exported:
             newton=NEWTON_ROUNDS,
             bisection=BISECTION_ROUNDS,
         )
+
+    @property
+    def _called(self) -> str:
+        """What a config calls the hysteresis."""
+        kind = type(self.model.actuator.hysteresis)
+        return next(name for name, made in HYSTERESIS.items() if made is kind)
 
     @property
     def _sections(self) -> list[dict[str, Any]]:

@@ -17,7 +17,12 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.inverse.stretch import reached
 
-__all__ = ["UNIT", "Operator", "Span"]
+__all__ = ["UNIT", "Operator", "Span", "narrower"]
+
+# Ranges of earlier drives that are told apart: how far down, and how much further up they went.
+# Fewer leave steps that show; more take longer.
+REACHES = 16
+FURTHER = (0.8, 1.0, 1.25)
 
 
 class Span(NamedTuple):
@@ -38,6 +43,21 @@ class Span(NamedTuple):
 
 
 UNIT = Span(-1.0, 1.0)
+
+
+def narrower(span: Span) -> tuple[Span, ...]:
+    """Return ranges about a span's middle, evenly from next to nothing to all of it."""
+    low, middle, half = span.low, span.middle, span.half
+    if not half > 0:
+        return (span,)
+    ends = [
+        (down / REACHES, min(further * down / REACHES, 1.0))
+        for down in range(1, REACHES + 1)
+        for further in FURTHER
+    ]
+    return tuple(
+        dict.fromkeys(Span(max(middle - down * half, low), middle + up * half) for down, up in ends)
+    )
 
 
 class Operator(ABC):

@@ -27,7 +27,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
-from bwbayes.model.operator import Span
+from bwbayes.model.operator import Span, narrower
 from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
@@ -67,6 +67,9 @@ class Start:
     after
         What comes after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
         readings leave it (:mod:`bwbayes.results.carried`).
+    settled
+        Without a lead-in: the actuator has waited at the first voltage until it stood still, with
+        whatever earlier drives have left of hysteresis and creep.
     """
 
     from_rest: bool = False
@@ -75,6 +78,7 @@ class Start:
     lead_in_from: float | None = None
     hold: Hold | None = None
     after: bool = False
+    settled: bool = False
 
     def window(self, record: Record) -> slice | None:
         """Return the samples of the lead-in, or None if nothing can be learned from one.
@@ -214,7 +218,7 @@ def started(
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(replace(whole, actuator=replace(actuator, span=one)) for one in earlier)
     if window is None:
-        return _unseen(likelihoods, theta, generator)
+        return _unseen(likelihoods, theta, generator, settled=start.settled)
     if start.own_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
@@ -281,23 +285,43 @@ def _likelihood(
 
 
 def _unseen(
-    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    generator: np.random.Generator,
+    *,
+    settled: bool,
 ) -> Started:
-    """Draw the start from what is known of it beforehand: all histories are equally probable."""
-    draws, count, first = len(theta), len(likelihoods), likelihoods[0]
+    """Draw the start from what is known of it beforehand: all histories are equally probable.
+
+    Where one number holds all states there is one history. Its states are then those of drives of
+    any amplitude within the span that were running when they were stopped: on either branch of
+    their loops.
+    """
+    draws, first = len(theta), likelihoods[0]
+    earlier, span = likelihoods, first.actuator.span
+    alone = len(likelihoods) == 1
+    if alone and not first.from_rest and span is not None:
+        earlier = tuple(
+            replace(first, actuator=replace(first.actuator, span=one)) for one in narrower(span)
+        )
     which = np.zeros(draws, dtype=np.int64)
-    if count > 1:
-        which = (count * uniform(generator, draws)).astype(np.int64)
-    histories = Histories(likelihoods, which)
+    if len(earlier) > 1:
+        which = (len(earlier) * uniform(generator, draws)).astype(np.int64)
+    histories = Histories(earlier, which)
     (sd,) = histories.each(theta, lambda one, some: (one.start_sd(some),))
+    if settled:
+        sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
     part = uniform(generator, draws)
+    if alone:
+        part = np.round(part)
     (begun,) = histories.each(
         np.column_stack([theta, part]),
-        lambda one, some: (States(one, some[:, :-1], alone=count == 1).at(some[:, -1]),),
+        lambda one, some: (States(one, some[:, :-1], alone=alone).at(some[:, -1]),),
     )
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(one.actuator for one in likelihoods)
+    which = np.zeros_like(which) if alone else which
     return Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
 
 

@@ -172,8 +172,8 @@ def soon_after(moment: Moment) -> Moment:
 MOMENTS: dict[str, Moment] = {
     "start": appears("config.toml"),
     "point fit": soon_after(appears(".lock")),
-    "pilot": blocks("pilot", 3),
-    "tuning": blocks("tuning", 2),
+    "pilot": blocks("pilot", 1),
+    "tuning": blocks("tuning", 1),
     "sampling": blocks("sampling", 3),
     "final outputs": lambda _: False,  # where it dies by itself: these are too quick to wait for
 }

@@ -128,6 +128,16 @@ def promised(
     return {key: float(np.mean(values)) for key, values in held.items()}
 
 
+def running(voltage: float, source: np.random.Generator, interval: float) -> FloatArray:
+    """Return a sine of any amplitude within the limits that is stopped at a voltage, and waits."""
+    amplitude = source.uniform(abs(voltage) + 1.0, 100.0)
+    time = interval * np.arange(round(4.0 / interval))
+    swung = amplitude * np.sin(2 * np.pi * (time + source.uniform())) * np.minimum(time, 1.0)
+    passes = np.flatnonzero(np.diff(np.sign(swung[time > 2.0] - voltage))) + np.sum(time <= 2.0)
+    until = int(source.choice(passes)) + 1
+    return np.concatenate([swung[:until], np.full(round(0.2 / interval), voltage)])
+
+
 def off(held: dict[tuple[str, int], float], count: int) -> dict[tuple[str, int], float]:
     """Return by how many standard errors the parts are off."""
     return {
@@ -146,6 +156,49 @@ def test_truths_are_where_the_command_says(asked: Reference) -> None:
     command = made(of, asked, about(of, 0.02, 400, source))
     found = off(promised(of, command, about(of, 0.02, 400, source), source), 400)
     assert max(abs(value) for value in found.values()) < 4.0, found
+
+
+def covered_early(of: Problem, command: Compensation, truths: FloatArray) -> dict[Any, float]:
+    """Return the part of truths (truths, free) that bands hold in the first tenth of a command.
+
+    Each is an actuator that ran before, and was stopped anywhere.
+    """
+    record, source = of.posterior.only, np.random.default_rng(11)
+    theta = of.posterior.prior.theta(truths)
+    actuator = replace(record.actuator, interval=command.reference.interval)
+    bands = command.compensated.bands
+    held: dict[tuple[str, int], list[float]] = {}
+    for row in range(len(theta)):
+        before = running(float(command.voltage[0]), source, actuator.interval)
+        model = record.table.actuator(theta[row : row + 1])
+        whole = actuator.displacement(
+            model, np.concatenate([before, command.voltage]), from_rest=True
+        )[0, before.size :]
+        noise = record.noise.at(actuator.interval)
+        truth = whole + noise.draw(record.table.noise(theta[row : row + 1]), whole.size, source)[0]
+        at = int(source.integers(whole.size // 10))
+        for level in LEVELS:
+            low, high = (edge["displacement", level] for edge in (bands.lower, bands.upper))
+            held.setdefault(("early", level), []).append(low[at] <= truth[at] <= high[at])
+    return {key: float(np.mean(values)) for key, values in held.items()}
+
+
+def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: Reference) -> None:
+    """The twin, which takes them to be demagnetised, is found."""
+    of, source = problem(), np.random.default_rng(3)
+    flat, truths = (about(of, 0.02, 400, source) for _ in range(2))
+    flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
+    truths[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
+
+    def anywhere(**options: Any) -> dict[Any, float]:
+        source = np.random.default_rng(7)
+        made = compensate(of.posterior, flat, asked, source, limits=LIMITS, **options)
+        return off(covered_early(of, made, truths), 400)
+
+    found = anywhere()
+    assert max(abs(value) for value in found.values()) < 4.0, found
+    sure = anywhere(from_rest=True)
+    assert sure["early", 95] < -4.0, sure
 
 
 def test_twin_draws_that_are_too_sure_are_found(asked: Reference) -> None:

@@ -18,6 +18,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS
 from tests.control import cases
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -154,6 +155,9 @@ def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
         known = numbers["parameters"][declared.name]
         assert (value, declared.unit) == (known["mean"], known["unit"])
     assert 1e-3 == numbers["interval_s"]
+    known = numbers["parts"]["hysteresis"]
+    assert type(actuator.hysteresis) is HYSTERESIS[known]
+    assert f"Parts: hysteresis {known}, dynamics" in made.c_code()
     assert all(one["unit"] in UNITS.values() for one in numbers["hysteresis"].values())
     system = made.linear
     for matrix in "ABCD":

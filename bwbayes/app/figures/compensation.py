@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
@@ -22,6 +24,9 @@ from bwbayes.control.compensation import Compensation, Played
 __all__ = ["draw_compensation", "draw_compensations"]
 
 LINEAR_COLOUR, ASKED_COLOUR = COLOURS[3], "#222222"
+
+# Edges of a histogram's bins.
+BINS = 61
 
 
 def draw_compensations(made: Compensation) -> dict[str, Figure]:
@@ -64,14 +69,20 @@ def _error(made: Compensation) -> Figure:
     along, spread = figure.subplots(1, 2, width_ratios=(2, 1))
     _errors(along, made, without=False)
     along.set_xlabel("time (s)")
+    both = np.concatenate([made.linear.rms, made.compensated.rms])
+    # Errors are mostly far from zero; where they are not, all of them may be zero.
+    bins = np.geomspace(max(both.min(), 1e-9), max(both.max(), 2e-9), BINS)
     for played, colour, name in (
         (made.linear, LINEAR_COLOUR, "uncompensated"),
         (made.compensated, MEAN_COLOUR, "compensated"),
     ):
-        spread.hist(played.rms, bins=40, density=True, color=colour, alpha=0.6, label=name)
+        spread.hist(played.rms, bins=bins, color=colour, alpha=0.6, label=name)
     spread.set_xlabel("rms of the error (µm)")
-    spread.set_ylabel("density")
+    spread.set_ylabel("draws")
     spread.set_xscale("log")
+    spread.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    spread.xaxis.set_major_formatter(ScalarFormatter())
+    spread.xaxis.set_minor_formatter(NullFormatter())
     share_legend(figure)
     return figure
 

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["render"]
 
+# How an actuator starts of which nothing is known.
+ANYHOW = "waited at the first voltage, after any drive"
+
+# How an actuator starts of which nothing is known.
+ANYHOW = "waited at the first voltage, after any drive"
+
 CAPTIONS = {
     "tracking": (
         "Reference and prediction",
@@ -79,7 +85,7 @@ def _facts(made: Compensation, summary: Mapping[str, Any]) -> list[tuple[str, st
             f"{summary['compensated']['expected_rms_um']:.4g} µm",
         ),
         ("Voltage between samples", between),
-        ("Start", "demagnetised at zero volts" if made.from_rest else "unknown"),
+        ("Start", "demagnetised at zero volts" if made.from_rest else ANYHOW),
     ]
 
 

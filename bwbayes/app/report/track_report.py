@@ -46,7 +46,7 @@ def render(name: str, tracking: Tracking, png: bytes) -> str:
             ("jumps", f"take {1e3 * tracking.rise:.3g} ms"),
             ("limits", f"{stand.limits.low:.4g} to {stand.limits.high:.4g} V"),
             ("sampling", f"every {1e3 * tracking.gains.interval:.3g} ms"),
-            ("delay", f"{stand.delay} samples from a reading to the command that answers it"),
+            ("delay", f"in samples, from a reading to the command that answers it: {stand.delay}"),
             ("DAC", f"steps of {stand.amplifier.step:.3g} V, {stand.amplifier.slew:.3g} V/s"),
             ("ADC", f"steps of {stand.sensor.step:.3g} µm"),
         ],

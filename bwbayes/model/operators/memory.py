@@ -21,17 +21,12 @@ from bwbayes.errors import InputError
 from bwbayes.model.declaration import Context, Declaration, Values
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator, Span, narrower
 
 __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refuse"]
 
 # Elements (models x samples) that one array expression handles: small enough for the cache.
 PIECE = 65_536
-
-# Ranges of earlier drives that are told apart: how far down, and how much further up they went.
-# Fewer leave steps that show; more take longer.
-REACHES = 16
-FURTHER = (0.8, 1.0, 1.25)
 
 
 def _initial_prior(_: Context) -> Distribution:
@@ -217,19 +212,7 @@ class RemembersExtrema(Operator):
 
     def earlier(self, span: Span) -> tuple[Span, ...]:
         """Return ranges about the span's middle, evenly from next to nothing to all of it."""
-        low, middle, half = span.low, span.middle, span.half
-        if not half > 0:
-            return (span,)
-        ends = [
-            (down / REACHES, min(further * down / REACHES, 1.0))
-            for down in range(1, REACHES + 1)
-            for further in FURTHER
-        ]
-        return tuple(
-            dict.fromkeys(
-                Span(max(middle - down * half, low), middle + up * half) for down, up in ends
-            )
-        )
+        return narrower(span)
 
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return the mean slope from the span's lowest to its highest voltage (models,), um/V."""
