@@ -218,6 +218,23 @@ def spikes() -> str:
     )
 
 
+def closed_loop() -> str:
+    one = measured()["closed loop"]
+    return (
+        f"for at least {100 * one['least_share_of_draws']:.1f} % of {one['draws']} draws, with each "
+        f"of {one['seeds']} seeds of the stand, on every signal and at every frequency"
+    )
+
+
+def forecasts() -> str:
+    one = measured()["forecasts from posteriors"]
+    parts = [100 * part for part in one["95 % bands cover"].values()]
+    return (
+        f"{one['records']} records with parameters from the posterior: 95 % bands cover "
+        f"{min(parts):.0f} to {max(parts):.0f} % at five distances"
+    )
+
+
 def defects() -> str:
     one = measured()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
@@ -233,6 +250,8 @@ FINDINGS = [
     moving,
     nested,
     spikes,
+    closed_loop,
+    forecasts,
     defects,
 ]
 
