@@ -67,8 +67,8 @@ def made(common: Experiment, count: int, seed: int = SEED) -> list[Replicate]:
         return list(replicates(common, seed, range(count), pool))
 
 
-def judged(found: list[Replicate]) -> Calibration:
-    return judge([one.entry() for one in found], np.random.default_rng(SEED))
+def judged(outcome: list[Replicate]) -> Calibration:
+    return judge([one.entry() for one in outcome], np.random.default_rng(SEED))
 
 
 # The sound calibration, and defects that are planted on its draws
@@ -85,10 +85,10 @@ def prior() -> JointPrior:
 
 
 def test_calibration_passes(sound: list[Replicate]) -> None:
-    found = judged(sound)
-    assert () == found.shortcomings
-    assert () == found.unconverged
-    assert REPLICATES == found.replicates
+    outcome = judged(sound)
+    assert () == outcome.shortcomings
+    assert () == outcome.unconverged
+    assert REPLICATES == outcome.replicates
 
 
 def test_parameters_together_are_calibrated(sound: list[Replicate], prior: JointPrior) -> None:
@@ -108,10 +108,10 @@ def test_bands_cover_held_out_samples_with_parameters_from_the_prior(
     assert {} == {name: off for name, off in errors_off(sound) if not abs(off) < LIMIT}
 
 
-def errors_off(found: list[Replicate]) -> Iterator[tuple[str, float]]:
+def errors_off(outcome: list[Replicate]) -> Iterator[tuple[str, float]]:
     """Yield how far each band's mean coverage is off, in standard errors between replicates."""
     for name in (f"{kind} {level}" for kind in KINDS for level in LEVELS):
-        covered = np.array([one.covered[name] for one in found])
+        covered = np.array([one.covered[name] for one in outcome])
         error = np.std(covered, ddof=1) / np.sqrt(covered.size)
         yield name, float((np.mean(covered) - int(name.split()[1]) / 100) / error)
 
@@ -130,11 +130,11 @@ def test_white_noise_model_fails_the_bands() -> None:
         prior=JointPrior(p for p in right.prior.parameters if p.name in names),
         joint=None,
     )
-    found = made(replace(common, posterior=white, source=right), FEW)
-    off = dict(errors_off(found))
+    outcome = made(replace(common, posterior=white, source=right), FEW)
+    off = dict(errors_off(outcome))
     for kind in ("parameter", "displacement"):
         assert off[f"{kind} 95"] < -LIMIT
-    assert not judged(found).passed
+    assert not judged(outcome).passed
 
 
 @dataclass(frozen=True)
@@ -195,17 +195,17 @@ def forgotten_prior() -> Experiment:
 
 @pytest.mark.parametrize("defect", [wrong_correlation, swapped_sign, forgotten_prior])
 def test_defect_of_likelihood_or_prior_is_found(defect: Callable[[], Experiment]) -> None:
-    found = judged(made(replace(defect(), held_out={}), FEW))
-    assert not found.passed
-    assert any("ranks" in text for text in found.shortcomings), found.shortcomings
+    outcome = judged(made(replace(defect(), held_out={}), FEW))
+    assert not outcome.passed
+    assert any("ranks" in text for text in outcome.shortcomings), outcome.shortcomings
 
 
 @pytest.mark.slow
 def test_five_hundred_replicates_are_calibrated() -> None:
     with executor(os.cpu_count()) as pool, one_thread():
         made = replicates(experiment(problem()), SEED + 1, range(500), pool, os.cpu_count() or 1)
-        found = sorted(made, key=lambda one: one.number)
-    result = judged(found)
+        outcome = sorted(made, key=lambda one: one.number)
+    result = judged(outcome)
     assert () == result.shortcomings
     assert result.power["20 % too small"] > 0.98
-    assert together_test(found, problem().posterior.prior) > LEVEL
+    assert together_test(outcome, problem().posterior.prior) > LEVEL

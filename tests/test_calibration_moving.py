@@ -163,23 +163,23 @@ def off(every: list[Replicate]) -> dict[str, float]:
     return result
 
 
-def remarks(found: Calibration) -> list[str]:
+def remarks(outcome: Calibration) -> list[str]:
     """Return a calibration's shortcomings but for replicates that have not converged."""
-    return [text for text in found.shortcomings if "did not converge" not in text]
+    return [text for text in outcome.shortcomings if "did not converge" not in text]
 
 
 def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
     """Return what is kept of a calibration."""
-    found = judge([one.entry() for one in every], np.random.default_rng(SEED))
+    outcome = judge([one.entry() for one in every], np.random.default_rng(SEED))
     ranked = [one for one in every if len(one.draws)]
     return {
         "replicates": len(every),
-        "unconverged": len(found.unconverged),
-        "shortcomings": remarks(found),
-        "smallest adjusted p": round(min(one.adjusted for one in found.statistics.values()), 4),
+        "unconverged": len(outcome.unconverged),
+        "shortcomings": remarks(outcome),
+        "smallest adjusted p": round(min(one.adjusted for one in outcome.statistics.values()), 4),
         "all parameters together, p": round(together_test(ranked, common.posterior.prior), 4),
         "bands, standard errors off": {name: round(t, 2) for name, t in off(every).items()},
-        "bands cover": {name: round(one.mean, 4) for name, one in found.bands.items()},
+        "bands cover": {name: round(one.mean, 4) for name, one in outcome.bands.items()},
     }
 
 
@@ -193,16 +193,16 @@ Sound = tuple[Experiment, list[Replicate]]
 
 def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> None:
     common, every = sound
-    found = judge([one.entry() for one in every], np.random.default_rng(SEED))
-    assert [] == remarks(found)
-    assert len(found.unconverged) <= MOST_UNCONVERGED * QUICK
+    outcome = judge([one.entry() for one in every], np.random.default_rng(SEED))
+    assert [] == remarks(outcome)
+    assert len(outcome.unconverged) <= MOST_UNCONVERGED * QUICK
     assert together_test(every, common.posterior.prior) > LEVEL
 
 
 def test_bands_of_the_record_and_of_another_one_hold(sound: Sound) -> None:
-    found = off(sound[1])
-    assert 18 == len(found)
-    assert {} == {name: t for name, t in found.items() if not abs(t) < band_limit(18, QUICK)}
+    outcome = off(sound[1])
+    assert 18 == len(outcome)
+    assert {} == {name: t for name, t in outcome.items() if not abs(t) < band_limit(18, QUICK)}
 
 
 def narrowed(draws: FloatArray) -> FloatArray:
@@ -221,10 +221,10 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_is_calibrated(variant: str, tmp_path: Path) -> None:
     common, every = made(variant, tmp_path, REPLICATES)
-    found = figures(common, every)
-    keep(f"calibration, {variant}", found)
-    assert [] == found["shortcomings"]
-    assert found["unconverged"] <= MOST_UNCONVERGED * REPLICATES
+    outcome = figures(common, every)
+    keep(f"calibration, {variant}", outcome)
+    assert [] == outcome["shortcomings"]
+    assert outcome["unconverged"] <= MOST_UNCONVERGED * REPLICATES
     assert together_test(every, common.posterior.prior) > LEVEL
     limit = band_limit(18, REPLICATES)
     assert {} == {name: t for name, t in off(every).items() if not abs(t) < limit}

@@ -123,10 +123,10 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
 def test_every_part_is_calibrated(part: str, tmp_path: Path) -> None:
     common = resolved(EVERY[part], "", tmp_path)
     every = made(common, REPLICATES)
-    found = figures(common, every)
-    keep(f"calibration, {part}", found)
-    assert [] == found["shortcomings"]
-    assert found["unconverged"] <= MOST_UNCONVERGED * REPLICATES
+    result = figures(common, every)
+    keep(f"calibration, {part}", result)
+    assert [] == result["shortcomings"]
+    assert result["unconverged"] <= MOST_UNCONVERGED * REPLICATES
     assert together_test(every, common.posterior.prior) > LEVEL
     limit = band_limit(18, REPLICATES)
     assert {} == {name: t for name, t in off(every).items() if not abs(t) < limit}

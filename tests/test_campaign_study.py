@@ -131,7 +131,7 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
     assert all("\n" not in reason and reason for reason in refused.values())
     fitted = {row.name: row for row in ended.rows if row.parameters}
     assert SPECIMENS == len(fitted)
-    found: dict[str, Any] = {"specimens": SPECIMENS, "minutes": round(minutes, 1)}
+    result: dict[str, Any] = {"specimens": SPECIMENS, "minutes": round(minutes, 1)}
     known = truths()
     for name, (median, spread) in POPULATION.items():
         own, shrunk, ratio = [], [], []
@@ -141,13 +141,13 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
             own.append(one["lower_95"] < values[name] < one["upper_95"])
             shrunk.append(among.lower < values[name] < among.upper)
             ratio.append((among.upper - among.lower) / (one["upper_95"] - one["lower_95"]))
-        found[name] = {
+        result[name] = {
             "own": assert_covers(own, 0.95, f"{name} alone"),
             "shrunk": assert_covers(shrunk, 0.95, f"{name} shrunk"),
             "width": float(np.mean(ratio)),
         }
         # Draws of a finite number: a specimen that is all sure stays as wide.
-        assert found[name]["width"] < 1.02
+        assert result[name]["width"] < 1.02
         assert ended.population is not None
         told = ended.population.parameters[name]
         for draws, truth in ((told.mean, median), (told.spread, spread)):
@@ -157,8 +157,8 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
         inside = [
             r.numbers["validation"]["end"]["coverage"]["sensor"][level] for r in fitted.values()
         ]
-        found[f"sensor {level}"] = assert_covers(inside, int(level) / 100, f"sensor {level}")
-    keep("campaign", found)
+        result[f"sensor {level}"] = assert_covers(inside, int(level) / 100, f"sensor {level}")
+    keep("campaign", result)
 
 
 @pytest.mark.slow

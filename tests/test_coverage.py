@@ -146,13 +146,13 @@ def test_twin_bands_that_are_too_narrow_are_found(replicates: list[Replicate], k
 @pytest.mark.parametrize("discrepancy", ["process", "none"])
 def test_forty_seeds_at_the_full_rate(discrepancy: str) -> None:
     """Three standard errors, with 40 seeds, at 1000 Hz."""
-    found = [replicate(seed, discrepancy, 1000.0) for seed in range(40)]
+    seen = [replicate(seed, discrepancy, 1000.0) for seed in range(40)]
     covered, off = {}, {}
     for level in LEVELS:
         parts = {
-            "parameters": parameters_covered(found, level),
-            "sensor": bands_cover(found, "sensor", level),
-            "displacement": bands_cover(found, "displacement", level),
+            "parameters": parameters_covered(seen, level),
+            "sensor": bands_cover(seen, "sensor", level),
+            "displacement": bands_cover(seen, "displacement", level),
         }
         for name, part in parts.items():
             covered[f"{name} {level}"] = round(float(np.mean(part)), 4)

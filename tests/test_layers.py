@@ -80,17 +80,17 @@ def tree(module: str) -> ast.Module:
 
 def imports(module: str) -> set[str]:
     """All that a module imports, wherever in it, by full name."""
-    found: set[str] = set()
+    result: set[str] = set()
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            result |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}:{node.lineno}: write the import in full"
             assert node.module is not None
             # `from package import name` means a module where there is one of that name.
             names = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in PATHS else node.module for name in names}
-    return found
+            result |= {name if name in PATHS else node.module for name in names}
+    return result
 
 
 def own_imports(module: str) -> set[str]:

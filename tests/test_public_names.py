@@ -62,15 +62,15 @@ def test_the_public_names_are_these() -> None:
 @every_name
 def test_a_public_name_is_what_its_module_defines(name: str) -> None:
     module, original = HOMES[name]
-    found = getattr(bwbayes, name)
-    assert (module, original) == (found.__module__, found.__name__)
+    result = getattr(bwbayes, name)
+    assert (module, original) == (result.__module__, result.__name__)
 
 
 @every_name
 def test_a_public_name_is_documented(name: str) -> None:
-    found = getattr(bwbayes, name)
+    result = getattr(bwbayes, name)
     # A dataclass without a docstring of its own gets its signature for one.
-    assert not (inspect.getdoc(found) or f"{name}(").startswith(f"{name}(")
+    assert not (inspect.getdoc(result) or f"{name}(").startswith(f"{name}(")
 
 
 def test_type_checkers_find_each_name_where_it_is_loaded_from() -> None:

@@ -28,9 +28,9 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def block(name: str) -> str:
     """Return what stands between ``<!-- name -->`` and the next ``<!-- -->``."""
-    found = re.search(rf"<!-- {name} -->\n(.*?)<!-- -->", README, flags=re.DOTALL)
-    assert found, f"the README has no block {name}"
-    return found.group(1)
+    result = re.search(rf"<!-- {name} -->\n(.*?)<!-- -->", README, flags=re.DOTALL)
+    assert result, f"the README has no block {name}"
+    return result.group(1)
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +118,8 @@ def test_the_quoted_verification_is_that_of_the_run(summary: Any) -> None:
         run["nrmse"] * 100,
         run["max_error_um"],
     ]
-    for wanted, got in zip(quoted, expected, strict=True):
-        assert wanted == pytest.approx(got, rel=0.05, abs=0.3)
+    for required, got in zip(quoted, expected, strict=True):
+        assert required == pytest.approx(got, rel=0.05, abs=0.3)
 
 
 def covered(discrepancy: str) -> str:
@@ -221,8 +221,8 @@ def spikes() -> str:
 def closed_loop() -> str:
     one = measured()["closed loop"]
     return (
-        f"for at least {100 * one['least_share_of_draws']:.1f} % of {one['draws']} draws, with each "
-        f"of {one['seeds']} seeds of the stand, on every signal and at every frequency"
+        f"for at least {100 * one['least_share_of_draws']:.1f} % of {one['draws']} draws, with "
+        f"each of {one['seeds']} seeds of the stand, on every signal and at every frequency"
     )
 
 

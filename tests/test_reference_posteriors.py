@@ -49,7 +49,7 @@ class Reference:
 
     problem: Problem
     case: Case
-    found: Mapping[str, Any]
+    result: Mapping[str, Any]
 
 
 @pytest.fixture(scope="module", params=["virtual", pytest.param("measured", marks=absent)])
@@ -58,7 +58,7 @@ def reference(
 ) -> Reference:
     """Let both read a case; the plain code thins the measured record, voltage and all, for both."""
     path = FOLDER / f"{request.param}.toml"
-    found = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    result = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     config, case, folder = load(path), load_case(path), FOLDER
     if request.param == "measured":
         folder = tmp_path_factory.mktemp("thinned")
@@ -69,17 +69,17 @@ def reference(
         write_record(thinned, folder / "thinned.h5")
         source = RecordConfig(file="thinned.h5", train=config.records["record"].train)
         config = config.model_copy(update={"record": source})
-    return Reference(resolve(config, folder), case, found)
+    return Reference(resolve(config, folder), case, result)
 
 
 @pytest.fixture(scope="module")
 def sampled(reference: Reference) -> FloatArray:
     """Draws of the case by the normal path, (draws, free)."""
-    outcome, found = run(reference.problem)
+    outcome, result = run(reference.problem)
     check = outcome.check
     assert outcome.converged, outcome.stop_reason
     assert min(check.ess_bulk.min(), check.ess_tail.min()) >= ESS
-    return found
+    return result
 
 
 def run(problem: Problem) -> tuple[Outcome, FloatArray]:
@@ -92,11 +92,13 @@ def run(problem: Problem) -> tuple[Outcome, FloatArray]:
     return outcome, draws(posterior, chain).reshape(-1, len(posterior.names))
 
 
-def deviations(found: Mapping[str, Any], names: tuple[str, ...], got: FloatArray) -> dict[str, Any]:
+def deviations(
+    result: Mapping[str, Any], names: tuple[str, ...], got: FloatArray
+) -> dict[str, Any]:
     """Distance of draws (draws, free) from a reference, in parts of what is allowed."""
     off = {}
     for name, column in zip(names, got.T, strict=True):
-        known = found["parameters"][name]
+        known = result["parameters"][name]
         low, high = np.quantile(column, [0.05, 0.95])
         values = {"mean": np.mean(column), "sd": np.std(column, ddof=1)}
         values |= {"quantile_5": low, "quantile_95": high}
@@ -126,13 +128,13 @@ def test_both_read_the_same_case(reference: Reference) -> None:
 
 def test_the_reference_is_of_this_case(reference: Reference) -> None:
     """If not, config or record have changed: make the reference again."""
-    assert digest(reference.case) == reference.found["digest"]
+    assert digest(reference.case) == reference.result["digest"]
 
 
 def test_the_reference_is_precise(reference: Reference) -> None:
     """Its error, from the spread of its runs, is small against what is allowed."""
-    assert reference.found["ess"] > 4 * ESS
-    for error in reference.found["error_in_sd"].values():
+    assert reference.result["ess"] > 4 * ESS
+    for error in reference.result["error_in_sd"].values():
         assert error["mean"] < 0.03
         assert all(error[key] < limit / 3 for key, limit in LIMITS.items())
 
@@ -158,7 +160,7 @@ def test_the_prior_is_the_plain_one(reference: Reference) -> None:
 
 
 def test_a_run_gives_the_reference(reference: Reference, sampled: FloatArray) -> None:
-    off = deviations(reference.found, reference.case.free, sampled)
+    off = deviations(reference.result, reference.case.free, sampled)
     assert max(off.values()) < 1, off
 
 
@@ -167,7 +169,7 @@ def test_twin_draws_that_are_too_narrow_are_found(
 ) -> None:
     """Ten per cent, in every parameter."""
     middle = np.mean(sampled, axis=0)
-    off = deviations(reference.found, reference.case.free, middle + 0.9 * (sampled - middle))
+    off = deviations(reference.result, reference.case.free, middle + 0.9 * (sampled - middle))
     assert all(off[f"{name} sd"] > 1 for name in reference.case.free), off
 
 
@@ -190,5 +192,5 @@ def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> N
     )
     outcome, got = run(planted)
     assert outcome.converged, outcome.stop_reason
-    off = deviations(reference.found, reference.case.free, got)
+    off = deviations(reference.result, reference.case.free, got)
     assert max(off.values()) > 2, off

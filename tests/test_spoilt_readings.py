@@ -120,12 +120,12 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
     """
     inside = {level: dict.fromkeys(TRUTH, 0) for level in (50, 95)}
     without = {level: dict.fromkeys(TRUTH, 0) for level in (50, 95)}
-    ratios, found, false = [], 0, 0
+    ratios, outcome, false = [], 0, 0
     for seed in range(100, 100 + RECORDS):
         record, rows = spiky(measured(seed), seed)
         clean, aside = told(measured(seed), tmp_path), told(record, tmp_path, ASIDE)
         gone = set(np.flatnonzero(np.isnan(aside.problem.posterior.only.displacement)).tolist())
-        found, false = found + len(gone & set(rows)), false + len(gone - set(rows))
+        outcome, false = outcome + len(gone & set(rows)), false + len(gone - set(rows))
         ratios.append(width(aside.bands["rest"]) / width(clean.bands["rest"]))
         for name, value in TRUTH.items():
             for one, counts in ((aside, inside), (clean, without)):
@@ -137,7 +137,7 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
         {
             "records": RECORDS,
             "spikes": 10 * RECORDS,
-            "found": found,
+            "found": outcome,
             "good readings set aside": false,
             "width over clean, least and most": [min(ratios), max(ratios)],
             "covered 50": inside[50],
@@ -145,7 +145,7 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
             "covered 95 without spikes": without[95],
         },
     )
-    assert 10 * RECORDS == found
+    assert 10 * RECORDS == outcome
     assert 0 == false
     assert 0.9 < min(ratios)
     assert max(ratios) < 1.1

@@ -52,33 +52,33 @@ def shifted(draws: FloatArray) -> FloatArray:
     return draws + 0.3 * np.std(draws, axis=0)
 
 
-def whitened_positions(found: Replicate, prior: JointPrior, plant: Plant) -> FloatArray:
+def whitened_positions(result: Replicate, prior: JointPrior, plant: Plant) -> FloatArray:
     """Where the truth lies among the draws, along each whitened coordinate: (free,) in (0, 1).
 
     The axes are those of the covariance of truth and draws together, by its symmetric root, so
     that they do not tell one from the other, and a bias of one sign keeps it.
     """
     free = prior.dimensions
-    draws = plant(prior.unconstrain(found.draws[:, :free]))
-    both = np.concatenate([prior.unconstrain(found.truth[np.newaxis, :free]), draws])
+    draws = plant(prior.unconstrain(result.draws[:, :free]))
+    both = np.concatenate([prior.unconstrain(result.truth[np.newaxis, :free]), draws])
     both = (both - np.mean(both, axis=0)) / np.std(both, axis=0)
     variances, axes = linalg.eigh(np.atleast_2d(np.corrcoef(both.T)))
     white = both @ (axes / np.sqrt(variances)) @ axes.T
-    jitter = np.random.default_rng([SEED, found.number]).uniform(size=free)
+    jitter = np.random.default_rng([SEED, result.number]).uniform(size=free)
     positions: FloatArray = (np.sum(white[1:] < white[0], axis=0) + jitter) / len(both)
     return positions
 
 
-def together_test(found: list[Replicate], prior: JointPrior, plant: Plant = nothing) -> float:
+def together_test(result: list[Replicate], prior: JointPrior, plant: Plant = nothing) -> float:
     """P-value of the smooth test of all parameters together.
 
     A replicate gives the means of b₁ and b₂ over its whitened coordinates; Hotelling's test asks
     whether both means over replicates are zero, with the covariance that replicates show.
     """
-    u = np.stack([whitened_positions(one, prior, plant) for one in found])
+    u = np.stack([whitened_positions(one, prior, plant) for one in result])
     b = np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u**2 - 6 * u + 1)], axis=-1)
     each = np.mean(b, axis=1)
-    count = len(found)
+    count = len(result)
     mean = np.mean(each, axis=0)
     squared = count * mean @ linalg.solve(np.cov(each.T), mean)
     return float(stats.f.sf(squared * (count - 2) / (2 * (count - 1)), 2, count - 2))

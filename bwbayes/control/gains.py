@@ -106,7 +106,7 @@ class Margins:
 
 
 def design(
-    mean: SampledModel, draws: SampledModel, limits: Span, delay: int, wanted: Robustness
+    mean: SampledModel, draws: SampledModel, limits: Span, delay: int, required: Robustness
 ) -> tuple[Gains, Margins]:
     """Return the fastest controller that keeps the margins with all draws, and those margins.
 
@@ -144,27 +144,28 @@ def design(
     # An integrator of this speed is at its limit on the steepest slope, whatever the dynamics.
     high = 2.0 / float(draws.slopes(limits)[1].max())
     low = 1e-6 * high
-    kept = _keeps(margins(gains_of(low), draws, limits, delay, poles=False), wanted)
+    kept = _keeps(margins(gains_of(low), draws, limits, delay, poles=False), required)
     if not kept:
         raise InputError(
-            f"track: no controller of this kind keeps a gain margin of {wanted.gain:g} and a phase "
-            f"margin of {wanted.phase:g} degrees with all draws; ask for less, or sample faster"
+            f"track: no controller of this kind keeps a gain margin of {required.gain:g} and a "
+            f"phase margin of {required.phase:g} degrees with all draws; ask for less, or sample "
+            "faster"
         )
     while high / low > 1 + PRECISION:
         middle = math.sqrt(low * high)
-        kept = _keeps(margins(gains_of(middle), draws, limits, delay, poles=False), wanted)
+        kept = _keeps(margins(gains_of(middle), draws, limits, delay, poles=False), required)
         low, high = (middle, high) if kept else (low, middle)
     gains = gains_of(low)
-    found = margins(gains, draws, limits, delay)
-    if not found.stable:
+    result = margins(gains, draws, limits, delay)
+    if not result.stable:
         raise InputError(
             "track: some draws are unstable with the margins that were asked for; ask for more"
         )
-    return gains, found
+    return gains, result
 
 
-def _keeps(found: Margins, wanted: Robustness) -> bool:
-    kept = (found.gain >= wanted.gain) & (found.phase >= wanted.phase) & (found.circle > 0)
+def _keeps(result: Margins, required: Robustness) -> bool:
+    kept = (result.gain >= required.gain) & (result.phase >= required.phase) & (result.circle > 0)
     return bool(np.all(kept))
 
 

@@ -229,10 +229,10 @@ def track(
     models = SampledModel.of(
         actuator, np.tile(every.mean(axis=0), (len(frequencies) * len(names), 1))
     )
-    fed = _fed(models, [wanted for wanted, _ in references], stand)
+    fed = _fed(models, [desired for desired, _ in references], stand)
     followed: list[Followed] = []
-    for (wanted, begins), (command, reached) in zip(references, fed, strict=True):
-        plan = _plan(wanted, begins, command, reached, ends, limits)
+    for (desired, begins), (command, reached) in zip(references, fed, strict=True):
+        plan = _plan(desired, begins, command, reached, ends, limits)
         followed.append(follow(plan, gains, rows, noise, stand, generator))
     rms, largest, limited = (np.stack(part, axis=1) for part in zip(*followed, strict=True))
     return Tracking(
@@ -260,17 +260,17 @@ def _fed(
     many models do it. Of that length the others rest where they end.
     """
     longest = max(one.shape[1] for one in references)
-    wanted = np.vstack(
+    desired = np.vstack(
         [np.pad(one, ((0, 0), (0, longest - one.shape[1])), mode="edge") for one in references]
     )
-    command, reached = np.zeros_like(wanted), np.zeros_like(wanted)
+    command, reached = np.zeros_like(desired), np.zeros_like(desired)
     state = model.begin(np.zeros(model.models))
     last, close = np.zeros(model.models), CLOSE * stand.amplifier.step
     for t in range(longest - 1):
         reached[:, t] = model.displacement(state)
         guess = 2 * state.voltage - last
         last = state.voltage
-        command[:, t], state = model.inverse(state, wanted[:, t + 1], stand.limits, guess, close)
+        command[:, t], state = model.inverse(state, desired[:, t + 1], stand.limits, guess, close)
     reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
     ends = np.cumsum([one.shape[0] for one in references])[:-1]
     parts = zip(references, np.split(command, ends), np.split(reached, ends), strict=True)
@@ -278,7 +278,7 @@ def _fed(
 
 
 def _plan(
-    wanted: FloatArray,
+    desired: FloatArray,
     begins: int,
     command: FloatArray,
     reached: FloatArray,
@@ -287,13 +287,13 @@ def _plan(
 ) -> Plan:
     """Return what the four controllers do to follow references (signals, samples)."""
     slope = ends.half / limits.half
-    linear = np.clip(limits.middle + (wanted - ends.middle) / slope, *limits)
-    nothing = np.zeros_like(wanted)
+    linear = np.clip(limits.middle + (desired - ends.middle) / slope, *limits)
+    nothing = np.zeros_like(desired)
     return Plan(
         np.stack([linear, command, nothing, command]),
-        np.stack([nothing, nothing, wanted, reached]),
+        np.stack([nothing, nothing, desired, reached]),
         LOOKS,
-        wanted,
+        desired,
         begins,
     )
 

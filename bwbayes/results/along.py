@@ -132,8 +132,9 @@ def moments_of(means: FloatArray, every: Sequence[FloatArray]) -> list[Moments]:
     result = []
     for sds, with_away, with_square in zip(every, first[1:], second[1:], strict=True):
         variance = second[0] + (sds**2).mean()
-        skewness = (third + 3 * with_away) / variance**1.5
-        kurtosis = (fourth + 6 * with_square + 3 * (sds**4).mean()) / variance**2
+        size = np.where(variance > 0, variance, 1.0)  # where all draws agree there is no shape
+        skewness = (third + 3 * with_away) / size**1.5
+        kurtosis = (fourth + 6 * with_square + 3 * (sds**4).mean()) / size**2
         moves = SKEWNESS_MOVES * skewness, KURTOSIS_MOVES * kurtosis
         result.append(Moments(mean, np.sqrt(variance), moves))
     return result

@@ -113,9 +113,9 @@ def finished(factory: pytest.TempPathFactory) -> Path:
 
 def numbers(folder: Path) -> dict[str, Any]:
     """Return the summary without what differs between two runs of the same."""
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    del found["wall_s"]
-    return found
+    result: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    del result["wall_s"]
+    return result
 
 
 def lowest_ess(folder: Path) -> float:

@@ -279,8 +279,8 @@ def test_a_page_can_be_read_aloud(chromium: Any, pages: dict[str, Path], name: s
     with Opened(chromium, pages[name]) as opened:
 
         def number(selector: str) -> int:
-            found: int = opened.page.locator(selector).count()
-            return found
+            outcome: int = opened.page.locator(selector).count()
+            return outcome
 
         assert [1, 1, 1] == [number(s) for s in ("html[lang=en]", "main", "h1")]
         assert 0 == number("img:not([alt]), img[alt='']")

@@ -115,7 +115,7 @@ def cut(whole: Path, path: Path, size: int) -> CalibrationFolder:
 
 def line_ends(whole: Path) -> list[int]:
     content = (whole / "replicates.jsonl").read_bytes()
-    return [found.end() for found in re.finditer(b"\n", content)]
+    return [result.end() for result in re.finditer(b"\n", content)]
 
 
 def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: Path) -> None:
@@ -131,18 +131,18 @@ def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: P
 
 
 def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
-    found = json.loads((whole / "calibration.json").read_text())
+    result = json.loads((whole / "calibration.json").read_text())
     assert (True, False, 3, [], 12) == tuple(
-        found[key] for key in ("passed", "telling", "replicates", "unconverged", "tests")
+        result[key] for key in ("passed", "telling", "replicates", "unconverged", "tests")
     )
-    assert 3 == found["seed"]
-    assert {"20 % too small", "10 % too small"} == set(found["power_of_one_smooth_test"])
+    assert 3 == result["seed"]
+    assert {"20 % too small", "10 % too small"} == set(result["power_of_one_smooth_test"])
     first, *lines = (whole / "replicates.jsonl").read_text().splitlines()
     assert 3 == json.loads(first)["replicates"]
     assert [0, 1, 2] == [json.loads(line)["number"] for line in lines]
     own = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
     bands = [*own, *(f"other {name}" for name in own)]
-    assert bands == list(found["bands"])
+    assert bands == list(result["bands"])
     for line in lines:
         assert bands == list(json.loads(line)["covered"])
 
@@ -236,8 +236,8 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
     expected = "NOT PASSED: 2 of 2 replicates did not converge, more than 1%; see "
     assert expected in printed.err
     assert "2 replicates, 2 not converged" in printed.out
-    found = json.loads((tmp_path / "a/calibration.json").read_text())
-    assert (False, [0, 1]) == (found["passed"], found["unconverged"])
+    result = json.loads((tmp_path / "a/calibration.json").read_text())
+    assert (False, [0, 1]) == (result["passed"], result["unconverged"])
     page = (tmp_path / "a/calibration.html").read_text(encoding="utf-8")
     assert "NOT PASSED" in page
     assert "replicates 0, 1" in page

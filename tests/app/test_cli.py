@@ -320,11 +320,11 @@ def test_simulate_writes_record_and_truth(bwbayes: Type, tmp_path: Path, suffix:
     expected = [f"a.{suffix}", *([f"a.truth.{suffix}"] if text else []), "a.truth.json"]
     assert [f"wrote {name}" for name in expected] == said.out.splitlines()
     assert set(expected) == {path.name for path in tmp_path.iterdir()}
-    found = read_record(tmp_path / f"a.{suffix}")
-    assert (200, "command") == (found.samples, found.voltage_is)
-    assert found.truth is not None
-    assert found.displacement is not None
-    assert np.std(found.displacement - found.truth) < 1  # the sensor's noise
+    result = read_record(tmp_path / f"a.{suffix}")
+    assert (200, "command") == (result.samples, result.voltage_is)
+    assert result.truth is not None
+    assert result.displacement is not None
+    assert np.std(result.displacement - result.truth) < 1  # the sensor's noise
     assert 0.3575 == json.loads((tmp_path / "a.truth.json").read_text())["alpha"]
 
 

@@ -28,19 +28,19 @@ def refused(text: str) -> str:
 
 
 def test_two_lines_are_a_config() -> None:
-    found = parse(RECORD, "my.toml")
-    assert found.records["record"].file == "record.csv"
+    result = parse(RECORD, "my.toml")
+    assert result.records["record"].file == "record.csv"
     assert (1, "lag", "auto", "discrepancy") == (
-        found.seed,
-        found.model.dynamics,
-        found.model.hold,
-        found.model.noise,
+        result.seed,
+        result.model.dynamics,
+        result.model.hold,
+        result.model.noise,
     )
 
 
 def test_five_lines_are_a_config() -> None:
-    found = parse(RECORD + '[model]\ndynamics = "none"\n[parameters]\n', "my.toml")
-    assert found.model.dynamics == "none"
+    result = parse(RECORD + '[model]\ndynamics = "none"\n[parameters]\n', "my.toml")
+    assert result.model.dynamics == "none"
 
 
 @pytest.mark.parametrize("named", ["ring_bender.toml", "measured_stack.toml"])
@@ -200,10 +200,10 @@ def test_validation_has_one_source(source: str) -> None:
 
 def test_a_window_of_another_record_is_what_is_judged() -> None:
     text = f'{RECORD}[validation.a]\nfile = "a.csv"\nwindow = [1.0, 2.0]\nlead_in_from = 0.5'
-    found = parse(text, "").validation["a"]
-    assert found.another
-    assert [1.0, 2.0] == found.window
-    assert 0.5 == found.lead_in_from
+    result = parse(text, "").validation["a"]
+    assert result.another
+    assert [1.0, 2.0] == result.window
+    assert 0.5 == result.lead_in_from
 
 
 def test_a_window_of_the_training_record_has_no_lead_in() -> None:
@@ -314,9 +314,9 @@ def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
         small.config(("seed = 3", 'seed = 3\nname = "µ \\"quoted\\" \\\\ name"')),
     ],
 )
-def test_dumped_config_is_the_same_config(found: Config) -> None:
-    assert found == parse(dump(found), "")
-    assert dump(found) == dump(parse(dump(found), ""))
+def test_dumped_config_is_the_same_config(result: Config) -> None:
+    assert result == parse(dump(result), "")
+    assert dump(result) == dump(parse(dump(result), ""))
 
 
 @settings(deadline=None)

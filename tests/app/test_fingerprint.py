@@ -13,6 +13,7 @@ import pytest
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.jobs.predict import predict
 from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running import assembling
 from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import UNSAID, fingerprint, require_same, version_remarks
 from bwbayes.app.running.folder import RunFolder
@@ -198,7 +199,7 @@ def test_other_versions_do_not_stop_a_report(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed = module.versions("numpy")
-    monkeypatch.setattr(module, "versions", lambda _: installed | {"numpy": "99"})
+    monkeypatch.setattr(assembling, "versions", lambda _: installed | {"numpy": "99"})
     (remark,) = [text for text in redraw(copy).remarks if "other versions" in text]
     assert remark.endswith(", now 99")
 

@@ -155,7 +155,7 @@ def assert_becomes_a_run(place: Path) -> None:
 
 def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
     """Check the cases of these numbers; return how often each kind ended with each status."""
-    found = {kind.strip(): Counter[int]() for kind in KINDS}
+    result = {kind.strip(): Counter[int]() for kind in KINDS}
     slowest = (0.0, "")
     for number in numbers:
         one = case(SEED, number)
@@ -166,12 +166,12 @@ def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
             error.add_note(f"case({SEED}, {number}): {one.kind}")
             raise
         slowest = max(slowest, (said.seconds, f"case({SEED}, {number}), {one.kind}"))
-        found[one.kind.strip()][said.status] += 1
+        result[one.kind.strip()][said.status] += 1
         (place / one.record).unlink()
     print(f"slowest: {slowest[0]:.2f} s, {slowest[1]}")
-    for kind, counts in found.items():
+    for kind, counts in result.items():
         print(f"{kind}: {counts[0]} used, {counts[2]} refused")
-    return found
+    return result
 
 
 @pytest.mark.usefixtures("quick_fit")
@@ -184,10 +184,10 @@ def test_1500_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_fit")
 def test_10000_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
-    found = spoilt(range(ALL), place)
-    used, refused = (sum(counts[status] for counts in found.values()) for status in (0, 2))
+    result = spoilt(range(ALL), place)
+    used, refused = (sum(counts[status] for counts in result.values()) for status in (0, 2))
     keep("hostile input", {"used": used, "refused": refused})
-    assert ALL == sum(counts.total() for counts in found.values())
+    assert ALL == sum(counts.total() for counts in result.values())
 
 
 def test_what_is_used_goes_through_the_whole_check(place: Path) -> None:

@@ -116,13 +116,13 @@ def finished(where: Path, *arguments: str) -> tuple[int | None, str, str]:
 
 def session(leader: int) -> list[str]:
     """Return the processes of a session that live: command lines."""
-    found = subprocess.run(
+    result = subprocess.run(
         ["ps", "-o", "stat=,args=", "--sid", str(leader)],
         capture_output=True,
         text=True,
         check=False,
     )
-    return [row for row in found.stdout.splitlines() if not row.startswith("Z")]
+    return [row for row in result.stdout.splitlines() if not row.startswith("Z")]
 
 
 def assert_alone(leader: int) -> None:

@@ -73,13 +73,13 @@ def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
 @pytest.fixture(scope="module")
 def steps() -> dict[str, StepResponse]:
     voltage = decaying_sine(200)
-    found = {}
+    outcome = {}
     for name, creep in (("one", None), ("two", Creep((0.1, 1.0)))):
         actuator = Actuator("lag", "first", 0.01, creep=creep)
         of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
         draws = of.prior.draw(np.random.default_rng(1), 20)
-        found[name] = measure_step(of, draws, Step(50.0, 5.0))
-    return found
+        outcome[name] = measure_step(of, draws, Step(50.0, 5.0))
+    return outcome
 
 
 def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:

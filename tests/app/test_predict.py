@@ -34,11 +34,11 @@ def test_scores_and_a_picture_lie_beside_the_bands(
     out = tmp_path / "new/bands.csv"
     arguments = run, tmp_path / "sine.h5", None, Start(from_rest=True), out, small.quiet()
     assert 0 == predict(*arguments, window=(2.0, 3.5))
-    found = json.loads(out.with_suffix(".json").read_text())
-    assert (2.0, 3.5) == pytest.approx((found["from_s"], found["to_s"]))
-    assert 75 == found["samples"]
-    assert 0 < found["scores"]["nrmse"]
-    assert found["holds"] in (True, None)
+    result = json.loads(out.with_suffix(".json").read_text())
+    assert (2.0, 3.5) == pytest.approx((result["from_s"], result["to_s"]))
+    assert 75 == result["samples"]
+    assert 0 < result["scores"]["nrmse"]
+    assert result["holds"] in (True, None)
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     out.unlink()
     with pytest.raises(InputError, match=r"bands.json: exists; choose another name, or give --ov"):
@@ -60,8 +60,8 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
     assert said.getvalue().startswith("DOES NOT HOLD: turned, not fitted: does not hold: ")
     assert "the displacement goes against the voltage" in said.getvalue()
     assert f"DOES NOT HOLD: turned; see {tmp_path / 'bands.png'}\n" in capsys.readouterr().err
-    found = json.loads(out.with_suffix(".json").read_text())
-    assert (False, "sign") == (found["holds"], found["cause"])
+    result = json.loads(out.with_suffix(".json").read_text())
+    assert (False, "sign") == (result["holds"], result["cause"])
 
 
 def test_a_files_own_columns_are_recognised(run: Path, record: Record, tmp_path: Path) -> None:
@@ -73,6 +73,6 @@ def test_a_files_own_columns_are_recognised(run: Path, record: Record, tmp_path:
     out = tmp_path / "bands.csv"
     start = Start(from_rest=True)
     assert 0 == predict(run, tmp_path / "sine.csv", None, start, out, small.quiet())
-    found = json.loads(out.with_suffix(".json").read_text())
-    assert record.samples == found["samples"]
-    assert found["holds"] in (True, None)
+    result = json.loads(out.with_suffix(".json").read_text())
+    assert record.samples == result["samples"]
+    assert result["holds"] in (True, None)

@@ -99,13 +99,13 @@ def test_each_purpose_and_each_seed_has_a_random_stream_of_its_own() -> None:
 
 
 def test_default_priors_depend_on_ranges_and_times_of_the_drive_alone(tmp_path: Path) -> None:
-    found = []
+    result = []
     for number, samples in ((1, 400), (2, 900)):
         write_record(record(samples, seed=number), tmp_path / "record.csv")
-        found.append(of(RECORD, tmp_path).parameters)
-    assert found[0] == found[1]
+        result.append(of(RECORD, tmp_path).parameters)
+    assert result[0] == result[1]
     write_record(record(interval=0.02), tmp_path / "record.csv")
-    assert found[0] != of(RECORD, tmp_path).parameters
+    assert result[0] != of(RECORD, tmp_path).parameters
 
 
 def test_free_exponent_has_its_own_unit_and_wider_scales_of_beta(folder: Path) -> None:
@@ -132,12 +132,12 @@ def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
     text = RECORD + "train = [[0.0, 2.0]]\n[validation.a]\nwindow = [2.0, 4.0]"
     made = record()
     assert made.displacement is not None
-    found = []
+    result = []
     for factor in (1.0, 3.0):
         displacement = made.displacement * np.where(np.arange(400) < 200, 1.0, factor)
         write_record(replace(made, displacement=displacement), tmp_path / "record.csv")
-        found.append(of(text, tmp_path).parameters)
-    assert found[0] == found[1]
+        result.append(of(text, tmp_path).parameters)
+    assert result[0] == result[1]
 
 
 def test_resolved_config_says_every_choice_in_numbers(folder: Path) -> None:
@@ -260,12 +260,12 @@ def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None
         "[parameters.d]\nprior = {distribution = 'normal', mean = 0.7, sd = 0.1}\nlower = 0.2\n"
         "unit = 'µm/V'\nlabel = 'D'\ndescription = 'gain'\n[parameters.gamma]\nfixed = 0.0"
     )
-    found = by_name(of(text, folder))
-    d = found["d"]
+    result = by_name(of(text, folder))
+    d = result["d"]
     assert d.prior is not None
     assert ("normal", {"mean": 0.7, "sd": 0.1}) == (d.prior.name, dict(d.prior.arguments))
     assert (0.2, np.inf, "µm/V", "D", "gain") == (d.lower, d.upper, d.unit, d.label, d.description)
-    assert (0.0, None) == (found["gamma"].fixed, found["gamma"].prior)
+    assert (0.0, None) == (result["gamma"].fixed, result["gamma"].prior)
 
 
 def test_integer_is_a_number(folder: Path) -> None:
@@ -359,8 +359,10 @@ def with_seed(seed: int) -> Config:
 def test_seed_makes_the_stands_records(tmp_path: Path) -> None:
     def readings(seed: int) -> dict[str, str]:
         problem = resolve(with_seed(seed), tmp_path)
-        found = {n: v.record.sha256 for n, v in problem.validations.items() if v.record is not None}
-        return found | {"training": problem.record.sha256}
+        result = {
+            n: v.record.sha256 for n, v in problem.validations.items() if v.record is not None
+        }
+        return result | {"training": problem.record.sha256}
 
     assert {"training", "sine"} == set(readings(1))
     assert readings(1) == readings(1)
@@ -368,11 +370,11 @@ def test_seed_makes_the_stands_records(tmp_path: Path) -> None:
 
 
 def test_true_values_of_a_simulated_record_are_known(tmp_path: Path) -> None:
-    found = resolve(small.config(), tmp_path).config.truth
+    result = resolve(small.config(), tmp_path).config.truth
     assert (0.7, 0.3575, 0.0272, 0.5) == tuple(
-        found[name] for name in ("d", "alpha", "beta", "sensor_sd")
+        result[name] for name in ("d", "alpha", "beta", "sensor_sd")
     )
-    assert "mass" not in found
+    assert "mass" not in result
 
 
 def test_warnings_of_a_record_become_remarks(tmp_path: Path) -> None:
@@ -436,6 +438,6 @@ def test_outliers_that_a_config_names_are_left_out(folder: Path) -> None:
 
 
 def test_steps_are_drawn_up_from_levels_and_their_dwell() -> None:
-    wanted = SignalConfig(shape="steps", levels=[0.0, 50.0, -20.0], dwell=2.0, duration=7.0)
-    _, voltage = sampled_waveform(wanted).sample(10.0)
+    required = SignalConfig(shape="steps", levels=[0.0, 50.0, -20.0], dwell=2.0, duration=7.0)
+    _, voltage = sampled_waveform(required).sample(10.0)
     np.testing.assert_array_equal(np.repeat([0.0, 50.0, -20.0], [20, 20, 30]), voltage)

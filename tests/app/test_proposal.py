@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from bwbayes.app.commands import cli, run
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import Proposal, propose
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import load_run
 from bwbayes.arrays import FloatArray
@@ -298,6 +298,15 @@ def test_run_without_a_config_runs_the_proposed_one(
     assert "fitting 0 to 4.5 s; the rest is held out; `bwbayes init" in said
 
 
+def shown_alone(
+    path: Path, *_: object, show: Callable[[Problem], None] | None = None, **__: object
+) -> int:
+    """Show what a run shows before it samples, and leave the rest."""
+    if show is not None:
+        show(load_run(RunFolder(path)))
+    return 0
+
+
 @pytest.mark.parametrize("command_line", ["init", "run", "run my.toml"])
 def test_what_the_reader_remarks_is_shown_and_kept(
     write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command_line: str
@@ -307,7 +316,7 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     header, *rows = path.read_text().splitlines()
     path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
     remark = "mine.csv:1: ignored columns: temperature_C"
-    monkeypatch.setattr(run, "finish", lambda *_, **__: 0)
+    monkeypatch.setattr(run, "finish", shown_alone)
     name, _, config = command_line.partition(" ")
     if config:
         path = path.with_suffix(".toml")

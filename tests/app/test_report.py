@@ -38,12 +38,12 @@ def page(run: Result) -> str:
 def rows(text: str, table: str) -> dict[str, list[str]]:
     """Return a table's cells by their row's first cell, without tags."""
     body = re.findall(rf'<table id="{table}"[^>]*>.*?<tbody>(.*?)</tbody>', text, re.DOTALL)[0]
-    found = {}
+    seen = {}
     for row in re.findall(r"<tr.*?</tr>", body, re.DOTALL):
         cells = re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL)
         first, *rest = (re.sub(r"<.*?>", "", cell) for cell in cells)
-        found[first] = rest
-    return found
+        seen[first] = rest
+    return seen
 
 
 def words(parameter: Parameter) -> str:

@@ -87,30 +87,30 @@ def assert_numbers(table: dict[str, Any], *names: str) -> None:
 
 
 def test_summary_says_how_the_run_ended(run: Path) -> None:
-    found = json.loads((run / "summary.json").read_text())
-    assert found["converged"] is True
-    assert "converged on two checks in a row" == found["stop_reason"]
-    assert 3 == found["seed"]
-    assert_numbers(found, "wall_s")
-    assert 0 < found["wall_s"]
+    answer = json.loads((run / "summary.json").read_text())
+    assert answer["converged"] is True
+    assert "converged on two checks in a row" == answer["stop_reason"]
+    assert 3 == answer["seed"]
+    assert_numbers(answer, "wall_s")
+    assert 0 < answer["wall_s"]
     assert {"python", "bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py"} <= set(
-        found["versions"]
+        answer["versions"]
     )
-    assert all(isinstance(text, str) for text in found["versions"].values())
+    assert all(isinstance(text, str) for text in answer["versions"].values())
     problem = module.load_run(RunFolder(run))
-    assert problem.record.sha256 == found["data_sha256"]
+    assert problem.record.sha256 == answer["data_sha256"]
 
 
 def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> None:
-    found = json.loads((run / "summary.json").read_text())
+    answer = json.loads((run / "summary.json").read_text())
     chain = ChainFile.read(run / "chain.h5")
     moves = chain.moves("sampling")
     assert {"differential evolution", "snooker", "mixture"} == set(moves)
-    sampling = found["sampling"]
+    sampling = answer["sampling"]
     assert {name: tried for name, (tried, _) in moves.items()} == sampling["proposals"]
     assert {name: kept / tried for name, (tried, kept) in moves.items()} == sampling["acceptance"]
     overall = sum(kept for _, kept in moves.values()) / sum(tried for tried, _ in moves.values())
-    assert overall == pytest.approx(found["acceptance"])
+    assert overall == pytest.approx(answer["acceptance"])
     assert sampling["pareto_k"] < 0.7
 
 
@@ -131,9 +131,9 @@ def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
 
 
 def test_summary_has_every_free_parameter(run: Path) -> None:
-    found = json.loads((run / "summary.json").read_text())["parameters"]
-    assert set(FREE) == set(found)
-    for name, row in found.items():
+    answer = json.loads((run / "summary.json").read_text())["parameters"]
+    assert set(FREE) == set(answer)
+    for name, row in answer.items():
         assert_numbers(row, "mean", "sd", "median", "lower_95", "upper_95")
         assert_numbers(row, "ess_bulk", "ess_tail", "rhat", "mcse_mean")
         assert isinstance(row["unit"], str), name
@@ -142,13 +142,13 @@ def test_summary_has_every_free_parameter(run: Path) -> None:
         assert min(row["ess_bulk"], row["ess_tail"]) >= 200
         assert row["rhat"] < 1.01
         assert 0 < row["mcse_mean"] < row["sd"]
-    assert ("um/V", "1/V", "s") == tuple(found[n]["unit"] for n in ("d", "beta", "lag"))
+    assert ("um/V", "1/V", "s") == tuple(answer[n]["unit"] for n in ("d", "beta", "lag"))
 
 
 def test_summary_judges_every_prediction(run: Path) -> None:
-    found = json.loads((run / "summary.json").read_text())["validation"]
-    assert {"held-out", "sine"} <= set(found)
-    for row in found.values():
+    answer = json.loads((run / "summary.json").read_text())["validation"]
+    assert {"held-out", "sine"} <= set(answer)
+    for row in answer.values():
         assert_numbers(row, "nrmse", "max_error_um", "crps_um", "width_95_um")
         assert 0 < row["nrmse"] < 0.1
         for kind in ("sensor", "displacement"):
@@ -161,10 +161,10 @@ def test_coverage_of_the_displacement_needs_a_truth(copy: RunFolder) -> None:
     path = copy.path / "records/sine.h5"
     write_record(replace(read_record(path), truth=None), path)
     carry_on(copy, small.quiet(), workers=1)
-    found = small.numbers(copy.path)["validation"]
-    assert found["sine"]["coverage"]["displacement"] is None
-    assert set(found["sine"]["coverage"]["sensor"]) == LEVELS
-    assert found["held-out"]["coverage"]["displacement"] is not None
+    answer = small.numbers(copy.path)["validation"]
+    assert answer["sine"]["coverage"]["displacement"] is None
+    assert set(answer["sine"]["coverage"]["sensor"]) == LEVELS
+    assert answer["held-out"]["coverage"]["displacement"] is not None
 
 
 def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
@@ -210,12 +210,12 @@ def test_posterior_has_the_log_likelihood_of_each_draw(run: Path) -> None:
     """It is that of all readings together, and with the log prior it makes the log density."""
     posterior = module.load_run(RunFolder(run)).posterior
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
-        found = tree["log_likelihood"].to_dataset()["displacement"]
+        answer = tree["log_likelihood"].to_dataset()["displacement"]
         drawn = tree["posterior"].to_dataset()
         free = np.array([[float(drawn[n][c, 3]) for n in posterior.names] for c in (0, 20, 71)])
         expected = posterior.log_likelihood(posterior.prior.theta(free))
-        np.testing.assert_allclose(found.values[[0, 20, 71], 3], expected, rtol=0, atol=1e-6)
-        assert found.shape == tree["sample_stats"].to_dataset()["lp"].shape
+        np.testing.assert_allclose(answer.values[[0, 20, 71], 3], expected, rtol=0, atol=1e-6)
+        assert answer.shape == tree["sample_stats"].to_dataset()["lp"].shape
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -224,14 +224,14 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_bands_have_every_window_and_kind(run: Path) -> None:
-    found = rows(run / "bands.csv")
+    answer = rows(run / "bands.csv")
     kinds = ("parameter", "displacement", "sensor")
     edges = {f"{k}_{e}_{n}_um" for k in kinds for e in ("lower", "upper") for n in LEVELS}
     names = {"set", "time_s", "voltage_V", "displacement_um", "mean_um"}
-    assert names | edges == set(found[0])
-    counts = {n: sum(row["set"] == n for row in found) for n in ("training", "held-out", "sine")}
+    assert names | edges == set(answer[0])
+    counts = {n: sum(row["set"] == n for row in answer) for n in ("training", "held-out", "sine")}
     assert {"training": 250, "held-out": 50, "sine": 200} == counts
-    assert all(np.isfinite(float(v)) for row in found for n, v in row.items() if n != "set")
+    assert all(np.isfinite(float(v)) for row in answer for n, v in row.items() if n != "set")
 
 
 def test_report_needs_nothing_but_itself(run: Path) -> None:
@@ -297,9 +297,9 @@ def watch_until(monkeypatch: pytest.MonkeyPatch, last: str, count: int) -> None:
     """Interrupt the next run after so many blocks of single ensembles in a phase."""
     seen = 0
 
-    def watched(_: Progress, phase: Phase, found: Check | None) -> None:
+    def watched(_: Progress, phase: Phase, answer: Check | None) -> None:
         nonlocal seen
-        seen += phase == last and found is None
+        seen += phase == last and answer is None
         if seen == count:
             raise KeyboardInterrupt
 
@@ -354,8 +354,8 @@ def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
 def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: RunFolder) -> None:
     before = small.numbers(run)["parameters"]
     fewest = min(min(row["ess_bulk"], row["ess_tail"]) for row in before.values())
-    wanted = float(np.ceil(1.3 * fewest))
-    result = carry_on(copy, small.quiet(), workers=1, ess=wanted)
+    required = float(np.ceil(1.3 * fewest))
+    result = carry_on(copy, small.quiet(), workers=1, ess=required)
     assert result.outcome.converged
     first, longer = ChainFile.read(run / "chain.h5"), ChainFile.read(copy.chain)
     steps = first.steps("sampling")
@@ -363,8 +363,8 @@ def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: Run
     np.testing.assert_array_equal(
         first.coordinates("sampling"), longer.coordinates("sampling")[:steps]
     )
-    found = small.numbers(copy.path)["parameters"]
-    assert all(min(row["ess_bulk"], row["ess_tail"]) >= wanted for row in found.values())
+    answer = small.numbers(copy.path)["parameters"]
+    assert all(min(row["ess_bulk"], row["ess_tail"]) >= required for row in answer.values())
 
 
 # Files that do not fit together

@@ -45,9 +45,9 @@ def test_run_without_convergence_speaks_of_no_interval(
 ) -> None:
     made, status = cut_short
     assert 4 == status
-    found = small.numbers(made.path)
-    assert (False, None, None) == (found["converged"], found["parameters"], found["validation"])
-    assert found["stop_reason"].startswith("budget of 25 steps used up: ")
+    seen = small.numbers(made.path)
+    assert (False, None, None) == (seen["converged"], seen["parameters"], seen["validation"])
+    assert seen["stop_reason"].startswith("budget of 25 steps used up: ")
     bands = made.path / "bands.csv"
     assert not bands.exists() or not bands.read_text().strip()
     page = (made.path / "report.html").read_text(encoding="utf-8")
@@ -139,8 +139,8 @@ def test_hard_case_ends_with_status_4_and_without_parameters(
     monkeypatch.setattr(module, "draw_all", lambda _: {})
     folder = run_with(run, tmp_path / "a", HARD[name](np.random.default_rng(1), 8))
     assert 4 == finish(folder.path, 1, quiet=True, ess=1)
-    found = small.numbers(folder.path)
-    assert (False, None, None) == (found["converged"], found["parameters"], found["validation"])
+    seen = small.numbers(folder.path)
+    assert (False, None, None) == (seen["converged"], seen["parameters"], seen["validation"])
     assert not (folder.path / "bands.csv").exists()
 
 

@@ -352,8 +352,8 @@ def test_whatever_a_validation_is_called_all_stays_in_the_folder(bench: Path, na
     text = CONFIGS[1].replace("other", name)
     RunFolder.create(bench / "out", resolve(parse(text, "my.toml"), bench), overwrite=False)
     assert {"record.csv", "out"} == {path.name for path in bench.iterdir()}
-    found = {str(path.relative_to(bench / "out")) for path in (bench / "out").rglob("*")}
-    assert {"config.toml", "records", "records/record.h5", f"records/{name}.h5"} == found
+    outcome = {str(path.relative_to(bench / "out")) for path in (bench / "out").rglob("*")}
+    assert {"config.toml", "records", "records/record.h5", f"records/{name}.h5"} == outcome
 
 
 @pytest.mark.parametrize("out", ["results/..", "x" * 250, "record.csv/out"])

@@ -16,15 +16,17 @@ from tests.inference.problems import short_posterior, truth
 def linear_algebra_threads() -> set[int]:
     """Return how many threads the linear algebra libraries of this process use."""
     np.linalg.solve(np.eye(2), np.eye(2))
-    return {found["num_threads"] for found in threadpool_info() if found["user_api"] == "blas"}
+    return {
+        outcome["num_threads"] for outcome in threadpool_info() if outcome["user_api"] == "blas"
+    }
 
 
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_workers_use_one_thread_for_linear_algebra(workers: int, engine: Engine) -> None:
     with one_thread(), executor(workers, engine) as pool:
-        found = [pool.submit(linear_algebra_threads) for _ in range(2 * workers)]
-        assert [{1}] * len(found) == [future.result() for future in found]
+        outcome = [pool.submit(linear_algebra_threads) for _ in range(2 * workers)]
+        assert [{1}] * len(outcome) == [future.result() for future in outcome]
 
 
 @pytest.mark.parametrize("engine", ["numpy", "numba"])

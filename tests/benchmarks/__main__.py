@@ -17,7 +17,7 @@ from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
 from tests.measured import keep
 
-# Name, sign and number of each target; what was found is in `_found`.
+# Name, sign and number of each target; what each came to is in `_reached`.
 TARGETS: tuple[tuple[str, str, float], ...] = (
     ("effective draws/s, times emcee's defaults on a per-sample NumPy loop", ">=", 300),
     ("effective draws/s, times emcee's defaults on our NumPy engine", ">=", 100),
@@ -79,13 +79,13 @@ def _measured(effort: Effort) -> Iterator[Table]:
 
 def _targets(tables: dict[str, Table]) -> Table:
     rows: list[dict[str, Cell]] = []
-    for (name, sign, wanted), found in zip(TARGETS, _found(tables), strict=True):
-        met = found >= wanted if sign == ">=" else found <= wanted
-        rows.append({"target": name, "wanted": f"{sign} {wanted:g}", "found": found, "met": met})
+    for (name, sign, required), result in zip(TARGETS, _reached(tables), strict=True):
+        met = result >= required if sign == ">=" else result <= required
+        rows.append({"target": name, "wanted": f"{sign} {required:g}", "found": result, "met": met})
     return Table("targets", "Targets", "for a quiet machine with two cores", rows)
 
 
-def _found(tables: dict[str, Table]) -> Iterator[float]:
+def _reached(tables: dict[str, Table]) -> Iterator[float]:
     """Pick what the targets are about, in their order."""
     rate = {
         (r["moves"], r["engine"]): _number(r["draws/s"]) for r in _rows(tables, "effective_draws")

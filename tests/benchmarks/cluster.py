@@ -76,7 +76,7 @@ def scaling() -> dict[str, Any]:
     """Measure with 1, 2, 4 and 8 waiting workers, threads of two processes."""
     import distributed  # noqa: PLC0415  # takes a second, and one benchmark needs it
 
-    found: dict[str, Any] = {}
+    outcome: dict[str, Any] = {}
     with (
         distributed.LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=2, threads_per_worker=WORKERS[-1] // 2, dashboard_address=None
@@ -85,14 +85,14 @@ def scaling() -> dict[str, Any]:
         Cluster(client) as pool,
     ):
         busiest(pool, 50)  # the first calls fetch the posterior
-        found["call_ms"] = 1000 * busiest(pool)
+        outcome["call_ms"] = 1000 * busiest(pool)
         for workers, seconds in product(WORKERS, LENGTHS):
             each = overhead(pool, workers, seconds)
-            found[f"{workers} workers, calls of {seconds:g} s"] = {
+            outcome[f"{workers} workers, calls of {seconds:g} s"] = {
                 "busy": seconds / each,
                 "lost_ms": 1000 * (each - seconds),
             }
-    return found
+    return outcome
 
 
 def on_paper(call: float) -> dict[str, float]:
@@ -123,14 +123,14 @@ def replicated(count: int) -> dict[str, float]:
 
 def main(arguments: list[str]) -> None:
     """Measure, print and keep."""
-    found = scaling()
-    found["on_paper"] = on_paper(found["call_ms"] / 1000)
+    outcome = scaling()
+    outcome["on_paper"] = on_paper(outcome["call_ms"] / 1000)
     if "--replicates" in arguments:
         count = int(arguments[arguments.index("--replicates") + 1])
-        found[f"calibration of {count}"] = replicated(count)
-    for name, value in found.items():
+        outcome[f"calibration of {count}"] = replicated(count)
+    for name, value in outcome.items():
         sys.stdout.write(f"{name}: {value}\n")
-    keep("cluster", found)
+    keep("cluster", outcome)
 
 
 if __name__ == "__main__":

@@ -204,10 +204,10 @@ def _steps(draws: Mapping[str, float], cost: Mapping[Contestant, Cost]) -> Table
             "moves": move,
             "engine": engine,
             "draws per step": draws[move],
-            "ms per step": 1e3 * found.wall,
-            "core ms per step": 1e3 * found.cpu,
+            "ms per step": 1e3 * seen.wall,
+            "core ms per step": 1e3 * seen.cpu,
         }
-        for (move, engine), found in cost.items()
+        for (move, engine), seen in cost.items()
     ]
     return Table("steps", f"Moves of {WALKERS} walkers", "one ensemble on one core", rows)
 

@@ -67,7 +67,7 @@ def startup(effort: Effort) -> Table:
             cost["compile the engine, once"] = timed(first)
             cost["bwbayes run, all of it"] = timed(started(_run(Path(folder))))
     rows: list[dict[str, Cell]] = [
-        {"start": name, "s": found.wall, "core s": found.cpu} for name, found in cost.items()
+        {"start": name, "s": result.wall, "core s": result.cpu} for name, result in cost.items()
     ]
     note = "a process each, best of several; compiling and the whole run are measured once"
     return Table("startup", "Start-up", note, rows)

@@ -31,14 +31,14 @@ def interleaved[Name: Hashable](
     contestants: Mapping[Name, Callable[[], object]], rounds: int
 ) -> dict[Name, Cost]:
     """Return the least cost of each contestant's call, over rounds in which all take a turn."""
-    found: dict[Name, list[Cost]] = {name: [] for name in contestants}
+    result: dict[Name, list[Cost]] = {name: [] for name in contestants}
     for _ in range(rounds):
         for name, call in contestants.items():
             end = time.perf_counter() + TURN
-            found[name].append(timed(call))
+            result[name].append(timed(call))
             while time.perf_counter() < end:
-                found[name].append(timed(call))
-    return {name: Cost(*map(min, zip(*costs, strict=True))) for name, costs in found.items()}
+                result[name].append(timed(call))
+    return {name: Cost(*map(min, zip(*costs, strict=True))) for name, costs in result.items()}
 
 
 def _cpu() -> float:

@@ -154,8 +154,8 @@ def asked() -> Reference:
 def test_truths_are_where_the_command_says(asked: Reference) -> None:
     of, source = problem(), np.random.default_rng(3)
     command = made(of, asked, about(of, 0.02, 400, source))
-    found = off(promised(of, command, about(of, 0.02, 400, source), source), 400)
-    assert max(abs(value) for value in found.values()) < 4.0, found
+    result = off(promised(of, command, about(of, 0.02, 400, source), source), 400)
+    assert max(abs(value) for value in result.values()) < 4.0, result
 
 
 def covered_early(of: Problem, command: Compensation, truths: FloatArray) -> dict[Any, float]:
@@ -195,8 +195,8 @@ def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: R
         made = compensate(of.posterior, flat, asked, source, limits=LIMITS, **options)
         return off(covered_early(of, made, truths), 400)
 
-    found = anywhere()
-    assert max(abs(value) for value in found.values()) < 4.0, found
+    result = anywhere()
+    assert max(abs(value) for value in result.values()) < 4.0, result
     sure = anywhere(from_rest=True)
     assert sure["early", 95] < -4.0, sure
 
@@ -205,8 +205,8 @@ def test_twin_draws_that_are_too_sure_are_found(asked: Reference) -> None:
     of, source = problem(), np.random.default_rng(3)
     flat = about(of, 0.005, 400, source)
     flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.5
-    found = off(promised(of, made(of, asked, flat), about(of, 0.02, 400, source), source), 400)
-    assert min(found["band", 95], found["rms", 95]) < -4.0, found
+    result = off(promised(of, made(of, asked, flat), about(of, 0.02, 400, source), source), 400)
+    assert min(result["band", 95], result["rms", 95]) < -4.0, result
 
 
 def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: Reference) -> None:

@@ -49,13 +49,13 @@ def test_margins_of_an_integrator_are_the_closed_form(
 ) -> None:
     """L = K z^−(1+D) / (1 − 1/z): |L| = K / (2 sin(θ/2)), its lag is π/2 + (D + 1/2) θ."""
     made = without_hysteresis(slope)
-    found = margins(Gains((speed / slope, 0.0, 0.0), 1e-3), made, cases.SPAN, delay)
+    result = margins(Gains((speed / slope, 0.0, 0.0), 1e-3), made, cases.SPAN, delay)
     crossing = 2 * np.arcsin(speed / 2)
     gain = 2 * np.sin(np.pi / (2 * (2 * delay + 1))) / speed
-    assert found.gain[0] == pytest.approx(gain, rel=0.02)
-    assert found.phase[0] == pytest.approx(90 - np.degrees((delay + 0.5) * crossing), abs=1.0)
-    assert found.crossover[0] == pytest.approx(crossing / (2 * np.pi * 1e-3), rel=0.02)
-    assert bool(gain > 1) == (found.pole[0] < 1)
+    assert result.gain[0] == pytest.approx(gain, rel=0.02)
+    assert result.phase[0] == pytest.approx(90 - np.degrees((delay + 0.5) * crossing), abs=1.0)
+    assert result.crossover[0] == pytest.approx(crossing / (2 * np.pi * 1e-3), rel=0.02)
+    assert bool(gain > 1) == (result.pole[0] < 1)
 
 
 @every_actuator
@@ -75,13 +75,13 @@ def test_at_its_gain_margin_a_loop_has_a_pole_on_the_circle(name: str) -> None:
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_a_design_keeps_its_margins_and_is_the_fastest(name: str, delay: int) -> None:
     draws = models(name)
-    wanted = Robustness(2.5, 50.0)
-    gains, found = design(draws, draws, cases.SPAN, delay, wanted)
-    assert found.stable
-    assert (found.gain >= wanted.gain).all()
-    assert (found.phase >= wanted.phase).all()
+    required = Robustness(2.5, 50.0)
+    gains, result = design(draws, draws, cases.SPAN, delay, required)
+    assert result.stable
+    assert (result.gain >= required.gain).all()
+    assert (result.phase >= required.phase).all()
     faster = margins(scaled(gains, 1.03), draws, cases.SPAN, delay)
-    kept = (faster.gain >= wanted.gain) & (faster.phase >= wanted.phase) & (faster.circle > 0)
+    kept = (faster.gain >= required.gain) & (faster.phase >= required.phase) & (faster.circle > 0)
     assert not kept.all()
 
 
@@ -102,8 +102,8 @@ def test_the_controllers_zeros_are_the_models_poles() -> None:
 def test_slopes_that_change_from_sample_to_sample_leave_it_stable() -> None:
     """What the circle criterion promises, tried: increments die out whatever the slopes are."""
     draws = models("bouc-wen, second-order", 3)
-    gains, found = design(draws, draws, cases.SPAN, 1, Robustness())
-    assert (found.circle > 0).all()
+    gains, result = design(draws, draws, cases.SPAN, 1, Robustness())
+    assert (result.circle > 0).all()
     generator = np.random.default_rng(3)
     least, largest = draws.slopes(cases.SPAN)
     _, first, second = draws.sections.numerator[0, 0]

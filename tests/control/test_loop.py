@@ -67,15 +67,15 @@ def slowly(
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
     actuator, theta, rows = of(name, 2, 6)
-    wanted = references()
-    ahead = np.stack([wanted / 0.6, np.zeros_like(wanted), wanted / 0.6])
+    required = references()
+    ahead = np.stack([required / 0.6, np.zeros_like(required), required / 0.6])
     # So near that it is met: then the answers are kept to what is still to be had.
     stand = Stand(Span(-55.0, 45.0), delay, Amplifier(current=0.02))
     plan = Plan(
         np.clip(ahead, -55, 45),
-        np.stack([0 * wanted, wanted, wanted]),
+        np.stack([0 * required, required, required]),
         (False, True, True),
-        wanted,
+        required,
         10,
     )
     gains = Gains((1.2, -0.9, 0.02), 1e-3)
@@ -88,17 +88,17 @@ def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
 
 def test_without_feedback_it_is_the_virtual_stands_amplifier_and_actuator() -> None:
     actuator, theta, rows = of("bouc-wen with all", 2, 2)
-    wanted = references(400)
-    command = np.clip(wanted / 0.5, -80, 80)
+    required = references(400)
+    command = np.clip(required / 0.5, -80, 80)
     command[:, 0] = 0.0
     stand = Stand(Span(-100.0, 100.0))
-    plan = Plan(command[np.newaxis], wanted[np.newaxis], (False,), wanted, 0)
+    plan = Plan(command[np.newaxis], required[np.newaxis], (False,), required, 0)
     gains = Gains((1.0, 0.0, 0.0), 1e-3)
     got = follow(plan, gains, rows, QUIET, stand, np.random.default_rng(1))
     for s in range(2):
         output = stand.amplifier.output(command[s], 1e-3)
         x = actuator.displacement(theta, output, from_rest=True)[:, :-1]
-        rms = np.sqrt(np.mean((x - wanted[s, :-1]) ** 2, axis=1))
+        rms = np.sqrt(np.mean((x - required[s, :-1]) ** 2, axis=1))
         np.testing.assert_allclose(got.rms[0, s], rms, rtol=1e-9)
 
 
@@ -110,8 +110,8 @@ def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
     a process with a wrong time or sd 4 % off is noticed. Sensor noise alone leaves none.
     """
     _, _, rows = of("bouc-wen", 1, 400)
-    wanted = np.zeros((1, 1001))
-    plan = Plan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), wanted, 0)
+    required = np.zeros((1, 1001))
+    plan = Plan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), required, 0)
     noise = Noise(np.full(400, 0.5), np.full(400, 1.5), np.full(400, 0.01))
     gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(cases.SPAN)
     got = follow(plan, gains, rows, noise, stand, np.random.default_rng(8))
@@ -127,10 +127,10 @@ def test_out_of_reach_for_long_it_comes_back_at_once() -> None:
     limits = Span(-50.0, 50.0)
     one = SampledModel.of(actuator, theta)
     gains, _ = design(one, one, limits, 1, Robustness())
-    wanted = np.concatenate([np.full(1000, 200.0), np.zeros(201)])[np.newaxis]
+    required = np.concatenate([np.full(1000, 200.0), np.zeros(201)])[np.newaxis]
 
     def error(begins: int) -> float:
-        plan = Plan(np.zeros((1, 1, 1201)), wanted[np.newaxis], (True,), wanted, begins)
+        plan = Plan(np.zeros((1, 1, 1201)), required[np.newaxis], (True,), required, begins)
         stand, generator = Stand(limits), np.random.default_rng(1)
         return float(follow(plan, gains, rows, QUIET, stand, generator).largest.max())
 

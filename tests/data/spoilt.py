@@ -54,11 +54,11 @@ def _run(
     rate = float(generator.choice([100.0, 250.0, 1000.0]))
     kinds: tuple[Discrepancy, ...] = ("none", "process", "structural")
     stand = VirtualTestStand(kinds[generator.integers(3)], rate)
-    wanted = drive(float(generator.choice(amplitudes)), rate, generator)
+    required = drive(float(generator.choice(amplitudes)), rate, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        record = stand.run(wanted, generator)
-    if isinstance(wanted, Waveform) and wanted.decay.start == FROM_MOTION.start:
+        record = stand.run(required, generator)
+    if isinstance(required, Waveform) and required.decay.start == FROM_MOTION.start:
         return record.window(float(generator.uniform(1, 3)), record.duration)
     return record
 

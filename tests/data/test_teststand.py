@@ -46,9 +46,9 @@ def scalar_output(command: FloatArray) -> list[float]:
     """DAC, limit and slew, one sample at a time, with the paper's numbers."""
     levels = [round(volt / 20 / (20 / 4096)) * (20 / 4096) * 20 for volt in command]
     output = [levels[0]]
-    for wanted in levels[1:]:
+    for required in levels[1:]:
         most = 0.065 / 940e-9 * MILLISECOND
-        change = min(max(-100.0, min(100.0, wanted)) - output[-1], most)
+        change = min(max(-100.0, min(100.0, required)) - output[-1], most)
         output.append(output[-1] + max(change, -most))
     return output
 

@@ -355,7 +355,7 @@ def worst_score(
     posterior = target(known.log_density, known.free)
     origin = np.zeros(known.free)
     _, point = gaussian(known.free)
-    found = []
+    result = []
     for child in np.random.SeedSequence(seed).spawn(REPLICATES):
         generator = np.random.default_rng(child)
         draws = known.draw(generator, walkers)
@@ -363,8 +363,8 @@ def worst_score(
         state = start(flat, replace(point, mode=origin), 0, walkers, generator)
         state = replace(state, coordinates=draws, log_density=known.log_density(draws))
         chain = known.view(advance(posterior, moves, state, steps).coordinates)
-        found.append([np.mean(chain**power, axis=(0, 1)) for power in (1, 2)])
-    means = np.array(found)
+        result.append([np.mean(chain**power, axis=(0, 1)) for power in (1, 2)])
+    means = np.array(result)
     error = np.std(means, axis=0, ddof=1) / np.sqrt(REPLICATES)
     scores: FloatArray = np.abs(np.mean(means, axis=0) - known.moments) / error
     return float(np.max(scores))

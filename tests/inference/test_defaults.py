@@ -37,16 +37,16 @@ def displacement(voltage: FloatArray, interval: float = 1e-3, offset: float = 0.
 
 
 def prior(name: str, ranges: Ranges, exponent: float | Distribution = 1.0) -> Distribution:
-    found = default_prior(name, ranges, exponent, 4.1e5)
-    assert isinstance(found, Distribution)
-    return found
+    result = default_prior(name, ranges, exponent, 4.1e5)
+    assert isinstance(result, Distribution)
+    return result
 
 
 def score(name: str, value: float, ranges: Ranges, exponent: float | Distribution = 1.0) -> float:
     """Return how many prior sds a value lies from the median."""
-    found = prior(name, ranges, exponent)
+    result = prior(name, ranges, exponent)
     ends = np.array([-np.inf, np.inf])
-    return float(found.to_normal(np.array([value]), ends[0], ends[1])[0])
+    return float(result.to_normal(np.array([value]), ends[0], ends[1])[0])
 
 
 @settings(deadline=None, max_examples=30)
@@ -158,9 +158,9 @@ def test_offset_is_as_exact_as_the_displacements_range_asks(offset: float) -> No
     voltage = drive(1.0)
     reading = displacement(voltage, offset=offset)
     ranges = ranges_of(voltage, reading, 1e-3)
-    found = prior("offset", ranges).arguments
-    assert abs(found["mean"] - ranges.middle) < 0.01 * found["sd"]
-    assert len(f"{found['mean']:.12g}") <= 12
+    result = prior("offset", ranges).arguments
+    assert abs(result["mean"] - ranges.middle) < 0.01 * result["sd"]
+    assert len(f"{result['mean']:.12g}") <= 12
 
 
 def test_missing_readings_do_not_matter() -> None:

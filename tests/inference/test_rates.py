@@ -61,9 +61,9 @@ def apart(every: int, seed: int, *, twin: bool) -> dict[str, float]:
 
 @pytest.mark.parametrize(("every", "seed"), [(5, 1), (10, 2)])
 def test_every_kth_sample_gives_the_same_answer(every: int, seed: int) -> None:
-    found = apart(every, seed, twin=False)
-    assert max(found.pop("sensor_sd"), found.pop("lag")) < 2
-    assert max(found.values()) < 0.6, found
+    result = apart(every, seed, twin=False)
+    assert max(result.pop("sensor_sd"), result.pop("lag")) < 2
+    assert max(result.values()) < 0.6, result
 
 
 def test_twin_with_priors_of_so_many_intervals_gives_another() -> None:

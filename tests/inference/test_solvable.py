@@ -166,9 +166,9 @@ def sampled(posterior: Posterior) -> FloatArray:
     return draws(posterior, chain)
 
 
-def scores(known: Normal, found: FloatArray) -> dict[str, float]:
+def scores(known: Normal, result: FloatArray) -> dict[str, float]:
     """t-scores of draws (steps, ensembles, walkers, free) against what is known of them."""
-    z = (found - known.mean) / known.sd
+    z = (result - known.mean) / known.sd
     correlation = known.covariance / np.outer(known.sd, known.sd)
     statistics: dict[str, tuple[FloatArray, float]] = {}
     for i in range(known.mean.size):
@@ -188,8 +188,8 @@ def t_score(values: FloatArray, expected: float) -> float:
     return float((np.mean(means) - expected) / (np.std(means, ddof=1) / means.size**0.5))
 
 
-def worst(known: Normal, found: FloatArray) -> float:
-    return max(map(abs, scores(known, found).values()))
+def worst(known: Normal, result: FloatArray) -> float:
+    return max(map(abs, scores(known, result).values()))
 
 
 @pytest.mark.parametrize("noise", ["white", "discrepancy"])
@@ -229,11 +229,11 @@ def test_the_point_fit_is_the_normal(free: tuple[str, ...], noise: str) -> None:
 @every_case
 def test_the_draws_are_from_the_normal(free: tuple[str, ...], noise: str) -> None:
     posterior = linear_posterior(free, noise)
-    known, found = closed_form(posterior), sampled(posterior)
-    off = scores(known, found)
+    known, result = closed_form(posterior), sampled(posterior)
+    off = scores(known, result)
     assert max(map(abs, off.values())) < ALARM, off
     # The twins: a likelihood that takes the noise for 0.8 times what it is ...
     wider = closed_form(linear_posterior(free, noise, noise_factor=1.25))
-    assert worst(wider, found) > 2 * ALARM
+    assert worst(wider, result) > 2 * ALARM
     # ... and the same draws, 7 % nearer to their mean.
-    assert worst(known, known.mean + 0.93 * (found - known.mean)) > ALARM
+    assert worst(known, known.mean + 0.93 * (result - known.mean)) > ALARM

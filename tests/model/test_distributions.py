@@ -167,7 +167,7 @@ def test_wrong_arguments_are_refused_in_one_line(
 
 def scipys_continuous() -> list[tuple[str, dict[str, float]]]:
     """Return every fifth continuous distribution of scipy with shapes from inside its domain."""
-    found = []
+    result = []
     for name, family in sorted(vars(stats).items()):
         if not isinstance(family, stats.rv_continuous) or name in ("uniform", "beta"):
             continue
@@ -178,9 +178,9 @@ def scipys_continuous() -> list[tuple[str, dict[str, float]]]:
                 warnings.simplefilter("ignore")
                 allowed = np.all(family._argcheck(*arguments.values()))
             if allowed and name not in ("levy_stable", "studentized_range"):
-                found.append((name, arguments))
+                result.append((name, arguments))
                 break
-    return found[::5]
+    return result[::5]
 
 
 @pytest.mark.parametrize(("name", "arguments"), scipys_continuous(), ids=lambda v: str(v)[:20])

@@ -55,8 +55,8 @@ def test_a_record_given_a_population_is_a_convolution(
     one = NormalLikelihoods(np.array([0.3]), np.array([sd**-2.0]))
     y = np.linspace(-30, 30, 60_001)
     product = stats.norm.pdf(0.3, y, sd) * stats.norm.pdf(y, mean, spread)
-    found = one.marginal(np.array([mean]), np.array([spread]))[0, 0]
-    assert np.exp(found) == pytest.approx(np.trapezoid(product, y), rel=1e-5, abs=1e-12)
+    result = one.marginal(np.array([mean]), np.array([spread]))[0, 0]
+    assert np.exp(result) == pytest.approx(np.trapezoid(product, y), rel=1e-5, abs=1e-12)
 
 
 def test_a_shrunk_specimen_is_the_conjugate_normal() -> None:

@@ -43,12 +43,12 @@ def calibrated(count: int, seed: int) -> dict[str, float]:
     }
     for _ in range(count):
         truth = drawn(generator)
-        found = population(truth.specimens, generator).parameters[NAME]
-        inside["mean"].append(covered(found.mean, truth.mean))
-        inside["spread"].append(covered(found.spread, truth.spread))
+        result = population(truth.specimens, generator).parameters[NAME]
+        inside["mean"].append(covered(result.mean, truth.mean))
+        inside["spread"].append(covered(result.spread, truth.spread))
         new = truth.mean + truth.spread * generator.standard_normal()
-        inside["new"].append(covered(found.new, new))
-        for y, one in zip(truth.truths, found.specimens.values(), strict=True):
+        inside["new"].append(covered(result.new, new))
+        for y, one in zip(truth.truths, result.specimens.values(), strict=True):
             inside["shrunk"].append(one.lower < y < one.upper)
             inside["width"].append((one.upper - one.lower) / (one.own_upper - one.own_lower))
     return {name: float(np.mean(values)) for name, values in inside.items()}
@@ -57,11 +57,11 @@ def calibrated(count: int, seed: int) -> dict[str, float]:
 @pytest.mark.parametrize("seed", [1])
 def test_intervals_of_populations_cover_what_they_say(seed: int) -> None:
     """40 populations of 8 specimens; a sound one fails once in 100 runs of this test."""
-    found = calibrated(QUICK, seed)
+    result = calibrated(QUICK, seed)
     for name in ("mean", "spread", "new"):
-        assert abs(found[name] - 0.95) <= misses(0.95, QUICK), name
-    assert abs(found["shrunk"] - 0.95) <= 2 * misses(0.95, 8 * QUICK)  # specimens go together
-    assert found["width"] < 1
+        assert abs(result[name] - 0.95) <= misses(0.95, QUICK), name
+    assert abs(result["shrunk"] - 0.95) <= 2 * misses(0.95, 8 * QUICK)  # specimens go together
+    assert result["width"] < 1
 
 
 def test_a_forgotten_division_by_the_prior_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,11 +78,11 @@ def test_a_forgotten_division_by_the_prior_is_noticed(monkeypatch: pytest.Monkey
 @pytest.mark.slow
 def test_intervals_cover_over_a_hundred_populations() -> None:
     """Drawn from the prior, and one population that is narrow: within three standard errors."""
-    found = calibrated(SLOW, 5)
+    result = calibrated(SLOW, 5)
     for name in ("mean", "spread", "new"):
-        assert abs(found[name] - 0.95) <= misses(0.95, SLOW), name
-    assert abs(found["shrunk"] - 0.95) <= 2 * misses(0.95, 8 * SLOW)
-    keep("populations", found)
+        assert abs(result[name] - 0.95) <= misses(0.95, SLOW), name
+    assert abs(result["shrunk"] - 0.95) <= 2 * misses(0.95, 8 * SLOW)
+    keep("populations", result)
 
 
 def test_reweighted_draws_are_the_closed_form_where_likelihoods_are_normal() -> None:
@@ -90,12 +90,12 @@ def test_reweighted_draws_are_the_closed_form_where_likelihoods_are_normal() -> 
     truth = drawn(generator, 0.3, 0.15)
     normal = likelihoods(truth.specimens, NAME)
     mean, spread = spreads(normal, Hyperprior(0.0, 1.0, 1.0)).draw(generator, 4000)
-    found = of(truth.specimens)
-    assert found.pareto_k < 0.7
-    assert not any(one.normal for one in found.specimens.values())
+    result = of(truth.specimens)
+    assert result.pareto_k < 0.7
+    assert not any(one.normal for one in result.specimens.values())
     # Of 1000 draws and 4000; p below 1e-4 by chance once in 10,000 runs.
-    assert stats.ks_2samp(found.mean, mean).pvalue > 1e-4
-    assert stats.ks_2samp(found.spread, spread).pvalue > 1e-4
+    assert stats.ks_2samp(result.mean, mean).pvalue > 1e-4
+    assert stats.ks_2samp(result.spread, spread).pvalue > 1e-4
 
 
 def test_a_specimen_off_the_population_is_an_outlier_and_taken_for_normal() -> None:
@@ -103,8 +103,8 @@ def test_a_specimen_off_the_population_is_an_outlier_and_taken_for_normal() -> N
     # Twelve that are alike, and one whose draws do not reach where the population has it.
     every = [normal_specimen(f"s{i}", 0.01 * i, 0.02, generator) for i in range(12)]
     every.append(normal_specimen("odd", 0.9, 0.02, generator))
-    found = of(every)
-    assert ["odd"] == found.outliers
+    result = of(every)
+    assert ["odd"] == result.outliers
     vague = [*every[:-1], normal_specimen("vague", 0.9, 0.2, generator)]
     shrunk = of(vague).specimens["vague"]
     assert shrunk.normal == (shrunk.pareto_k > 0.7) or shrunk.normal
@@ -116,12 +116,12 @@ def test_without_trust_in_weights_all_are_taken_for_normal(monkeypatch: pytest.M
     monkeypatch.setattr(
         module, "_smoothed", lambda logs: (np.full(logs.size, -np.log(logs.size)), 2.0)
     )
-    found = of(truth.specimens)
-    assert all(one.normal for one in found.specimens.values())
-    assert 2.0 == found.pareto_k
+    result = of(truth.specimens)
+    assert all(one.normal for one in result.specimens.values())
+    assert 2.0 == result.pareto_k
     normal = likelihoods(truth.specimens, NAME)
     mean, _ = spreads(normal, Hyperprior(0.0, 1.0, 1.0)).draw(np.random.default_rng(9), 4000)
-    assert stats.ks_2samp(found.mean, mean).pvalue > 1e-4
+    assert stats.ks_2samp(result.mean, mean).pvalue > 1e-4
 
 
 def test_few_specimens_or_none_in_common_are_refused() -> None:
@@ -168,10 +168,10 @@ def test_the_next_specimen_has_the_populations_parameters_and_meets_the_constrai
     generator = np.random.default_rng(12)
     draws = posterior.prior.draw(generator, 500)
     every = [specimen_of(f"s{i}", posterior, draws[i::5], generator) for i in range(5)]
-    found = population(every, generator)
-    made = next_specimen(found, posterior, draws, generator)
+    result = population(every, generator)
+    made = next_specimen(result, posterior, draws, generator)
     assert np.isfinite(posterior.prior.log_density(made)).all()
     d = posterior.names.index("d")
-    assert set(made[:, d]) <= set(found.parameters["d"].new)
+    assert set(made[:, d]) <= set(result.parameters["d"].new)
     noise = posterior.names.index("sensor_sd")
     assert set(made[:, noise]) <= set(draws[:, noise])

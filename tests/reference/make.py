@@ -97,15 +97,18 @@ def nested(case: Case, seed: int) -> Any:
 def statistics(draws: Floats, weights: Floats) -> dict[str, Floats]:
     """Return mean, sd and quantiles, (free,) each, of draws (draws, free) with weights (draws,)."""
     mean = np.average(draws, axis=0, weights=weights)
-    found = {"mean": mean, "sd": np.sqrt(np.average((draws - mean) ** 2, axis=0, weights=weights))}
+    outcome = {
+        "mean": mean,
+        "sd": np.sqrt(np.average((draws - mean) ** 2, axis=0, weights=weights)),
+    }
     for level in (5, 50, 95):
-        found[f"quantile_{level}"] = np.array(
+        outcome[f"quantile_{level}"] = np.array(
             [
                 np.quantile(column, level / 100, weights=weights, method="inverted_cdf")
                 for column in draws.T
             ]
         )
-    return found
+    return outcome
 
 
 def digest(case: Case) -> str:

@@ -270,5 +270,5 @@ def read_csv(path: Path) -> tuple[Floats, Floats, Floats]:
 
 def rows(time: Floats, start: float, stop: float) -> slice:
     """Return the slice of the samples with start <= time < stop, times being a little rounded."""
-    found = np.flatnonzero((time > start - 1e-6) & (time < stop - 1e-6))
-    return slice(int(found[0]), int(found[-1]) + 1)
+    result = np.flatnonzero((time > start - 1e-6) & (time < stop - 1e-6))
+    return slice(int(result[0]), int(result[-1]) + 1)

@@ -88,8 +88,8 @@ def errors(means: FloatArray, sds: FloatArray) -> FloatArray:
     """Errors of quantiles and spread in units of the mixture's sd, (q + 1, samples)."""
     sd = np.sqrt(means.var(axis=0) + (sds**2).mean())
     exact = np.vstack(mixture.quantiles_and_spread(means, sds, PROBABILITIES))
-    found = np.vstack(along.quantiles_and_spread(means, sds, PROBABILITIES))
-    difference: FloatArray = np.abs(found - exact) / sd
+    result = np.vstack(along.quantiles_and_spread(means, sds, PROBABILITIES))
+    difference: FloatArray = np.abs(result - exact) / sd
     return difference
 
 

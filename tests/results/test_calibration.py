@@ -86,15 +86,15 @@ def test_smooth_test_is_nearly_at_its_level_for_a_family_of_tests() -> None:
 def test_smooth_test_has_the_power_that_is_stated(count: int, width: float) -> None:
     z = np.random.default_rng(count).standard_normal((count, 4_000))
     expected = smooth_power(count, 1e-3, width)
-    found = float(np.mean(smooth_test(ndtr(z / width)) < 1e-3))
+    result = float(np.mean(smooth_test(ndtr(z / width)) < 1e-3))
     # Means of b1 and b2 are only nearly normal.
-    assert abs(found - expected) < 0.02 + 4 * np.sqrt(0.25 / 4_000)
+    assert abs(result - expected) < 0.02 + 4 * np.sqrt(0.25 / 4_000)
 
 
 def test_power_is_known_for_five_hundred_replicates() -> None:
     """Of sds a fifth too small; a Kolmogorov-Smirnov test has 0.63 and 0.20 at these levels."""
-    found = [smooth_power(500, level, 0.8) for level in (0.01, 0.001)]
-    np.testing.assert_allclose(found, [0.999, 0.993], atol=0.003)
+    result = [smooth_power(500, level, 0.8) for level in (0.01, 0.001)]
+    np.testing.assert_allclose(result, [0.999, 0.993], atol=0.003)
 
 
 def test_power_without_a_defect_is_the_level() -> None:
@@ -104,8 +104,8 @@ def test_power_without_a_defect_is_the_level() -> None:
 def test_smooth_test_of_one_value_is_its_formula() -> None:
     u = 0.3
     b1, b2 = np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u**2 - 6 * u + 1)
-    found = smooth_test(np.array([[u]]))
-    np.testing.assert_allclose(np.exp(-0.5 * (b1**2 + b2**2)), found[0], rtol=1e-12)
+    result = smooth_test(np.array([[u]]))
+    np.testing.assert_allclose(np.exp(-0.5 * (b1**2 + b2**2)), result[0], rtol=1e-12)
 
 
 def test_holm_is_the_textbooks() -> None:
@@ -170,11 +170,11 @@ def test_sound_calibrations_pass_but_for_the_family_level() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twin_sds_a_fifth_too_small_are_found(seed: int) -> None:
-    found = judged(entries(scores(500, seed) / 0.8))
-    assert not found.passed
-    assert min(found.power.values()) > 0.2
-    assert found.telling
-    assert found.power["20 % too small"] > 0.98
+    result = judged(entries(scores(500, seed) / 0.8))
+    assert not result.passed
+    assert min(result.power.values()) > 0.2
+    assert result.telling
+    assert result.power["20 % too small"] > 0.98
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -185,10 +185,10 @@ def test_twin_bias_of_a_third_of_an_sd_is_found(seed: int) -> None:
 def test_defect_of_one_statistic_is_told_by_its_name() -> None:
     z = scores(500)
     z[:, 4] /= 0.6
-    found = judged(entries(z))
-    assert all(text.startswith("e: ") for text in found.shortcomings), found.shortcomings
-    assert found.statistics["e"].adjusted < FAMILY_LEVEL / 2
-    assert found.statistics["e"].outside
+    result = judged(entries(z))
+    assert all(text.startswith("e: ") for text in result.shortcomings), result.shortcomings
+    assert result.statistics["e"].adjusted < FAMILY_LEVEL / 2
+    assert result.statistics["e"].outside
 
 
 def test_ranks_among_199_draws_have_200_places() -> None:
@@ -202,14 +202,14 @@ def test_ranks_among_199_draws_have_200_places() -> None:
 
 def test_all_tests_together_share_the_family_level() -> None:
     """Each of two tests of twelve statistics has a 24th of one in a hundred."""
-    found = judged(entries(scores(500)))
+    result = judged(entries(scores(500)))
     each = 0.01 / (2 * len(NAMES))
     expected = ecdf_band(500, each)
-    np.testing.assert_array_equal(expected.lower, found.ecdf.lower)
-    np.testing.assert_array_equal(expected.upper, found.ecdf.upper)
-    assert smooth_power(500, each, 0.9) == found.power["10 % too small"]
+    np.testing.assert_array_equal(expected.lower, result.ecdf.lower)
+    np.testing.assert_array_equal(expected.upper, result.ecdf.upper)
+    assert smooth_power(500, each, 0.9) == result.power["10 % too small"]
     # Twice the level is another band: counts are whole, and it could have been the same.
-    assert (ecdf_band(500, 2 * each).lower != found.ecdf.lower).any()
+    assert (ecdf_band(500, 2 * each).lower != result.ecdf.lower).any()
 
 
 def test_too_few_replicates_say_that_they_have_no_power() -> None:
@@ -218,10 +218,10 @@ def test_too_few_replicates_say_that_they_have_no_power() -> None:
 
 def test_intervals_cover_within_their_binomial_limits() -> None:
     """99 % limits, 36 comparisons: five outside come by chance once in 10⁵ times."""
-    found = judged(entries(scores(400)))
+    result = judged(entries(scores(400)))
     outside = [
-        not found.limits[level][0] <= part <= found.limits[level][1]
-        for one in found.statistics.values()
+        not result.limits[level][0] <= part <= result.limits[level][1]
+        for one in result.statistics.values()
         for level, part in one.covered.items()
     ]
     assert len(outside) == 3 * len(NAMES)
@@ -233,17 +233,17 @@ def test_unconverged_replicates_are_counted_and_fail_beyond_one_per_cent() -> No
         made = entries(scores(200))
         for entry in made[:unconverged]:
             entry["converged"] = False
-        found = judged(made)
-        assert (passed, 200) == (found.passed, found.replicates)
-        assert tuple(range(unconverged)) == found.unconverged
-        assert 200 == found.positions.shape[0]  # they take part all the same
+        result = judged(made)
+        assert (passed, 200) == (result.passed, result.replicates)
+        assert tuple(range(unconverged)) == result.unconverged
+        assert 200 == result.positions.shape[0]  # they take part all the same
 
 
 def test_replicate_without_a_fit_is_counted() -> None:
     made = entries(scores(150))
     made[5] = {**made[5], "converged": False, "ranks": {}}
-    found = judged(made)
-    assert (150, (5,), 149) == (found.replicates, found.unconverged, found.positions.shape[0])
+    result = judged(made)
+    assert (150, (5,), 149) == (result.replicates, result.unconverged, result.positions.shape[0])
 
 
 def test_nothing_fitted_is_said() -> None:
@@ -258,10 +258,10 @@ def test_nothing_fitted_is_said() -> None:
 def test_bands_must_cover_within_three_standard_errors(mean: float, passed: bool) -> None:
     covered = mean + 0.1 * np.random.default_rng(1).standard_normal(500)
     covered += mean - np.mean(covered)
-    found = judged(entries(scores(500), covered))
-    assert found.bands["sensor 95"].mean == pytest.approx(mean)
-    assert found.bands["sensor 95"].error == pytest.approx(0.1 / np.sqrt(500), rel=0.2)
-    assert passed == found.passed
+    result = judged(entries(scores(500), covered))
+    assert result.bands["sensor 95"].mean == pytest.approx(mean)
+    assert result.bands["sensor 95"].error == pytest.approx(0.1 / np.sqrt(500), rel=0.2)
+    assert passed == result.passed
 
 
 def test_bands_of_few_replicates_are_shown_and_not_judged() -> None:
@@ -269,9 +269,9 @@ def test_bands_of_few_replicates_are_shown_and_not_judged() -> None:
 
 
 def test_summary_states_what_was_tested() -> None:
-    found = summary(judged(entries(scores(50))))
+    result = summary(judged(entries(scores(50))))
     assert (2 * len(NAMES), 0.01, RANKED) == (
-        found["tests"],
-        found["family_level"],
-        found["draws_ranked_among"],
+        result["tests"],
+        result["family_level"],
+        result["draws_ranked_among"],
     )

@@ -118,11 +118,11 @@ def known(replicates: Iterable[Replicate]) -> list[Replicate]:
 
 @pytest.fixture(scope="module")
 def few() -> list[Replicate]:
-    return [replicate(seed) for seed in range(24)]
+    return [replicate(seed) for seed in range(36)]
 
 
 def test_forecasts_from_posteriors_are_calibrated(few: list[Replicate]) -> None:
-    """Of 24 records; ten tests below 1e-4 by chance once in 1,000 times."""
+    """Of 36 records; ten tests below 1e-4 by chance once in 1,000 times."""
     assert smallest_p(ranks(few)) > 1e-4
 
 

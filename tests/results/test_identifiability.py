@@ -58,8 +58,8 @@ def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
 @pytest.mark.parametrize("rate", RATES)
 def test_at_the_mode_of_a_fit_one_sine_leaves_gamma_open(rate: float) -> None:
     posterior = measured(sine(50.0, 1.0), rate=rate)
-    found = undetermined(posterior, fit(posterior, np.random.default_rng(1)))
-    assert any("gamma" in text for text in found), found
+    result = undetermined(posterior, fit(posterior, np.random.default_rng(1)))
+    assert any("gamma" in text for text in result), result
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -75,9 +75,9 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
     amplitude: float, frequency: float, discrepancy: Discrepancy
 ) -> None:
     posterior = measured(sine(amplitude, frequency), discrepancy)
-    found = undetermined(posterior, at_truth(posterior))
-    assert 1 == len(found)
-    assert "gamma" in found[0]
+    result = undetermined(posterior, at_truth(posterior))
+    assert 1 == len(result)
+    assert "gamma" in result[0]
 
 
 @pytest.mark.parametrize("seed", [0, 1])

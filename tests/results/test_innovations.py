@@ -26,8 +26,8 @@ def test_innovations_of_the_right_model_raise_no_remark() -> None:
     generator = np.random.default_rng(1)
     alarms = 0
     for _ in range(400):
-        found = along(generator.normal(size=int(generator.choice([200, 1000, 4000]))))
-        alarms += bool(remarks(found) or odd_start(found))
+        result = along(generator.normal(size=int(generator.choice([200, 1000, 4000]))))
+        alarms += bool(remarks(result) or odd_start(result))
     assert alarms <= 4
 
 
@@ -39,16 +39,16 @@ def heavy(white: FloatArray, _: Innovations) -> FloatArray:
     return white * np.sqrt(3 / np.random.default_rng(1).chisquare(3, white.size))
 
 
-def fast(white: FloatArray, found: Innovations) -> FloatArray:
-    return white * (1 + 0.8 * (np.abs(found.rate) > 500))
+def fast(white: FloatArray, result: Innovations) -> FloatArray:
+    return white * (1 + 0.8 * (np.abs(result.rate) > 500))
 
 
-def high(white: FloatArray, found: Innovations) -> FloatArray:
-    return white * (1 + 0.8 * (found.voltage > 50))
+def high(white: FloatArray, result: Innovations) -> FloatArray:
+    return white * (1 + 0.8 * (result.voltage > 50))
 
 
-def rising(white: FloatArray, found: Innovations) -> FloatArray:
-    return white + 0.3 * (found.rate > 0)
+def rising(white: FloatArray, result: Innovations) -> FloatArray:
+    return white + 0.3 * (result.rate > 0)
 
 
 @pytest.mark.parametrize(
@@ -76,10 +76,10 @@ def test_a_start_that_is_pushed_is_odd_and_its_end_is_told() -> None:
     for seed in range(20):
         white = np.random.default_rng([3, seed]).normal(size=4000)
         white[:100] -= 1.0
-        found = odd_start(along(white))
-        assert found is not None
-        assert 0.1 < found.until < 1.0
-        assert 5.5 < found.size
+        result = odd_start(along(white))
+        assert result is not None
+        assert 0.1 < result.until < 1.0
+        assert 5.5 < result.size
 
 
 def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
@@ -87,13 +87,13 @@ def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
     posterior = problems.short_posterior(samples=3000, seed=4)
     theta = problems.truth(posterior)[0]
     free = np.array([theta[posterior.prior.names.index(n)] for n in posterior.names])
-    found = innovations(posterior, free, begin=7.0)
-    assert 7.0 == found.time[0]
-    assert abs(np.mean(found.white)) < 4.5 / np.sqrt(3000)
-    assert abs(np.std(found.white) - 1) < 4.5 / np.sqrt(6000)
-    assert () == remarks(found)
-    assert odd_start(found) is None
-    said = numbers(found)
+    result = innovations(posterior, free, begin=7.0)
+    assert 7.0 == result.time[0]
+    assert abs(np.mean(result.white)) < 4.5 / np.sqrt(3000)
+    assert abs(np.std(result.white) - 1) < 4.5 / np.sqrt(6000)
+    assert () == remarks(result)
+    assert odd_start(result) is None
+    said = numbers(result)
     assert 3000 == said["readings"]
     assert {"rate", "voltage", "direction"} == set(said["by"])  # type: ignore[call-overload]
 

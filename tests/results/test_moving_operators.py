@@ -104,19 +104,19 @@ def test_not_knowing_that_a_record_starts_from_rest_costs_little(name: str) -> N
 def test_bands_cover_records_of_every_operator(name: str) -> None:
     case = Case(hysteresis=name)
     every = studied(case, RECORDS, seed=7)
-    found = coverages(every)
+    result = coverages(every)
     wider = max(widening(replace(case, discrepancy=sd), 10) for sd in (0.3, 1.5))
     alarmed = alarms(every)
     keep(
         f"moving operators, {name}",
         {
             "records": RECORDS,
-            "coverage and t": found,
+            "coverage and t": result,
             "widening from rest": round(wider, 3),
             "false alarms of the lead-in": alarmed / RECORDS,
         },
     )
-    assert LEAST <= found["95"][0] <= MOST
+    assert LEAST <= result["95"][0] <= MOST
     assert wider < 1.1
     assert alarmed <= stats.binom.isf(1e-3, RECORDS, LEAD_IN_ALARM)
 

@@ -65,8 +65,8 @@ def sds(bands: Bands, kind: Kind) -> FloatArray:
         for level in LEVELS
     ]
     np.testing.assert_allclose(half, np.mean(half, axis=0) * np.ones_like(half), rtol=2e-3)
-    found: FloatArray = np.mean(half, axis=0)
-    return found
+    result: FloatArray = np.mean(half, axis=0)
+    return result
 
 
 def assert_scores_are_of(bands: Bands, mean: FloatArray, sd: float) -> None:

@@ -312,8 +312,8 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
 def test_first_measure_is_the_log_likelihood() -> None:
     posterior = small().posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 3))
-    found = small().measures(posterior, theta)
-    np.testing.assert_array_equal(posterior.log_likelihood(theta), found[:, 0])
+    result = small().measures(posterior, theta)
+    np.testing.assert_array_equal(posterior.log_likelihood(theta), result[:, 0])
 
 
 @pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])

@@ -41,22 +41,22 @@ def normal_posterior(mean: float, sd: float, draws: int = 40_000) -> FloatArray:
 
 @pytest.mark.parametrize(("mean", "sd"), [(0.0, 0.1), (1.0, 0.3), (1.0, 1.0), (-1.5, 0.7)])
 def test_wider_prior_moves_the_posterior_as_far_as_it_does(mean: float, sd: float) -> None:
-    found = sway(STANDARD, normal_posterior(mean, sd), ["offset"])
+    result = sway(STANDARD, normal_posterior(mean, sd), ["offset"])
     before, after = 1 + 1 / sd**2, 0.25 + 1 / sd**2
     moved = abs(mean / sd**2 / after - mean / sd**2 / before) * np.sqrt(before)
-    assert found.told
-    assert found.name == "offset"
-    assert found.moved == pytest.approx(moved, abs=0.05)
-    assert found.widened == pytest.approx(np.sqrt(before / after), rel=0.05)
-    assert found.part == pytest.approx(1 / np.sqrt(before), rel=0.05)
-    assert found.decides == (moved > 0.3 or before / after > 1.44 or before < 1 / 0.49)
+    assert result.told
+    assert result.name == "offset"
+    assert result.moved == pytest.approx(moved, abs=0.05)
+    assert result.widened == pytest.approx(np.sqrt(before / after), rel=0.05)
+    assert result.part == pytest.approx(1 / np.sqrt(before), rel=0.05)
+    assert result.decides == (moved > 0.3 or before / after > 1.44 or before < 1 / 0.49)
 
 
 def test_where_the_wider_prior_leads_away_from_all_draws_nothing_is_told() -> None:
     """A posterior that is the prior: its draws do not reach as far as one twice as wide."""
-    found = sway(STANDARD, normal_posterior(0.0, 1e6), ["offset", "initial_offset"])
-    assert not found.told
-    assert found.decides
+    result = sway(STANDARD, normal_posterior(0.0, 1e6), ["offset", "initial_offset"])
+    assert not result.told
+    assert result.decides
 
 
 def judged(posterior: Posterior) -> list[str]:

@@ -40,8 +40,8 @@ def good(generator: np.random.Generator, number: int) -> Verdict:
 def false_alarms(seed: int, records: int) -> tuple[int, int]:
     """Count records of which it is said that their bands do not hold, and that none can tell."""
     generator = np.random.default_rng(seed)
-    found = [good(generator, number).holds for number in range(records)]
-    return found.count(False), found.count(None)
+    result = [good(generator, number).holds for number in range(records)]
+    return result.count(False), result.count(None)
 
 
 def test_bands_of_good_records_hold() -> None:

@@ -58,13 +58,13 @@ class Watched:
         self.blocks: list[Phase] = []
         self.checks: list[Check] = []
 
-    def __call__(self, phase: Phase, found: Check | None) -> None:
+    def __call__(self, phase: Phase, result: Check | None) -> None:
         """Hear of a block, or of a check."""
-        if found is None:
+        if result is None:
             self.blocks.append(phase)
         else:
             assert "sampling" == phase
-            self.checks.append(found)
+            self.checks.append(result)
 
 
 def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None) -> None:

@@ -67,13 +67,15 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def chunks(path: Path) -> list[dict[str, Place]]:
     """Return for each block, in order, where its numbers are: first byte and the one after."""
-    found = []
+    result = []
     with h5py.File(path, "r") as file:
         for phase, count in PLAN:
             for number in range(count):
                 infos = {n: d.id.get_chunk_info(number) for n, d in file[phase].items()}
-                found.append({n: (i.byte_offset, i.byte_offset + i.size) for n, i in infos.items()})
-    return found
+                result.append(
+                    {n: (i.byte_offset, i.byte_offset + i.size) for n, i in infos.items()}
+                )
+    return result
 
 
 def flipped(content: bytes, place: int, bit: int = 3) -> bytes:

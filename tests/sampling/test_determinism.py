@@ -41,9 +41,9 @@ class Stopper:
     def __init__(self, blocks: int) -> None:
         self.left = blocks
 
-    def __call__(self, _: Phase, found: Check | None) -> None:
+    def __call__(self, _: Phase, result: Check | None) -> None:
         """Hear of a block, or of a check."""
-        if found is None:
+        if result is None:
             self.left -= 1
             if self.left == 0:
                 raise StoppedError

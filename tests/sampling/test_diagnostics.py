@@ -127,13 +127,13 @@ def test_the_means_effective_draws_are_not_those_of_the_ranks() -> None:
     for φ = 0.95 and s = 1. The estimate, as arviz has it, is within a tenth in five seeds.
     """
     series = np.exp(autoregressive(0.95, 5000, (4, 16, 1), np.random.default_rng(17)))
-    found = check(series, np.full((100, 4, 16), 20), BLOCK)
+    result = check(series, np.full((100, 4, 16), 20), BLOCK)
     kept = 0.95 ** np.arange(1, 2000)
     time = 1 + 2 * np.sum(np.expm1(kept)) / np.expm1(1)
-    assert series.size / time == pytest.approx(found.ess_mean[0], rel=0.15)
-    assert found.ess_mean[0] > 1.15 * found.ess_bulk[0]
+    assert series.size / time == pytest.approx(result.ess_mean[0], rel=0.15)
+    assert result.ess_mean[0] > 1.15 * result.ess_bulk[0]
     arvizs = array_stats.ess(as_chains(series), method="mean", chain_axis=0, draw_axis=1)
-    assert found.ess_mean[0] <= arvizs[0] * (1 + 1e-12)
+    assert result.ess_mean[0] <= arvizs[0] * (1 + 1e-12)
 
 
 def test_twin_folding_walkers_step_by_step_overstates_many_times(emcee_runs: FloatArray) -> None:
@@ -186,8 +186,8 @@ def test_rhat_of_halves_that_are_not_even_is_arvizs_within_rounding(steps: int) 
     axes: dict[str, int] = {"chain_axis": 0, "draw_axis": 1}
     whole = array_stats.rhat_nested(as_chains(draws), superchain_ids=ids[:24], **axes)
     apart = array_stats.rhat_nested(as_chains(halves), superchain_ids=ids, **axes)
-    found = check(draws, moving(6)[:8], 25).rhat
-    np.testing.assert_allclose(np.maximum(whole, apart), found, atol=2e-4)
+    result = check(draws, moving(6)[:8], 25).rhat
+    np.testing.assert_allclose(np.maximum(whole, apart), result, atol=2e-4)
 
 
 def test_nested_rhat_of_agreeing_ensembles_is_one() -> None:
@@ -217,9 +217,9 @@ def test_ensembles_that_never_move_have_not_converged() -> None:
     starts = 10 * generator.standard_normal((ENSEMBLES, 1, FREE))
     starts = starts + 0.2 * generator.standard_normal((ENSEMBLES, WALKERS, FREE))
     draws = np.tile(starts, (STEPS, 1, 1, 1))
-    found = shortcomings(draws, np.zeros_like(moving()))
-    assert any(text.startswith("R-hat") for text in found)
-    assert f"{ENSEMBLES * WALKERS} walkers are stuck" in found
+    result = shortcomings(draws, np.zeros_like(moving()))
+    assert any(text.startswith("R-hat") for text in result)
+    assert f"{ENSEMBLES * WALKERS} walkers are stuck" in result
 
 
 def test_walkers_that_never_move_from_one_common_cloud_have_not_converged() -> None:
@@ -265,9 +265,9 @@ def test_walkers_that_keep_to_their_modes_in_one_parameter_are_told() -> None:
     for parameter in range(FREE):
         draws = good_draws()
         draws[:, :, ::2, parameter] += 4
-        found = check(draws, moving(), BLOCK)
-        assert found.walker_rhat > 1.5
-        assert any("of walkers" in text for text in found.shortcomings(1000))
+        result = check(draws, moving(), BLOCK)
+        assert result.walker_rhat > 1.5
+        assert any("of walkers" in text for text in result.shortcomings(1000))
 
 
 def test_effective_draws_of_the_tails_are_those_of_the_outer_twentieths() -> None:

@@ -63,9 +63,9 @@ def test_a_proposal_that_was_given_up_is_told_of(fallen_back: tuple[Chain, Outco
     (remark,) = fallen_back[1].remarks
     steps = FIRST_CHECK * PLAN.block
     told = rf"the proposal did not cover its first {steps} steps \(Pareto k (0\.\d\d) "
-    found = re.match(told, remark)
-    assert found
-    assert float(found[1]) > 0.7
+    result = re.match(told, remark)
+    assert result
+    assert float(result[1]) > 0.7
     assert "differential evolution and snooker moves alone" in remark
     assert fallen_back[1].check.pareto_k is None
 
@@ -75,10 +75,10 @@ def test_without_the_proposal_the_draws_are_the_posteriors(
 ) -> None:
     chain, outcome = fallen_back
     assert outcome.converged
-    found = draws(POSTERIOR, chain)
+    result = draws(POSTERIOR, chain)
     error = 4 / np.sqrt(outcome.check.ess_bulk)
-    assert (np.abs(np.mean(found, axis=(0, 1, 2))) < error).all()
-    assert (np.abs(np.var(found, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
+    assert (np.abs(np.mean(result, axis=(0, 1, 2))) < error).all()
+    assert (np.abs(np.var(result, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
 
 
 @pytest.mark.parametrize("blocks", [1, FIRST_CHECK, FIRST_CHECK + 1])

@@ -149,9 +149,9 @@ def test_the_mixtures_draws_have_its_weights() -> None:
     draws = MIXTURE.draw(np.random.RandomState(4), count)
     centres = np.stack([component.centre for component in MIXTURE.components])
     nearest = np.argmin(np.linalg.norm(draws[:, np.newaxis] - centres, axis=2), axis=1)
-    found = np.bincount(nearest, minlength=3) / count
+    result = np.bincount(nearest, minlength=3) / count
     error = np.sqrt(MIXTURE.weights * (1 - MIXTURE.weights) / count)
-    assert np.max(np.abs(MIXTURE.weights - found) / error) < 4
+    assert np.max(np.abs(MIXTURE.weights - result) / error) < 4
 
 
 def test_the_mixtures_draws_have_its_moments() -> None:

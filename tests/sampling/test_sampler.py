@@ -92,10 +92,10 @@ def test_the_tuning_has_its_length(finished: tuple[Chain, Outcome]) -> None:
 def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
     """Mean and variance within four standard errors of the effective draws it claims."""
     chain, outcome = finished
-    found = draws(POSTERIOR, chain)
+    result = draws(POSTERIOR, chain)
     error = 4 / np.sqrt(outcome.check.ess_bulk)
-    assert (np.abs(np.mean(found, axis=(0, 1, 2))) < error).all()
-    assert (np.abs(np.var(found, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
+    assert (np.abs(np.mean(result, axis=(0, 1, 2))) < error).all()
+    assert (np.abs(np.var(result, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
 
 
 @pytest.mark.usefixtures("finished")
@@ -105,7 +105,7 @@ def test_it_stops_at_the_first_two_checks_that_find_nothing_missing(watched: Wat
     assert [] == first.shortcomings(PLAN.ess, 0.5)
     assert [] == second.shortcomings(PLAN.ess)
     assert second.steps >= 1.2 * first.steps
-    passed = [not found.shortcomings(PLAN.ess) for found in watched.checks]
+    passed = [not result.shortcomings(PLAN.ess) for result in watched.checks]
     assert not any(one and two for one, two in itertools.pairwise(passed[:-1]))
 
 
@@ -249,7 +249,7 @@ def test_every_move_is_counted_in_every_phase(finished: tuple[Chain, Outcome]) -
 
 
 def checked(watched: Watched) -> list[int]:
-    return [found.steps for found in watched.checks]
+    return [result.steps for result in watched.checks]
 
 
 def test_checks_wait_until_the_chain_is_predicted_to_be_long_enough() -> None:
@@ -263,10 +263,10 @@ def test_checks_wait_until_the_chain_is_predicted_to_be_long_enough() -> None:
         if not before.shortcomings(plan.ess, 0.5):
             passed = passed or before.steps
         fewest = np.min([before.ess_bulk, before.ess_tail])
-        wanted = max(before.steps * plan.ess / fewest, 50 * np.max(before.autocorrelation))
-        wanted = max(wanted, 1.2 * passed) if passed else 0.5 * wanted
-        assert wanted > before.steps
-        steps = min(wanted, 3 * before.steps)
+        required = max(before.steps * plan.ess / fewest, 50 * np.max(before.autocorrelation))
+        required = max(required, 1.2 * passed) if passed else 0.5 * required
+        assert required > before.steps
+        steps = min(required, 3 * before.steps)
         assert plan.block * np.ceil(steps / plan.block) == after.steps
 
 
@@ -374,8 +374,8 @@ def test_one_parameter_alone_is_sampled() -> None:
     zero = posterior.prior.theta(np.zeros((1, 1)))
     residual = posterior.only.displacement - posterior.simulate(zero)[0]
     expected = stats.norm(np.mean(residual), 0.3 / np.sqrt(50))
-    found = draws(posterior, chain).ravel()
+    result = draws(posterior, chain).ravel()
     error = 4 * expected.std() / np.sqrt(outcome.check.ess_bulk[0])
     # The prior pulls by less than a thousandth of the posterior's sd.
-    assert expected.mean() == pytest.approx(np.mean(found), abs=error)
-    assert expected.std() == pytest.approx(np.std(found), rel=0.15)
+    assert expected.mean() == pytest.approx(np.mean(result), abs=error)
+    assert expected.std() == pytest.approx(np.std(result), rel=0.15)

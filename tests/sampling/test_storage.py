@@ -241,9 +241,9 @@ def test_killed_at_any_time_no_block_that_was_told_of_is_lost(
     unfinished = 0
     for _ in range(20):
         process = FORKS.Process(target=write_and_tell, args=(path, told))
-        wanted = told.value + generator.integers(2)
+        required = told.value + generator.integers(2)
         process.start()
-        while told.value < wanted and process.is_alive():
+        while told.value < required and process.is_alive():
             time.sleep(1e-3)
         time.sleep(generator.uniform(0, 0.01))
         process.kill()

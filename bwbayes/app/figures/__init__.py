@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 # What draws a figure, and such by the figure's name.
-type Drawing = Callable[[], Figure]
+type Drawing = Callable[[], "Figure"]
 type Drawings = dict[str, Drawing]
 
 

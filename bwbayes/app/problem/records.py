@@ -62,21 +62,21 @@ def generator(seed: int, purpose: str) -> np.random.Generator:
     return np.random.default_rng([seed, *purpose.encode()])
 
 
-def sampled_waveform(wanted: str | SignalConfig) -> Waveform:
+def sampled_waveform(drive: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config describes."""
-    if isinstance(wanted, str):
-        return signal(wanted)
+    if isinstance(drive, str):
+        return signal(drive)
     carrier: Carrier
-    if wanted.shape == "steps":
-        carrier = Staircase(tuple(wanted.levels or ()), wanted.dwell or 0.0)
+    if drive.shape == "steps":
+        carrier = Staircase(tuple(drive.levels or ()), drive.dwell or 0.0)
     else:
-        shape = Sine if wanted.shape == "sine" else Triangle
-        carrier = shape(wanted.amplitude or 0.0, wanted.frequency or 0.0)
+        shape = Sine if drive.shape == "sine" else Triangle
+        carrier = shape(drive.amplitude or 0.0, drive.frequency or 0.0)
     return Waveform(
         carrier,
-        wanted.duration,
-        wanted.start,
-        Decay(wanted.decay_from, wanted.decay),
+        drive.duration,
+        drive.start,
+        Decay(drive.decay_from, drive.decay),
     )
 
 
@@ -187,8 +187,8 @@ def start_of(config: Config, name: str) -> Start:
     )
 
 
-def _named(record: Record, wanted: str | SignalConfig | None) -> Record:
-    name = wanted.shape if isinstance(wanted, SignalConfig) else wanted
+def _named(record: Record, drive: str | SignalConfig | None) -> Record:
+    name = drive.shape if isinstance(drive, SignalConfig) else drive
     return replace(record, origin=f"{record.origin}, {name} signal")
 
 

@@ -35,19 +35,19 @@ def symbol(parameter: Parameter) -> Symbol:
     """
     text = re.sub(r"\\mathrm\{(\w*)\}", r"\1", parameter.label)
     text = re.sub(r"\\([A-Za-z]+)", _greek, text)
-    found = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
-    if found is None:
+    match = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
+    if match is None:
         return Symbol(parameter.name, "")
-    return Symbol(found[1], found[2] or found[3] or "")
+    return Symbol(match[1], match[2] or match[3] or "")
 
 
-def _greek(found: re.Match[str]) -> str:
+def _greek(match: re.Match[str]) -> str:
     """Return the Greek letter that a LaTeX command stands for, or the command."""
-    size = "CAPITAL" if found[1][0].isupper() else "SMALL"
+    size = "CAPITAL" if match[1][0].isupper() else "SMALL"
     try:
-        return unicodedata.lookup(f"GREEK {size} LETTER {found[1].upper()}")
+        return unicodedata.lookup(f"GREEK {size} LETTER {match[1].upper()}")
     except KeyError:
-        return found[0]
+        return match[0]
 
 
 def digits(value: float, sd: float) -> str:

@@ -167,8 +167,8 @@ def test_without_dynamics_the_inverse_is_a_search_for_each_sample() -> None:
 
         expected.append(brentq(off, -200, 200, xtol=1e-13, rtol=1e-15))
         _, state = actuator.advance(theta, [expected[-1]], state, from_rest=True)
-    found_voltage = inverse(actuator, theta, reference, from_rest=True)[0]
-    np.testing.assert_allclose(found_voltage, expected, atol=1e-8)
+    computed = inverse(actuator, theta, reference, from_rest=True)[0]
+    np.testing.assert_allclose(computed, expected, atol=1e-8)
 
 
 def test_a_piece_goes_on_from_the_state_of_the_one_before() -> None:

@@ -35,7 +35,7 @@ def test_a_search_finds_all_samples_of_a_path_at_once(s: float) -> None:
         return u + 0.1 * u**3
 
     known = 2.0 + s * np.linspace(0.0, 3.0, 50)
-    found_voltage = reached(curve, curve(known), 2.0, 2.0 + 9 * s, 0.1)
-    np.testing.assert_allclose(found_voltage, known, atol=1e-13)
+    computed = reached(curve, curve(known), 2.0, 2.0 + 9 * s, 0.1)
+    np.testing.assert_allclose(computed, known, atol=1e-13)
     short = reached(curve, curve(known), 2.0, 2.0 + 2 * s, 0.1)
     np.testing.assert_allclose(short, 2.0 + np.clip(s * (known - 2.0), 0.0, 2.0) * s, atol=1e-13)
