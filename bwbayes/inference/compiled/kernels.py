@@ -48,7 +48,7 @@ PIECE = 64
 SHORT_PIECE = 16
 
 # What is below this part of its size at the start adds nothing.
-FORGOTTEN = 1e-20
+FORGOTTEN = 1e-18
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
