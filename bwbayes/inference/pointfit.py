@@ -30,10 +30,6 @@ RESIDUALS = 1000
 # nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
 HOPELESS = 30.0
 
-# Least squares stops where its steps change sum and place by less than this part: far below what
-# tells optima apart.
-NEAR = 1e-6
-
 # Optima whose sums of squares and coordinates agree to this part are one.
 SAME = 1e-2
 
@@ -154,14 +150,14 @@ class _LeastSquares:
             everywhere[:, self.physical] = values
             return everywhere
 
-        steps = 1e-6 * self.spread[self.physical]
-        star = np.concatenate([np.zeros((1, steps.size)), np.diag(steps)])
+        steps = 1e-5 * self.spread[self.physical]
+        star = np.concatenate([np.zeros((1, steps.size)), np.diag(steps), -np.diag(steps)])
         last: list[FloatArray] = []
 
         def residuals(values: FloatArray) -> FloatArray:
             # With what the slopes need, in one call: they are asked for at most of these places.
-            here, *ahead = self.residuals(place(values + star))
-            last[:] = here, values.copy(), ((np.stack(ahead) - here) / steps[:, np.newaxis]).T
+            here, plus, minus = np.split(self.residuals(place(values + star)), [1, 1 + steps.size])
+            last[:] = here[0], values.copy(), ((plus - minus) / (2 * steps[:, np.newaxis])).T
             return last[0]
 
         def jacobian(values: FloatArray) -> FloatArray:
@@ -174,8 +170,6 @@ class _LeastSquares:
             start[self.physical],
             jac=jacobian,
             x_scale=self.spread[self.physical],
-            ftol=NEAR,
-            xtol=NEAR,
             max_nfev=60,
         )
         optimum: FloatArray = place(solution.x)[0]
