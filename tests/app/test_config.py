@@ -307,7 +307,7 @@ def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "found",
+    "result",
     [
         parse(RECORD, ""),
         small.config(),
