@@ -183,7 +183,7 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
             f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
-        f"the prior does not decide there (one twice as wide moves {swayed.name} by "
+        f"what decides there is not the prior (one twice as wide moves {swayed.name} by "
         f"{swayed.moved:.2f} of its sd, and nothing by more) but the noise model, which may be "
         "too sure"
     )

@@ -104,8 +104,11 @@ def _with_sign(finding: Finding, path: Path, table: Table) -> Finding:
     name = table.columns["displacement"].name
     unit = table.naming.units.get("displacement") or unit_in(name, "displacement") or "um"
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
-    command = f"bwbayes init {path} --unit displacement={turned}"
-    return replace(finding, remedy=f"{finding.remedy}, or here with `{command}`")
+    here = (
+        f'units = {{ displacement = "{turned}" }} under [record], or '
+        f"`bwbayes init {path} --unit displacement={turned}`"
+    )
+    return replace(finding, remedy=f"{finding.remedy}, or say {here}")
 
 
 def _text(

@@ -318,7 +318,9 @@ class Fit(Advice):
 
     @property
     def _title(self) -> str:
-        name = self.problem.config.name or self.problem.record.origin
+        name = self.problem.config.name or ", ".join(
+            record.origin for record in self.problem.records.values()
+        )
         if not self.converged:
             return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; no interval is given"
         known = {True: "its bands hold", False: "its bands DO NOT HOLD", None: "bands not judged"}

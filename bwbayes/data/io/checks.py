@@ -307,7 +307,8 @@ def _time_grid(table: Table, held: bool) -> tuple[float, float, IntArray | None]
         return float(time[0]), interval, None
     sample = int(np.argmax(gaps)) + 1
     lost = int(places[-1]) + 1 - time.size
-    remark = f"{lost} samples are missing, from here on in {np.count_nonzero(gaps)} gaps"
+    count = int(np.count_nonzero(gaps))
+    remark = f"{lost} samples are missing, from here on in {count} gap{'s' * (count > 1)}"
     error = table.error(f"{remark}; the commanded voltage is taken as held there", "time", sample)
     warnings.warn(str(error), InputWarning, stacklevel=4)
     return float(time[0]), interval, places
