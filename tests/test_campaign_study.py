@@ -122,16 +122,14 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
     (tmp_path / "study.toml").write_text(STUDY)
     config = config_text(tmp_path / "study.toml")
     folder = start(tmp_path / "records", config, tmp_path, tmp_path / "out", pictures=False)
-    begun = time.monotonic()
     ended = carry_on(folder, small.quiet())
-    minutes = (time.monotonic() - begun) / 60
     assert 2 == ended.exit_status
     refused = {row.name: row.reason for row in ended.rows if row.status == "refused"}
     assert {f"bad_{name}" for name in MALFORMED} == set(refused)
     assert all("\n" not in reason and reason for reason in refused.values())
     fitted = {row.name: row for row in ended.rows if row.parameters}
     assert SPECIMENS == len(fitted)
-    result: dict[str, Any] = {"specimens": SPECIMENS, "minutes": round(minutes, 1)}
+    result: dict[str, Any] = {"specimens": SPECIMENS}
     known = truths()
     for name, (median, spread) in POPULATION.items():
         own, shrunk, ratio = [], [], []

@@ -235,6 +235,29 @@ def forecasts() -> str:
     )
 
 
+def specimens() -> str:
+    one = measured()["campaign"]
+    own, shrunk = (
+        [100 * each[kind] for each in one.values() if isinstance(each, dict)]
+        for kind in ("own", "shrunk")
+    )
+    sensor = "/".join(f"{100 * one[f'sensor {level}']:.1f}" for level in LEVELS)
+    return (
+        f"{one['specimens']} actuators: 95 % intervals of four parameters cover {min(own):.1f} to "
+        f"{max(own):.1f} %, shrunk {min(shrunk):.1f} to {max(shrunk):.1f} %; 50/90/95 % sensor "
+        f"bands {sensor} %; ten malformed records are reported, a line each"
+    )
+
+
+def populations() -> str:
+    one = measured()["populations"]
+    return (
+        f"100 populations of 8: 95 % intervals of mean, spread and next specimen cover "
+        f"{100 * one['mean']:.0f}, {100 * one['spread']:.0f} and {100 * one['new']:.0f} %, shrunk "
+        f"ones {100 * one['shrunk']:.1f} %, {100 * one['width']:.0f} % as wide"
+    )
+
+
 def campaign() -> str:
     one = measured()["joint fit of the campaign"]
     covered = [round(part * one["seeds"]) for part in one["covered"].values()]
@@ -290,6 +313,8 @@ FINDINGS = [
     campaign,
     agreement,
     compensation,
+    specimens,
+    populations,
     defects,
 ]
 
