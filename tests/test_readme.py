@@ -1,13 +1,14 @@
 """The README's commands are there, and the numbers it quotes are those of its commands.
 
 Those of its first command are held against a run of it; those of the slow ones against what was
-found when they last ran in full.
+measured when they last ran in full.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,21 @@ def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
 def test_each_config_of_the_readme_can_be_read(text: str) -> None:
     record = "" if "[record" in text else '[record]\nfile = "my_record.csv"\n'
     parse(record + text, "README")
+
+
+# A line of the shell that calls the package, without what is said of it.
+COMMANDS = [
+    line.partition("#")[0].strip()
+    for lines in re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+    for line in lines.splitlines()
+    if line.startswith("bwbayes ")
+]
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_each_command_takes_what_the_readme_gives_it(line: str) -> None:
+    _, name, *given = shlex.split(line)
+    assert cli.cli.commands[name].make_context(name, given).params
 
 
 def test_each_command_starts_from_a_bare_checkout() -> None:

@@ -176,16 +176,16 @@ def _apart(
     names = [name for name in posterior.names if name in alone.names]
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
     here = [physical.index(posterior.names.index(name)) for name in names]
-    there = [alone.names.index(name) for name in names]
+    own_rows = [alone.names.index(name) for name in names]
     if not names:
         return 0.0, 0, ("", 0.0)
-    moved = own.mode[there] - point.mode[physical][here]
-    mine = own.covariance[np.ix_(there, there)]
+    moved = own.mode[own_rows] - point.mode[physical][here]
+    mine = own.covariance[np.ix_(own_rows, own_rows)]
     # The covariance given the noise, as that of the record's own fit is.
     precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
     both = linalg.inv(precision)[np.ix_(here, here)]
     # Principal directions of what the record tells, in the prior's sds.
-    prior = np.sqrt(np.diag(own.prior_covariance)[there])
+    prior = np.sqrt(np.diag(own.prior_covariance)[own_rows])
     variance, directions = linalg.eigh(mine / np.outer(prior, prior))
     told = directions[:, variance < TOLD] / prior[:, np.newaxis]
     if not told.shape[1]:
