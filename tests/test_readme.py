@@ -10,14 +10,17 @@ import json
 import re
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import parse
+from bwbayes.data import write_record
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.results.bands import LEVELS
@@ -76,11 +79,37 @@ COMMANDS = [
     if line.startswith("bwbayes ")
 ]
 
+# Those of a first record, in their order; the last takes minutes, however small its record is.
+FIRST = [line for line in COMMANDS if re.search(r"my_record|my\.toml$|results/my|stand", line)][:8]
+
 
 @pytest.mark.parametrize("line", COMMANDS)
 def test_each_command_takes_what_the_readme_gives_it(line: str) -> None:
     _, name, *given = shlex.split(line)
     assert cli.cli.commands[name].make_context(name, given).params
+
+
+def test_the_commands_for_a_first_record_go_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a short record, in the order in which a reader types them."""
+    monkeypatch.chdir(tmp_path)
+    stand = VirtualTestStand(discrepancy="none", sample_rate=25.0)
+    generator = np.random.default_rng(2)
+    for name in ("my_record.csv", "next.csv"):
+        drive = Waveform(Sine(100.0, 0.8), 12.0, decay=Decay(0.0, 0.07))
+        write_record(replace(stand.run(drive, generator), truth=None), name)
+    (first, *_) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
+    (tmp_path / "my.toml").write_text(first)
+    assert {"run", "init", "check", "resume", "predict", "simulate", "report"} == {
+        line.split()[1] for line in FIRST
+    }
+    for line in FIRST:
+        done = CliRunner().invoke(cli.cli, shlex.split(line)[1:], standalone_mode=False)
+        assert done.exception is None, f"{line}: {done.output}"
+        assert done.return_value == 0, f"{line}: {done.output}"
+    for made in ("my_record.toml", "results/my/report.html", "stand.csv"):
+        assert (tmp_path / made).is_file(), made
 
 
 def test_each_command_starts_from_a_bare_checkout() -> None:

@@ -176,7 +176,7 @@ def test_csv_has_the_numbers_as_they_are(table: str) -> None:
     link = re.findall(
         rf'download="{table}.csv" href="data:text/csv;charset=utf-8,(.*?)"', page(run)
     )
-    frame = pd.read_csv(StringIO(unquote(link[0])), index_col=0)
+    frame = pd.read_csv(StringIO(unquote(link[0])), index_col=0, float_precision="round_trip")
     if table == "parameters":
         assert [one["mean"] for one in kept.values()] == list(frame["mean"])
         assert list(kept) == list(frame.index)
