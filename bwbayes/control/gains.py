@@ -120,7 +120,7 @@ def design(
         The voltages that may occur, V.
     delay
         Whole samples from a reading to the command that answers it.
-    wanted
+    required
         The margins.
 
     Raises

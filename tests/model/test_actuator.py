@@ -171,9 +171,9 @@ def test_offset_shifts_everything(actuator: Actuator) -> None:
 
 @every_kind
 def test_mirrored_voltage_mirrors_the_displacement(actuator: Actuator) -> None:
-    there = actuator.displacement(theta_of(actuator, offset=0.0), random_walk(9))
+    forth = actuator.displacement(theta_of(actuator, offset=0.0), random_walk(9))
     back = actuator.displacement(theta_of(actuator, offset=0.0, initial=-1.5), -random_walk(9))
-    np.testing.assert_allclose(-there, back, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(-forth, back, rtol=0, atol=1e-12)
 
 
 @every_kind

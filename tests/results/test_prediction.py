@@ -197,9 +197,9 @@ def test_reachable_states_stay_inside_the_ceiling(posterior: Posterior, draws: F
 def test_the_offset_comes_from_the_lead_in(posterior: Posterior, draws: FloatArray) -> None:
     """A record shifted by 30 um is predicted 30 um higher, and its bands are as wide."""
     here = predicted(posterior, draws, made(), Start(from_rest=True))
-    there = predicted(posterior, draws, made(offset=35.0), Start(from_rest=True))
-    np.testing.assert_allclose(30.0, there.mean - here.mean, atol=0.02)
-    np.testing.assert_allclose(width(here), width(there), atol=0.02)
+    elsewhere = predicted(posterior, draws, made(offset=35.0), Start(from_rest=True))
+    np.testing.assert_allclose(30.0, elsewhere.mean - here.mean, atol=0.02)
+    np.testing.assert_allclose(width(here), width(elsewhere), atol=0.02)
 
 
 def test_the_lead_in_is_told_and_a_longer_one_tells_more(

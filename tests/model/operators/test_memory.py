@@ -278,9 +278,9 @@ def test_loops_elsewhere_are_alike_only_for_plays(
 @settings(max_examples=15, deadline=None)
 @given(voltage=paths)
 def test_from_rest_it_is_odd(case: Case, voltage: FloatArray) -> None:
-    there = run(case.operator, case.column, voltage, None)
+    up = run(case.operator, case.column, voltage, None)
     np.testing.assert_allclose(
-        -there, run(case.operator, case.column, -voltage, None), rtol=0, atol=1e-12
+        -up, run(case.operator, case.column, -voltage, None), rtol=0, atol=1e-12
     )
 
 
