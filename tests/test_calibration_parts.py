@@ -36,7 +36,6 @@ from tests.test_calibration_moving import (
     CONFIG,
     KNOWN,
     MOST_UNCONVERGED,
-    REPLICATES,
     SEED,
     band_limit,
     figures,
@@ -46,6 +45,7 @@ from tests.test_calibration_moving import (
 from tests.together import LEVEL, Plant, together_test
 
 QUICK = 10
+REPLICATES = 150
 
 PLAYS_KNOWN = """\
 d = { prior = { distribution = "lognormal", median = 0.43, sigma = 0.3 } }
@@ -68,7 +68,7 @@ def resolved(model: str, parameters: str, folder: Path) -> Experiment:
     generator = np.random.default_rng(SEED)
     write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
     write_record(typical(0.025, 4.0, 0.7, generator), folder / "other.csv")
-    text = CONFIG.format(dynamics="lag").replace("[model]\n", f"[model]\n{model}")
+    text = CONFIG.format(dynamics="lag", steps=3000).replace("[model]\n", f"[model]\n{model}")
     # Ten plays have more parameters than 32 walkers could span.
     return experiment(resolve(parse(text.replace("= 32", "= 40") + parameters, "typical"), folder))
 
