@@ -27,29 +27,28 @@ Weighted = list[tuple[moves.Move, float]]
 class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
     """A step along the line through another walker, as long as two more are apart on that line.
 
-    With e the unit vector from walker z to x, and walkers z₁, z₂ from two other splits,
+    With e the unit vector from walker z to x, and walkers z₁, z₂, all of the half that rests,
 
         x' = x + 1.7 e (e·z₁ − e·z₂),   log factor (p − 1) log(|x' − z| / |x − z|),
 
-    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. Which split gives which
-    of the three is drawn at each step: the way back swaps z₁ and z₂, and must be as likely as the
-    way there. It stands in for
-    ``emcee.moves.DESnookerMove``, which in emcee up to 3.1.6 takes half of the logarithm and makes
-    a posterior of nine parameters a fifth too narrow.
+    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. The way back swaps z₁
+    and z₂, and is as likely as the way there. It stands in for ``emcee.moves.DESnookerMove``, which
+    in emcee up to 3.1.6 takes half of the logarithm and makes a posterior of nine parameters a
+    fifth too narrow.
     """
 
     def __init__(self, stretch: float = 1.7) -> None:
-        super().__init__(nsplits=4)
+        super().__init__()
         self.stretch = stretch
 
     def get_proposal(
         self, moving: FloatArray, others: list[FloatArray], random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
-        """Propose for ``moving`` (walkers, free), given the walkers of the other three splits."""
-        z, z1, z2 = (
-            others[role][random.randint(len(others[role]), size=len(moving))]
-            for role in random.permutation(3)
-        )
+        """Propose for ``moving`` (walkers, free), given the walkers of the other half."""
+        resting, count = np.concatenate(others), len(moving)
+        number, first = random.randint(len(resting), size=(2, count))
+        second = (first + random.randint(1, len(resting), size=count)) % len(resting)
+        z, z1, z2 = resting[number], resting[first], resting[second]
         away = moving - z
         distance = np.linalg.norm(away, axis=1, keepdims=True)
         direction = away / distance

@@ -75,7 +75,11 @@ def test_twin_a_snooker_move_without_its_factor_is_found(name: str) -> None:
 
 
 class OneWay(SnookerMove):
-    """A snooker move whose splits have fixed roles, so that most of its steps have no way back."""
+    """A snooker move of splits with fixed roles, so that most of its steps have no way back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.nsplits = 4
 
     def get_proposal(
         self, moving: FloatArray, others: list[FloatArray], random: Any
