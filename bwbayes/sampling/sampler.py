@@ -13,10 +13,10 @@ and the next one waits until then, and until the chain is long against its autoc
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
-differential evolution starts the sampling again from where the ensembles are: so all draws that
-count come from one kernel, fixed before the first of them. To keep the early draws would save
-little, because differential evolution alone needs about ten times the steps, and they are the very
-draws that are not to be trusted.
+the sampling starts again from where the ensembles are with a second proposal, which is fitted to
+them, for they have been where the first hardly goes. If that one does not cover its draws either,
+these are set aside too, and differential evolution goes on alone, which needs about ten times the
+steps. So all draws that count come from one kernel, fixed before the first of them.
 
 All decisions are functions of the chain alone, and are taken again from its beginning when a run
 that was interrupted goes on: it comes to the same end.
@@ -192,7 +192,7 @@ def sample(
     if not chain.history("sampling"):
         _tune(posterior, plan, chain, executor, watcher)
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        chain.fall_back(chain.blocks("sampling"))
+        _fall_back(chain)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
@@ -266,23 +266,41 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
+def _fall_back(chain: Chain) -> None:
+    """Set what the sampling has made aside; the first time, go on with a fit to that."""
+    thin = thinning(chain.draws("sampling"))
+    second = None if chain.set_aside else _fitted(chain.coordinates("sampling", thin))
+    chain.fall_back(len(chain.history("sampling")), second)
+
+
 def _remarks(chain: Chain) -> tuple[str, ...]:
     """Say what a user should know of the moves."""
     alone = "differential evolution and snooker moves alone made the draws that count"
-    proposal = chain.proposals["sampling"]
-    if proposal is None:
+    first, refitted = chain.proposals["sampling"], chain.refitted
+    if first is None:
         return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
     if not chain.set_aside:
         return ()
     aside = chain.history("sampling")[: chain.set_aside]
+    if not refitted:
+        return (f"the proposal {_uncovered(first, aside)}: they are set aside, and {alone}",)
+    told = f"the proposal {_uncovered(first, aside[:refitted])}: they are set aside, and "
+    if chain.second is None or chain.set_aside == refitted:
+        return (f"{told}a second one, fitted to them, made draws that count",)
+    again = _uncovered(chain.second, aside[refitted:])
+    return (f"{told}so are those of a second one, fitted to them, which {again}: {alone}",)
+
+
+def _uncovered(proposal: StudentMixture, aside: Sequence[Sequence[Block]]) -> str:
+    """Say how badly a proposal covers the blocks that were set aside."""
     each = [block for blocks in aside for block in blocks]
     coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in each])
     density = np.concatenate([b.log_density.ravel() for b in each])
     shape = pareto_k(density - proposal.log_density(coordinates))
     steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
     return (
-        f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
-        f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
+        f"did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
+        f"{LARGEST_PARETO_K})"
     )
 
 
