@@ -8,7 +8,7 @@ another record with the same truth, cut from another drive at another rate, with
 and an offset of its own, and predicts it from the posterior after a lead-in of a second.
 
 Default priors are so wide that some truths have next to no hysteresis; their posteriors are long
-and curved, and take more than 3,000 steps. There a replicate ends, and is ranked as it is;
+and curved, and take more steps than the budget has. There a replicate ends, and is ranked as it is;
 at most one in ten may.
 
 The default suite makes 30 replicates with the lag, and with priors of someone who knows the kind of
@@ -18,9 +18,9 @@ and a bias on the draws (sds three tenths too small are seen nearly always, sds 
 times in 100, a bias of 0.3 sd 96 times). Coverages of the 18 bands are held to the spread between
 replicates: by chance one in 100 sound calibrations has one that is off by more (Bonferroni's
 bound). ``-m slow`` makes 150 replicates of this, and with default priors for all with the lag, the
-second order, and the lag with little noise; and with a free exponent beside known hysteresis, for
-four seconds of a record do not tell an exponent, a loop and its shape of which nothing is known:
-three of three such chains had not converged after 3,000 steps.
+second order, and the lag with little noise; and 50, each of 6,000 steps at most, with a free
+exponent beside known hysteresis: four seconds of a record do not tell an exponent, a loop and its
+shape of which nothing is known, and each takes most of a minute.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -51,7 +51,6 @@ from tests.together import LEVEL, Plant, shifted, together_test
 
 SEED = 1
 QUICK = 30
-REPLICATES = 150
 
 # Part of the replicates that may end before they have converged.
 MOST_UNCONVERGED = 0.1
@@ -69,7 +68,7 @@ dynamics = "{dynamics}"
 
 [sampling]
 ess = 500
-steps = 3000
+steps = {steps}
 walkers = 32
 block = 25
 
@@ -98,12 +97,24 @@ gamma = { prior = { distribution = "normal", mean = 0.0, sd = 0.006 } }
 exponent = { prior = { distribution = "lognormal", median = 1.5, sigma = 0.3 } }
 """
 
+
+class Variant(NamedTuple):
+    """What is calibrated: the dynamics, the priors that are not defaults, budget and replicates."""
+
+    dynamics: str
+    parameters: str
+    steps: int = 3000
+    replicates: int = 150
+
+
 VARIANTS = {
-    "known hysteresis": ("lag", KNOWN),
-    "lag": ("lag", ""),
-    "second order": ("second-order", "mass = { fixed = 300.0 }\nstiffness = { fixed = 4.1e5 }\n"),
-    "free exponent": ("lag", CURVED),
-    "little noise": (
+    "known hysteresis": Variant("lag", KNOWN),
+    "lag": Variant("lag", ""),
+    "second order": Variant(
+        "second-order", "mass = { fixed = 300.0 }\nstiffness = { fixed = 4.1e5 }\n"
+    ),
+    "free exponent": Variant("lag", CURVED, steps=6000, replicates=50),
+    "little noise": Variant(
         "lag",
         'sensor_sd = { prior = { distribution = "lognormal", median = 0.03, sigma = 0.5 } }\n'
         'discrepancy_sd = { prior = { distribution = "lognormal", median = 0.3, sigma = 0.5 } }\n',
@@ -135,8 +146,8 @@ def typical_experiment(variant: str, folder: Path) -> Experiment:
     generator = np.random.default_rng(SEED)
     write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
     write_record(typical(0.025, 4.0, 0.7, generator), folder / "other.csv")
-    dynamics, parameters = VARIANTS[variant]
-    text = CONFIG.format(dynamics=dynamics) + parameters
+    of = VARIANTS[variant]
+    text = CONFIG.format(dynamics=of.dynamics, steps=of.steps) + of.parameters
     return experiment(resolve(parse(text, "typical"), folder))
 
 
@@ -220,11 +231,12 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_is_calibrated(variant: str, tmp_path: Path) -> None:
-    common, every = made(variant, tmp_path, REPLICATES)
+    count = VARIANTS[variant].replicates
+    common, every = made(variant, tmp_path, count)
     outcome = figures(common, every)
     keep(f"calibration, {variant}", outcome)
     assert [] == outcome["shortcomings"]
-    assert outcome["unconverged"] <= MOST_UNCONVERGED * REPLICATES
+    assert outcome["unconverged"] <= MOST_UNCONVERGED * count
     assert together_test(every, common.posterior.prior) > LEVEL
-    limit = band_limit(18, REPLICATES)
+    limit = band_limit(18, count)
     assert {} == {name: t for name, t in off(every).items() if not abs(t) < limit}

@@ -87,8 +87,9 @@ def test_joint_intervals_cover_the_truth_and_are_narrower_than_from_the_loops_al
             covered[name].append(bool(low <= problem.config.truth[name] <= high))
             narrower[name].append(float((high - low) / np.ptp(loops[name])))
         keep(
-            f"joint fit of the campaign, {seed} seeds",
+            "joint fit of the campaign",
             {
+                "seeds": seed,
                 "covered": {name: float(np.mean(one)) for name, one in covered.items()},
                 "width, of that from the loops alone": {
                     name: float(np.median(one)) for name, one in narrower.items()

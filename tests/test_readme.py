@@ -235,6 +235,41 @@ def forecasts() -> str:
     )
 
 
+def campaign() -> str:
+    one = measured()["joint fit of the campaign"]
+    covered = [round(part * one["seeds"]) for part in one["covered"].values()]
+    widths = one["width, of that from the loops alone"]
+    return (
+        f"{one['seeds']} seeds: 95 % intervals of eight parameters cover {min(covered)} to "
+        f"{max(covered)}; the damping's is {100 * widths['damping']:.0f} % as wide, the others' "
+        f"{100 * min(widths[name] for name in widths if name != 'damping'):.0f} to "
+        f"{100 * max(widths.values()):.0f} %"
+    )
+
+
+def agreement() -> str:
+    one = measured()["joint fits: records that agree"]
+    return (
+        f"to rounding where one `continues` the other; as records of their own within 0.1 sd, if "
+        f"ten correlation times of the discrepancy lie between them; {one['named']} of 200 sound "
+        f"records are named, and {100 * one['named with 10 % more gain']:.0f} % of those with a "
+        "tenth more gain"
+    )
+
+
+def compensation() -> str:
+    every = measured()["compensation"]
+    bands, rms = (
+        "/".join(f"{100 * every[f'{kind} {level}'][0]:.0f}" for level in LEVELS)
+        for kind in ("band", "rms")
+    )
+    worst = max(abs(off) for _, off in every.values())
+    return (
+        f"50/90/95 %: bands of the error cover {bands}, intervals of its rms {rms} %; none off by "
+        f"more than {worst:.1f} standard errors"
+    )
+
+
 def defects() -> str:
     one = measured()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
@@ -252,6 +287,9 @@ FINDINGS = [
     spikes,
     closed_loop,
     forecasts,
+    campaign,
+    agreement,
+    compensation,
     defects,
 ]
 

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bwbayes.app.problem.problem import generator
+from bwbayes.app.report.words import digits
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
@@ -97,9 +98,9 @@ def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
     for name, row in numbers.items() if isinstance(numbers, Mapping) else ():
         yield (
             name,
-            f"{row['mean']:.5g}",
-            f"{row['sd']:.2g}",
-            f"{row['lower_95']:.4g} to {row['upper_95']:.4g}",
+            digits(row["mean"], row["sd"]),
+            digits(row["sd"], row["sd"]),
+            f"{digits(row['lower_95'], row['sd'])} to {digits(row['upper_95'], row['sd'])}",
             row["unit"],
             f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
             f"{row['rhat']:.3f}",

@@ -63,8 +63,8 @@ class Candidate:
     not_holding
         The names of those whose bands do not hold.
     joint
-        Log density of the held-out readings of the training record together, nats, and Pareto k̂ of
-        the ratios that it is a mean of; None if there are none.
+        Log density of the held-out readings of the training records together, nats, and Pareto k̂
+        of the ratios that it is a mean of; None if there are none.
     future
         What it foretold of its training readings; None if that was left out.
     evidence

@@ -26,7 +26,7 @@ Measure = Literal["held_out", "future", "evidence"]
 
 WORDS: Mapping[Measure, str] = {
     "held_out": "held-out log score",
-    "future": "log score of the training record's future",
+    "future": "log score of the training readings' future",
     "evidence": "log evidence",
 }
 
@@ -252,7 +252,7 @@ def _against(
     if measure == "evidence":
         said.append("nothing was held out, so the evidence decides, which trusts priors and noise")
     elif measure == "future":
-        said.append("nothing was held out; the training record's own future decides")
+        said.append("nothing was held out; the training readings' own future decides")
     if measure != "evidence" and _known(chosen):
         top = max((one for one in ordered if _known(one)), key=_log_evidence)
         if top is not chosen and _less_likely(chosen, top):
@@ -281,11 +281,11 @@ def _future_against(
     ordered: Sequence[Candidate],
     differences: Mapping[str, Mapping[Measure, Difference]],
 ) -> list[str]:
-    """Say where the training record's own future speaks for another model."""
+    """Say where the training readings' own future speaks for another model."""
     told = [one for one in ordered if one.future is not None and one.future.converged]
     ours = differences[chosen.name].get("future")
     if chosen not in told or ours is None:
-        return ["fits to parts of the training record did not converge; its future is not judged"]
+        return ["fits to parts of the training readings did not converge; its future is not judged"]
     top = max(told, key=lambda one: _value(one, "future"))
     gain = differences[top.name]["future"].value - ours.value
     error = float(np.hypot(differences[top.name]["future"].error, ours.error))

@@ -4,11 +4,13 @@ Leaving out single readings tells nothing in a series whose neighbours know each
 later half of the training readings is predicted a stretch at a time, each from the readings before
 it alone. The first stretch takes a fit to the readings before; for the next one the draws of that
 fit are weighted by what has come to be known since, and only where too few of them would be left
-(Pareto k̂ above 0.7) is the model fitted again.
+(Pareto k̂ above 0.7) is the model fitted again. Of several records the later half of each is
+predicted from the earlier halves of all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -45,9 +47,10 @@ class Future:
     Attributes
     ----------
     log_score
-        (readings,) log density of each, given all before its stretch, nats, per um.
+        (readings,) log density of each, given all before its stretch, nats, per um; record after
+        record, in order of time.
     rows
-        (readings,) their samples.
+        Their samples, (readings of the record,) by its name.
     pareto_k
         Of the weights of each stretch after the first.
     fits
@@ -57,7 +60,7 @@ class Future:
     """
 
     log_score: FloatArray
-    rows: IntArray
+    rows: Mapping[str, IntArray]
     pareto_k: tuple[float, ...]
     fits: int
     converged: bool
@@ -66,31 +69,34 @@ class Future:
 def future(
     posterior: Posterior,
     plan: SamplingPlan,
-    record: Record,
+    records: Mapping[str, Record],
     generator: np.random.Generator,
     executor: Executor,
 ) -> Future:
-    """Predict the later half of the training readings in two stretches.
+    """Predict the later half of each record's training readings in two stretches.
 
     Parameters
     ----------
     posterior, plan
         What was fitted, and how.
-    record
-        The training record, whole.
+    records
+        The training records, whole, by name.
     generator
         Starts the fits, chooses draws.
     executor
         Runs the ensembles.
     """
-    rows = posterior.only.readings.rows
-    edges = [round(part * rows.size) for part in STARTS] + [rows.size]
+    stretches = {one.name: _stretches(one.readings.rows) for one in posterior.datasets}
     fits, converged, shapes = 0, True, []
-    scores = []
+    scores: dict[str, list[FloatArray]] = {name: [] for name in stretches}
     flat = np.empty((0, 0))
     before: Posterior | None = None
-    for first, last in pairwise(edges):
-        part = posterior.altered(training=cut(posterior.only.training, int(rows[first])))
+    for number in range(len(STARTS)):
+        rows = {name: each[number] for name, each in stretches.items()}
+        windows = {
+            one.name: cut(one.training, int(rows[one.name][0])) for one in posterior.datasets
+        }
+        part = posterior.trained(windows)
         weighted = None
         if before is not None:
             weighted, shape = reweighted(before, part, flat, generator)
@@ -99,12 +105,20 @@ def future(
             flat, good = _fitted(part, plan, generator, executor)
             fits, converged, before = fits + 1, converged and good, part
             weighted = flat
-        window = slice(int(rows[first]), int(rows[last - 1]) + 1)
-        chosen = thinned(weighted, generator)
-        bands = predict_windows(part, chosen, record, {"future": window}, generator)[0]
-        assert bands.log_score is not None
-        scores.append(bands.log_score[rows[first:last] - window.start])
-    return Future(np.concatenate(scores), rows[edges[0] :], tuple(shapes), fits, converged)
+        for name, alone, its in part.each(thinned(weighted, generator)):
+            window = slice(int(rows[name][0]), int(rows[name][-1]) + 1)
+            bands = predict_windows(alone, its, records[name], {"future": window}, generator)[0]
+            assert bands.log_score is not None
+            scores[name].append(bands.log_score[rows[name] - window.start])
+    every = np.concatenate([score for parts in scores.values() for score in parts])
+    later = {name: np.concatenate(parts) for name, parts in stretches.items()}
+    return Future(every, later, tuple(shapes), fits, converged)
+
+
+def _stretches(rows: IntArray) -> list[IntArray]:
+    """Cut a record's training readings into the stretches that are predicted."""
+    edges = [round(part * rows.size) for part in STARTS] + [rows.size]
+    return [rows[first:last] for first, last in pairwise(edges)]
 
 
 def cut(windows: tuple[slice, ...], end: int) -> tuple[slice, ...]:
@@ -147,13 +161,13 @@ def _fitted(
 def joint_log_score(
     posterior: Posterior,
     flat: FloatArray,
-    windows: list[slice],
+    windows: Mapping[str, Sequence[slice]],
     generator: np.random.Generator,
 ) -> tuple[float, float]:
-    """Log density of all held-out readings of the training record together, given the fitted ones.
+    """Log density of all held-out readings of the training records together, given the fitted ones.
 
     log (1/S) Σ p(all readings | θ) / p(fitted readings | θ) over the draws θ, the discrepancy
-    carried on from reading to reading.
+    carried on from reading to reading. The windows that were held out go by their record's name.
 
     Returns
     -------
@@ -161,8 +175,11 @@ def joint_log_score(
         Nats, and Pareto k̂ of the ratios: above 0.7 a few draws carry the sum.
     """
     theta = posterior.prior.theta(thinned(flat, generator, WEIGHTED))
-    every = tuple(sorted((*posterior.only.training, *windows), key=lambda window: window.start))
-    longer = posterior.altered(training=every)
+    every = {
+        one.name: tuple(sorted((*one.training, *windows.get(one.name, ())), key=lambda w: w.start))
+        for one in posterior.datasets
+    }
+    longer = posterior.trained(every)
     gains = longer.log_likelihood(theta) - posterior.log_likelihood(theta)
     top = float(np.max(gains))
     if not np.isfinite(top):

@@ -90,6 +90,7 @@ class Exported:
     def numbers(self) -> dict[str, Any]:
         """Return what ``model.json`` says: parts, parameters and coefficients, with their units."""
         actuator = self.model.actuator
+        known = {name: float(values[0]) for name, values in self.model.column.items()}
         linear = self.linear
         return {
             "name": self.name,
@@ -107,9 +108,9 @@ class Exported:
             },
             "parameters": {
                 one.name: {
-                    "mean": float(self.model.column[one.name][0]),
+                    "mean": known[one.name],
                     "sd": self.sds.get(one.name),
-                    "unit": one.unit,
+                    "unit": one.unit_in(known),
                     "description": one.description,
                 }
                 for one in actuator.declarations

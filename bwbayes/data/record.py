@@ -152,9 +152,10 @@ class Record:
         ----------
         frame : pandas.DataFrame
             A column each for time, voltage and displacement; without the last one it is a planned
-            voltage. A time of dates or durations counts from its first sample.
+            voltage. The time may be the index; dates or durations count from the first sample.
         time, voltage, displacement : str
-            The columns' names, if they are not ``time_s``, ``voltage_mV`` and the like.
+            The columns' names, if they are neither ``time_s``, ``voltage_mV`` and the like, nor can
+            be recognised as those of a file are.
         units : dict
             Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
         voltage_is, origin

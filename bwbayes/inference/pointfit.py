@@ -283,7 +283,10 @@ class _Surface:
 
 def _distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
     """Keep the places that lie more than a standard deviation or so from those before them."""
-    inverse = linalg.inv(covariance)
+    with warnings.catch_warnings():
+        # A discrepancy of which a record shows nothing is far less sure than a gain.
+        warnings.simplefilter("ignore", linalg.LinAlgWarning)
+        inverse = linalg.inv(covariance)
     kept: list[FloatArray] = []
     for place in places:
         apart = [(place - other) @ inverse @ (place - other) for other in kept]

@@ -237,6 +237,11 @@ class Posterior:
         """Return a posterior of one record with other fields of its dataset."""
         return replace(self, datasets=(replace(self.only, **fields),))
 
+    def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
+        """Return the posterior of other training windows of the same records, by name."""
+        datasets = (replace(one, training=windows[one.name]) for one in self.datasets)
+        return replace(self, datasets=tuple(datasets))
+
     def with_readings(self, displacements: Mapping[str, FloatArray]) -> Posterior:
         """Return the posterior of other readings (samples,) of the same records, by name."""
         datasets = (replace(one, displacement=displacements[one.name]) for one in self.datasets)

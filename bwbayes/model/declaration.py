@@ -123,7 +123,7 @@ class Declaration:
     scope: Scope = "actuator"
     loop: bool = False
     aliases: tuple[str, ...] = ()
-    unit_given: Callable[[Context], str] | None = None
+    unit_given: Callable[[Mapping[str, float | Distribution]], str] | None = None
     without_default: str = ""
 
     @property
@@ -131,9 +131,9 @@ class Declaration:
         """Whether it lies above zero."""
         return self.floor == 0 and not self.reaches_floor
 
-    def unit_in(self, context: Context) -> str:
-        """Return its unit, given what is stated of other parameters."""
-        return self.unit if self.unit_given is None else self.unit_given(context)
+    def unit_in(self, stated: Mapping[str, float | Distribution]) -> str:
+        """Return its unit, given what is stated of other parameters by name."""
+        return self.unit if self.unit_given is None else self.unit_given(stated)
 
 
 def lognormal(median: float, sigma: float) -> Distribution:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
@@ -101,3 +102,15 @@ class PolynomialGain:
         return sum(
             (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.size))
         )
+
+    def powers(self, column: Values) -> FloatArray:
+        """Return the coefficients (4, models) of 1, u, u² and u³, um/Vᵏ, that make up the gain."""
+        models = np.broadcast(*column.values()).size
+        made = np.zeros((4, models))
+        half = self.reference.half
+        if half > 0:
+            x = Polynomial([-self.reference.middle / half, 1 / half])
+            for name in self.terms:
+                power = TERMS[name].power
+                made[: power + 1] += np.outer(np.asarray((x**power).coef, np.float64), column[name])
+        return made

@@ -5,18 +5,21 @@ gain or another mounting, the joint posterior lies between them and fits none. S
 fitted alone, by a point fit with the joint fit's noise, and two things are compared with the joint
 one: its residuals, and where the shared parameters of the actuator are.
 
-With the unconstrained coordinates of these parameters, in which the prior is nearly a standard
-normal, m and C mean and covariance given all records, m_r and C_r those given record r alone,
+With m and C mean and covariance of its parameters given all records, m_r and C_r given record r
+alone, and ℓ its log likelihood,
 
-    m_r − m ~ N(0, C_r − C)
+    D = 2 [ℓ(m_r) − ℓ(m) + ∇ℓ(m_r)ᵀ (m − m_r)]
 
-if all records are those of one actuator that the prior draws: the covariance of a mean that was
-learnt from more is larger by what the posterior's is smaller (the law of total variance). So
-
-    H = (m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m)
-
-has a χ² distribution, with as many degrees of freedom as there are directions that the record
-tells and that others tell more of. (Without a prior it is Hausman's test, Econometrica 46, 1978.)
+is what the joint fit costs the record, less what the prior at m_r has cost it already. Were all
+normal, D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
+If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C): the
+covariance of a mean that was learnt from more is larger by what the posterior's is smaller (the law
+of total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
+A (C_r − C): what the record does not tell, or tells alone, has no weight. That sum is nearly a
+multiple of a χ² variable, with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946;
+at p = 1e-3 off by less than a factor of two). With (m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in
+Hausman's test, a bent posterior would pass for a disagreement: D is a difference of likelihoods, in
+whatever coordinates.
 
 Another noise shows elsewhere: the innovations of a record at the joint mode have a root mean square
 of 1 if the noise that the records share is its own.
@@ -39,14 +42,17 @@ from bwbayes.results.innovations import innovations
 
 __all__ = ["Agreement", "agreements", "numbers", "remarks"]
 
-# A direction counts if the record leaves less than this part of the prior's variance, and if the
-# others take away more than this part of what the record leaves: of what it tells by itself alone
-# the difference is rounding.
-TOLD, TAKEN = 0.5, 0.05
+# Below these weights together nothing can be compared: what a record tells by itself alone differs
+# by rounding. And the part of a parameter's variance that the others are taken to take away, at
+# least.
+TAKEN = 0.05
+
+# Step along m − m_r for the prior's slope there, as a part of it.
+STEP = 1e-3
 
 # Probability of a false alarm for a record, and the residual's growth below which a disagreement
 # does not matter, however sure it is.
-ALARM, GROWN = 1e-4, 1.02
+ALARM, GROWN = 1e-3, 1.02
 
 # Ratio of its noise to that of all from which on a record's noise is called another one. The
 # discrepancy of a short record may be this much smaller or larger by chance.
@@ -65,7 +71,8 @@ class Agreement:
     joint_um, own_um
         Root mean square of its residuals at the joint mode and at that of a fit of it alone, um.
     distance, degrees
-        H and its degrees of freedom; both zero if nothing can be compared.
+        D in units in which it is a χ² variable, and its degrees of freedom; both zero if nothing
+        can be compared.
     moved
         The shared parameter that is farthest off, and by how many sds of the difference; empty if
         nothing can be compared.
@@ -78,7 +85,7 @@ class Agreement:
     joint_um: float
     own_um: float
     distance: float
-    degrees: int
+    degrees: float
     moved: tuple[str, float]
     size: float
     readings: int
@@ -171,35 +178,41 @@ def _residuals(alone: Posterior, free: FloatArray) -> FloatArray:
 
 def _apart(
     posterior: Posterior, point: PointFit, alone: Posterior, own: PointFit
-) -> tuple[float, int, tuple[str, float]]:
-    """Return H, its degrees of freedom, and the parameter that is farthest off."""
-    names = [name for name in posterior.names if name in alone.names]
+) -> tuple[float, float, tuple[str, float]]:
+    """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off."""
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
-    here = [physical.index(posterior.names.index(name)) for name in names]
-    there = [alone.names.index(name) for name in names]
-    if not names:
-        return 0.0, 0, ("", 0.0)
-    moved = own.mode[there] - point.mode[physical][here]
-    mine = own.covariance[np.ix_(there, there)]
+    columns = [
+        posterior.names.index(posterior.table.name_of(name, alone.only.name))
+        for name in alone.names
+    ]
+    here = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
     precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
-    both = linalg.inv(precision)[np.ix_(here, here)]
-    # Principal directions of what the record tells, in the prior's sds.
-    prior = np.sqrt(np.diag(own.prior_covariance)[there])
-    variance, directions = linalg.eigh(mine / np.outer(prior, prior))
-    told = directions[:, variance < TOLD] / prior[:, np.newaxis]
-    if not told.shape[1]:
-        return 0.0, 0, ("", 0.0)
-    left, more = told.T @ mine @ told, told.T @ (mine - both) @ told
-    part, axes = linalg.eigh((more + more.T) / 2, left)
-    axes, part = axes[:, part > TAKEN], part[part > TAKEN]
-    if not part.size:
-        return 0.0, 0, ("", 0.0)
-    scores = axes.T @ told.T @ moved / np.sqrt(part)
-    spread = np.sqrt(np.maximum(np.diag(mine - both), TAKEN * np.diag(mine)))
-    away = moved / spread
+    taken = own.covariance - linalg.inv(precision)[np.ix_(here, here)]
+    added = linalg.inv(own.covariance) - linalg.inv(own.prior_covariance)
+    weights = np.maximum(linalg.eigvals(added @ taken).real, 0.0)
+    if not weights.sum() > TAKEN:
+        return 0.0, 0.0, ("", 0.0)
+    unit = float(np.sum(weights**2) / np.sum(weights))
+    moved = own.mode - point.mode[columns]
+    spread = np.sqrt(np.maximum(np.diag(taken), TAKEN * np.diag(own.covariance)))
+    shared = [i for i, name in enumerate(alone.names) if name in posterior.names]
+    away = moved[shared] / spread[shared]
     worst = int(np.argmax(np.abs(away)))
-    return float(scores @ scores), int(part.size), (names[worst], float(away[worst]))
+    farthest = alone.names[shared[worst]], float(away[worst])
+    cost = max(_cost(alone, own.mode, point.mode[columns]), 0.0)
+    return cost / unit, float(np.sum(weights)) / unit, farthest
+
+
+def _cost(alone: Posterior, own: FloatArray, joint: FloatArray) -> float:
+    """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
+    step = STEP * (joint - own)
+    places = np.stack([own, joint, own + step, own - step])
+    _, log_prior = alone.prior.constrain(places)
+    log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
+    # At the mode, the likelihood's slope is the prior's turned round.
+    slope = (log_prior[3] - log_prior[2]) / (2 * STEP)
+    return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
 
 
 def remarks(every: Mapping[str, Agreement]) -> list[str]:
@@ -208,7 +221,7 @@ def remarks(every: Mapping[str, Agreement]) -> list[str]:
         f"{name}: does not agree with the other records: its residual is {one.joint_um:.3g} um rms "
         f"in the joint fit and {one.own_um:.3g} um in a fit of its own, and {one.moved[0]} is "
         f"{abs(one.moved[1]):.1f} sds {'higher' if one.moved[1] > 0 else 'lower'} there "
-        f"(chi-square {one.distance:.4g} with {one.degrees} degrees of freedom, "
+        f"(chi-square {one.distance:.4g} with {one.degrees:.3g} degrees of freedom, "
         f"p = {one.p_value:.1g}): fit it alone, or give it what differs as its own with "
         f'model.per_record = ["{one.moved[0]}"]'
         for name, one in every.items()

@@ -23,7 +23,7 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 from bwbayes.sampling.diagnostics import pareto_k
 
-__all__ = ["Sway", "remarks", "spectrum", "stretches_once", "sway", "undetermined"]
+__all__ = ["Sway", "percent", "remarks", "spectrum", "stretches_once", "sway", "undetermined"]
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -108,7 +108,8 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
     lines = []
     for i in np.flatnonzero(parts > LEFT_OPEN):
         combination = _combination(directions[:, i], names)
-        text = f"the record does not determine {combination}: {parts[i]:.0%} of the prior's sd left"
+        left = percent(parts[i])
+        text = f"the record does not determine {combination}: {left} of the prior's sd left"
         if i + 1 < parts.size:
             following = _combination(directions[:, i + 1], names)
             text += f", next {following} with {parts[i + 1]:.0%}"
@@ -116,6 +117,11 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
         decider = _decider(posterior.prior, draws, members)
         lines.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
     return lines
+
+
+def percent(left: float) -> str:
+    """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
+    return "all" if left >= 0.995 else f"{left:.0%}"
 
 
 def sway(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> Sway:
@@ -168,7 +174,7 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
             return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
     swayed = sway(prior, draws, names)
     if swayed.part > WIDE:
-        return f"the prior decides there: the posterior has {swayed.part:.0%} of its sd"
+        return f"the prior decides there: the posterior has {percent(swayed.part)} of its sd"
     if not swayed.told:
         return "these draws cannot tell whether the prior decides there"
     if swayed.decides:
@@ -177,7 +183,7 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
             f"of its sd and makes an interval {swayed.widened:.1f} times as wide"
         )
     return (
-        f"the prior does not decide there (one twice as wide moves {swayed.name} by "
+        f"what decides there is not the prior (one twice as wide moves {swayed.name} by "
         f"{swayed.moved:.2f} of its sd, and nothing by more) but the noise model, which may be "
         "too sure"
     )

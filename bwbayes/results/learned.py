@@ -22,6 +22,7 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.results.identifiability import percent
 
 __all__ = ["Combination", "Learned", "Taught", "learned", "numbers"]
 
@@ -205,5 +206,6 @@ def _remarks(parameters: Mapping[str, Taught], combinations: Sequence[Combinatio
     ]
     if combinations:
         worst = combinations[0]
-        said.append(f"determined worst: {worst.text}, with {worst.left:.0%} of the prior's sd left")
+        left = percent(worst.left)
+        said.append(f"determined worst: {worst.text}, with {left} of the prior's sd left")
     return said

@@ -18,6 +18,7 @@ from bwbayes.app.fit import fitted
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run
+from bwbayes.app.report.words import digits
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands
@@ -128,7 +129,7 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
     said, page = repr(fit), fit._repr_html_()
     for name, row in fit.summary.iterrows():
-        for text in (str(name), f"{row['mean']:.5g}", f"{row['sd']:.2g}"):
+        for text in (str(name), digits(row["mean"], row["sd"]), digits(row["sd"], row["sd"])):
             assert text in said
             assert text in page
     assert said.startswith("small: converged, ")

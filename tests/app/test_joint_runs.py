@@ -183,7 +183,7 @@ def test_any_other_record_is_predicted(finished: RunFolder) -> None:
 
 
 def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_path: Path) -> None:
-    """What a model has no parameter for is left out of its scopes; none is another's future."""
+    """What a model has no parameter for is left out of its scopes; every record has a future."""
     scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))
     models = models_of("linear", scoped.model)
     out = tmp_path / "out"
@@ -193,7 +193,11 @@ def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_pat
     both = [finished.path, out / "linear"]
     made = compare_runs(both, tmp_path / "both", small.quiet(), workers=1)
     assert "run" == made.recommended
-    assert all(one.future is None for one in made.candidates)
+    for one in made.candidates:
+        assert one.future is not None
+        assert one.future.converged
+        assert {"loops", "step"} == one.future.rows.keys()
+        assert sum(rows.size for rows in one.future.rows.values()) == one.future.log_score.size
     assert {"later", "sine"} == made["linear"].scores.keys() == made["run"].scores.keys()
     assert (tmp_path / "both/comparison.html").is_file()
 

@@ -383,6 +383,17 @@ def test_warnings_of_a_record_become_remarks(tmp_path: Path) -> None:
     assert "100 V" in remarks[0]
 
 
+def test_what_was_said_of_a_record_stays_with_its_run(folder: Path) -> None:
+    """Its own copy, in the package's columns, would not say it again."""
+    text = (folder / "record.csv").read_text().splitlines()
+    rows = [f"{line},21.5" for line in text if not line.startswith("#")]
+    (folder / "record.csv").write_text("\n".join([rows[0].replace("21.5", "temp_C"), *rows[1:]]))
+    first = of(RECORD, folder)
+    assert first.remarks[0].endswith("ignored columns: temp_C")
+    again = load_run(RunFolder.create(folder / "run", first, overwrite=False))
+    assert first.remarks == again.remarks
+
+
 def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -> None:
     transient = SPOILT["switch-on transient"](looping(0), np.random.default_rng(0))
     write_record(transient, tmp_path / "record.h5")

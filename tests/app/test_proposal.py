@@ -224,7 +224,7 @@ def test_outliers_that_are_held_out_are_left_out(write: Write) -> None:
         ({"rows": np.r_[0:200, 220:600]}, r"csv:202: time_s: gap of 0.21 s .*; give the voltage"),
         ({"header": "time_s,voltage_V,pos"}, "pos: no unit of the displacement .* --unit displ"),
         ({"header": "time_s,a_V,b_V"}, "which column is the voltage"),
-        ({"header": "time_s,voltage_V,displacement_pm"}, "displacement_pm: no unit|which column"),
+        ({"header": "time_s,voltage_V,displacement_pm"}, "displacement_pm: unknown unit 'pm'"),
     ],
     ids=["sign", "mV", "gap", "no unit", "two voltages", "odd unit"],
 )

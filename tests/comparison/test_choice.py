@@ -46,9 +46,8 @@ def model(
     if log_evidence is not None:
         one = replace(one, evidence=Evidence(log_evidence, 0.02, 0.0, 1000.0))
     if future is not None:
-        one = replace(
-            one, future=Future(future, np.arange(future.size, dtype=np.int64), (0.3,), 1, True)
-        )
+        rows = {"record": np.arange(future.size, dtype=np.int64)}
+        one = replace(one, future=Future(future, rows, (0.3,), 1, True))
     return one
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.comparison.future import cut, future, joint_log_score, reweighted
 from bwbayes.data import Record
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.table import JointTable
 from bwbayes.sampling.sampler import SamplingPlan
 from tests.inference.problems import INTERVAL
 from tests.inference.test_solvable import (
@@ -39,11 +41,13 @@ def exact(posterior: Posterior, count: int = 4000) -> FloatArray:
     return drawn
 
 
-def posterior_of_rows(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of the normal posterior of the readings that count."""
+def posterior_of_rows(
+    posterior: Posterior, rows: IntArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of the normal posterior of some readings, or of those that count."""
     design, level, noise = parts(posterior)
     mean, sd = prior_moments(posterior)
-    rows = posterior.only.readings.rows
+    rows = posterior.only.readings.rows if rows is None else rows
     weighted = linalg.solve(noise[np.ix_(rows, rows)], design[rows], assume_a="pos")
     made = linalg.inv(design[rows].T @ weighted + np.diag(sd**-2.0))
     shift = made @ weighted.T @ (posterior.only.displacement - level)[rows]
@@ -67,33 +71,64 @@ def test_windows_are_cut_before_a_sample() -> None:
     assert cut(windows, 4) == (slice(2, 4),)
 
 
+def foretold(posterior: Posterior, known: IntArray, some: IntArray) -> FloatArray:
+    """Log density of each of some readings, given the known ones, in closed form."""
+    design, level, noise = parts(posterior)
+    mean, spread = posterior_of_rows(posterior, known)
+    middle = level[some] + design[some] @ (mean - prior_moments(posterior)[0])
+    variance = np.einsum("ri,ij,rj->r", design[some], spread, design[some])
+    sds = np.sqrt(variance + np.diag(noise)[some])
+    return np.asarray(stats.norm.logpdf(posterior.only.displacement[some], middle, sds))
+
+
+def whole_record(posterior: Posterior) -> Record:
+    return Record(posterior.only.voltage, posterior.only.displacement, INTERVAL)
+
+
 def test_each_stretch_is_predicted_from_what_came_before(posterior: Posterior) -> None:
     """Against the closed form of each reading's density, given the readings before its stretch."""
-    record = Record(posterior.only.voltage, posterior.only.displacement, INTERVAL)
     with ThreadPoolExecutor(1) as pool, one_thread():
+        record = {"record": whole_record(posterior)}
         made = future(posterior, PLAN, record, np.random.default_rng(1), pool)
     rows = posterior.only.readings.rows
     assert made.converged
-    half = rows.size // 2
-    np.testing.assert_array_equal(made.rows, rows[half:])
-    design, level, noise = parts(posterior)
-    expected = []
-    for first, last in ((half, round(0.75 * rows.size)), (round(0.75 * rows.size), rows.size)):
-        earlier = posterior.altered(training=cut(posterior.only.training, int(rows[first])))
-        mean, known = posterior_of_rows(earlier)
-        some = rows[first:last]
-        middle = level[some] + design[some] @ (mean - prior_moments(posterior)[0])
-        spread = np.einsum("ri,ij,rj->r", design[some], known, design[some])
-        sds = np.sqrt(spread + np.diag(noise)[some])
-        expected.append(stats.norm.logpdf(posterior.only.displacement[some], middle, sds))
+    half, later = rows.size // 2, round(0.75 * rows.size)
+    np.testing.assert_array_equal(made.rows["record"], rows[half:])
+    expected = [
+        foretold(posterior, rows[:first], rows[first:last])
+        for first, last in ((half, later), (later, rows.size))
+    ]
     np.testing.assert_allclose(made.log_score, np.concatenate(expected), atol=0.01)
     # The twin: from all readings the scores are others, by more than that.
-    mean, _ = posterior_of_rows(posterior)
-    middle = level + design @ (mean - prior_moments(posterior)[0])
-    fitted = stats.norm.logpdf(
-        posterior.only.displacement[rows[half:]], middle[rows[half:]], np.sqrt(noise[0, 0])
+    assert np.max(np.abs(foretold(posterior, rows, rows[half:]) - made.log_score)) > 0.02
+
+
+def test_each_of_two_records_is_predicted_from_the_beginnings_of_both(posterior: Posterior) -> None:
+    """Two windows as records of their own that share all; white noise has no memory of the cut."""
+    names = ("first", "second")
+    datasets = tuple(
+        replace(posterior.only, training=(window,), name=name)
+        for name, window in zip(names, WINDOWS, strict=True)
     )
-    assert np.max(np.abs(fitted - made.log_score)) > 0.02
+    table = JointTable(datasets[0].table, names, shared=("initial", "offset"))
+    both = Posterior(datasets, posterior.prior, joint=table)
+    record = whole_record(posterior)
+    with ThreadPoolExecutor(1) as pool, one_thread():
+        records = dict.fromkeys(names, record)
+        made = future(both, PLAN, records, np.random.default_rng(1), pool)
+    assert made.converged
+    rows = [one.readings.rows for one in datasets]
+    expected: list[list[FloatArray]] = [[], []]
+    for first, last in ((0.5, 0.75), (0.75, 1.0)):
+        known = np.concatenate([every[: round(first * every.size)] for every in rows])
+        for scores, every in zip(expected, rows, strict=True):
+            some = every[round(first * every.size) : round(last * every.size)]
+            scores.append(foretold(posterior, known, some))
+    parts_of_both = [score for scores in expected for score in scores]
+    np.testing.assert_allclose(made.log_score, np.concatenate(parts_of_both), atol=0.01)
+    # The twin: of its own beginning alone the second record is told otherwise.
+    alone = foretold(posterior, rows[1][: round(0.5 * rows[1].size)], made.rows["second"])
+    assert np.max(np.abs(alone - made.log_score[-alone.size :])) > 0.02
 
 
 def test_weighted_draws_are_those_of_the_later_posterior(posterior: Posterior) -> None:
@@ -120,7 +155,8 @@ def test_the_joint_score_is_the_conditional_density(posterior: Posterior) -> Non
     """Of the normal distribution of all readings; within 0.1 nats."""
     first, second = WINDOWS
     before = posterior.altered(training=(first,))
-    got, shape = joint_log_score(before, exact(before), [second], np.random.default_rng(2))
+    later = {"record": [second]}
+    got, shape = joint_log_score(before, exact(before), later, np.random.default_rng(2))
     design, level, noise = parts(posterior)
     _, sd = prior_moments(posterior)
     whole = noise + (design * sd**2) @ design.T

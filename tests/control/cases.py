@@ -32,6 +32,7 @@ ACTUATORS = {
     "bouc-wen": (BoucWen(), "none", None, None),
     "bouc-wen not passive": (BoucWen(passive=False), "lag", None, None),
     "bouc-wen, second-order": (BoucWen(), "second-order", None, None),
+    "bouc-wen, lag, gain": (BoucWen(), "lag", GAIN, None),
     "bouc-wen with all": (BoucWen(), "second-order", GAIN, GROWING),
     "backlash-like, lag, creep": (BacklashLike(), "lag", None, CREEP),
     "plays, lag, gain": (Plays(6), "lag", GAIN, None),

@@ -151,9 +151,10 @@ def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     actuator = cases.actuator(name)
     theta = cases.theta(actuator, 1, name)[0]
     assert list(actuator.parameters) == list(numbers["parameters"])
+    stated = dict(zip(actuator.parameters, theta.tolist(), strict=True))
     for declared, value in zip(actuator.declarations, theta, strict=True):
         known = numbers["parameters"][declared.name]
-        assert (value, declared.unit) == (known["mean"], known["unit"])
+        assert (value, declared.unit_in(stated)) == (known["mean"], known["unit"])
     assert 1e-3 == numbers["interval_s"]
     known = numbers["parts"]["hysteresis"]
     assert type(actuator.hysteresis) is HYSTERESIS[known]
@@ -162,6 +163,14 @@ def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     system = made.linear
     for matrix in "ABCD":
         np.testing.assert_array_equal(numbers["state_space"][matrix], getattr(system, matrix))
+
+
+def test_an_exponent_says_in_what_units_beta_and_gamma_are() -> None:
+    units = [
+        [of(name, "first").numbers()["parameters"][one]["unit"] for one in ("beta", "gamma")]
+        for name in ("bouc-wen, second-order", "bouc-wen, n = 1.7, lag")
+    ]
+    assert [["1/V"] * 2, ["um^(1-n)/V"] * 2] == units
 
 
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)])

@@ -71,7 +71,11 @@ def test_a_matlab_files_own_columns_are_read(tmp_path: Path) -> None:
             "no column 'poss' for the displacement; did you mean 'pos'",
         ),
         ({"displacement": "laser"}, UNIT, "no column 'laser' .*; there are '.*'"),
-        ({}, {}, "pos: no unit in the name; say it: units = { displacement = "),
+        (
+            {},
+            {},
+            "pos: no unit of the displacement in its name; write it there, or say units = { d",
+        ),
         ({}, {"displacement": "pm"}, "units: displacement in 'pm' is unknown; write one of um"),
         ({"position": "pos"}, UNIT, "columns: no quantity 'position'; write time, voltage, disp"),
         ({"voltage": "pos"}, UNIT, "columns: two quantities have the same column"),
@@ -83,6 +87,35 @@ def test_a_mapping_that_is_wrong_is_one_line(
 ) -> None:
     with pytest.raises(InputError, match=line):
         read_record(write(tmp_path / f"a{suffix}"), columns=COLUMNS | columns, units=units)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5", ".mat"])
+def test_columns_are_recognised_where_none_are_said(tmp_path: Path, suffix: str) -> None:
+    """A unit is all that has to be said, and of a MATLAB file's, which have none, each."""
+    units = UNIT | ({"time": "ms"} if suffix == ".mat" else {})
+    path = write(tmp_path / f"a{suffix}")
+    assert_same(read_record(path, units=units))
+    with pytest.raises(InputError, match=r": (pos|x|t): no unit of the (displacement|time) in its"):
+        read_record(path)
+
+
+def test_a_column_that_is_recognised_by_its_unit_alone_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv")
+    path.write_text(path.read_text().replace("pos", "displcement_nm").replace("U_mV", "u_mV"))
+    with pytest.warns(InputWarning, match=r"taken by its unit: displacement is 'displcement_nm';"):
+        assert_same(read_record(path))
+
+
+def test_the_packages_own_names_come_before_others(tmp_path: Path) -> None:
+    """And a simulated record's truth is never taken for a displacement."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in {"time_s": TIME, "voltage_V": VOLTAGE, "truth_um": VOLTAGE}.items():
+            file[name] = values
+    assert read_record(path, need_displacement=False).displacement is None
+    with h5py.File(path, "a") as file:
+        file["displacement_um"], file["pos (um)"] = DISPLACEMENT, VOLTAGE
+    assert_same(read_record(path))
 
 
 def test_a_column_that_is_mapped_counts_and_its_namesake_does_not(tmp_path: Path) -> None:
@@ -129,7 +162,10 @@ def test_columns_are_recognised(names: list[str], expected: list[str] | None) ->
 
 
 def test_what_two_columns_may_be_is_left_open() -> None:
-    assert {"time": "t_s"} == recognised(["t_s", "a_V", "b_V", "c_um", "d_um"])
+    names = ["t_s", "a_V", "b_V", "c_um", "d_um"]
+    assert {"time": "t_s"} == recognised(names)
+    with pytest.raises(InputError, match=r"which column is the voltage\? There are 'a_V', 'b_V'"):
+        Record.from_pandas(pd.DataFrame(np.ones((20, 5)), columns=names))
 
 
 def test_the_packages_own_names_need_no_mapping() -> None:
@@ -170,14 +206,23 @@ def test_a_table_is_a_record() -> None:
     assert plan.displacement is None
 
 
+def test_a_tables_columns_and_index_are_recognised() -> None:
+    frame = pd.DataFrame(VALUES)
+    assert_same(Record.from_pandas(frame, units=UNIT))
+    assert_same(Record.from_pandas(frame.set_index("t [ms]"), units=UNIT))
+    moments = pd.to_timedelta(VALUES["t [ms]"], unit="ms")
+    assert_same(Record.from_pandas(frame.drop(columns="t [ms]").set_index(moments), units=UNIT))
+
+
 @pytest.mark.parametrize("kind", ["datetime64[ns]", "datetime64[us]", "timedelta64[ns]"])
 def test_a_table_may_have_dates_for_times(kind: str) -> None:
+    """They need no unit."""
     dates = (TIME * 1e9).round().astype("timedelta64[ns]")
     if kind.startswith("date"):
         dates = np.datetime64("2024-01-01", "ns") + dates
-    frame = pd.DataFrame(VALUES).assign(when=dates.astype(kind))
-    columns = COLUMNS | {"time": "when"}
-    assert_same(Record.from_pandas(frame, **columns, units=UNIT | {"time": "s"}))
+    frame = pd.DataFrame(VALUES).drop(columns="t [ms]").assign(when=dates.astype(kind))
+    assert_same(Record.from_pandas(frame, **COLUMNS | {"time": "when"}, units=UNIT))
+    assert_same(Record.from_pandas(frame, units=UNIT))
 
 
 @pytest.mark.parametrize(
@@ -187,7 +232,7 @@ def test_a_table_may_have_dates_for_times(kind: str) -> None:
             {"displacement": "poss"},
             "DataFrame: no column 'poss' for the displacement; did you mean",
         ),
-        ({"time": None}, r"DataFrame: t \[ms\]: unknown column; did you mean time_s\?"),
+        ({"displacement": "U_mV"}, "columns: two quantities have the same column"),
     ],
 )
 def test_a_tables_column_that_is_misspelt_is_one_line(change: dict[str, Any], line: str) -> None:

@@ -13,6 +13,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.patterns import decay, spikes, trend, turning_points
+from bwbayes.data.stuck import clipped
 from tests.data.spoilt import SPOILT, good, looping
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
@@ -30,12 +31,23 @@ SINE = np.sin(np.linspace(0.0, 12 * np.pi, 3000))
 def test_a_displacement_cut_off_at_its_limit_is_clipping(
     limits: tuple[float, float], step: float
 ) -> None:
-    clipped = np.clip(np.round(SINE / step) * step, *limits)
-    (finding,) = findings("clipping", SINE, clipped)
+    limited = np.clip(np.round(SINE / step) * step, *limits)
+    (finding,) = findings("clipping", SINE, limited)
     first, last = round(finding.start / 1e-3), round(finding.stop / 1e-3) - 1
-    assert abs(clipped[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
-    assert abs(clipped[[first - 1, last + 1]]).max() < 0.8
+    assert abs(limited[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
+    assert abs(limited[[first - 1, last + 1]]).max() < 0.8
     assert "use a wider range" == finding.remedy
+
+
+@pytest.mark.parametrize("part", [0.015, 0.05, 0.15])
+def test_every_reading_of_a_noisy_tip_that_is_cut_off_counts(part: float) -> None:
+    """The noise breaks the flat top into pieces, most of them shorter than five readings."""
+    noisy = SINE + 0.05 * np.random.default_rng(1).standard_normal(SINE.size)
+    limited = np.minimum(noisy, np.quantile(noisy, 1 - part))
+    some = clipped(limited, SINE)
+    assert some is not None
+    assert np.count_nonzero(limited == limited.max()) == some.samples
+    assert clipped(noisy, SINE) is None
 
 
 TRAPEZOID = np.clip(SINE, -0.7, 0.7)
@@ -168,6 +180,8 @@ def test_spikes_are_neither_edges_nor_turns() -> None:
     triangle = np.abs(np.arange(400) % 80 - 40) / 10
     assert [] == spikes(triangle + noise, triangle).tolist()
     assert [] == spikes(np.sign(triangle - 2) + noise).tolist()
+    pulses = triangle + 5.0 * (np.arange(400) % 100 == 50)
+    assert [] == spikes(pulses + noise, pulses).tolist()
     assert [200] == spikes(triangle + noise + 2.0 * (np.arange(400) == 200), triangle).tolist()
 
 

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
@@ -168,6 +169,13 @@ def test_an_optimum_that_is_much_worse_is_no_place_to_start_from() -> None:
     point = fit(posterior, np.random.default_rng(7))
     free, _ = posterior.prior.constrain(point.optima)
     np.testing.assert_allclose([6.0], free[:, 1], atol=0.15)
+
+
+def test_optima_are_told_apart_where_one_direction_is_far_less_sure() -> None:
+    """And without a warning: the record shows nothing of a discrepancy, and all of a gain."""
+    places = [np.array([0.0, 0.0]), np.array([1e-13, 0.0]), np.array([1e-10, 0.0])]
+    kept = pointfit._distinct(places, np.diag([1e-24, 1.0]))
+    np.testing.assert_array_equal([places[0], places[2]], kept)
 
 
 def test_noise_alone_can_be_fitted() -> None:

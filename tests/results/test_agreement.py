@@ -12,9 +12,10 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.agreement import Agreement, agreements, numbers, remarks
+from bwbayes.results.agreement import Agreement, _cost, agreements, numbers, remarks
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
+from tests.inference.test_solvable import linear_posterior
 from tests.measured import keep
 
 
@@ -67,23 +68,49 @@ def test_one_record_alone_has_nothing_to_agree_with() -> None:
     assert {} == compared(posterior)
 
 
+@pytest.mark.parametrize("seed", [61, 91])
+def test_a_record_whose_posterior_is_bent_agrees(seed: int) -> None:
+    """Of two hundred sound records these have the largest distances between means, 25 and 40."""
+    every = compared(pair(seed))
+    assert [] == remarks(every)
+    assert all(one.p_value > 1e-3 for one in every.values())
+
+
+def test_what_a_record_costs_is_the_quadratic_form_where_all_is_normal() -> None:
+    """A linear model: D = δᵀ A δ, with the precision that the record adds to its prior's."""
+    posterior = linear_posterior(("d", "offset"), "white")
+    own = pointfit.fit(posterior, np.random.default_rng(1))
+    added = np.linalg.inv(own.covariance) - np.eye(2)
+    moved = np.array([0.3, -0.2])
+    expected = moved @ added @ moved
+    assert _cost(posterior, own.mode, own.mode + moved) == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_they_should_be() -> None:
     """Of 100 pairs of records of one actuator 5 % lie beyond the 95 % of the chi-square.
 
     Of 200 comparisons, which come in pairs that are nearly the same: within three standard errors
-    of 100 independent ones, 0 to 11.5 %, and none at the level of an alarm. Fails by chance once in
-    300 times. Twin: with a tenth more gain all are named.
+    of 100 independent ones, 0 to 11.5 %, and at most two at the level of an alarm, where 0.2 to 0.4
+    are expected. Fails by chance once in 100 times. Twin: with a tenth more gain nine in ten are
+    named.
     """
-    p = np.array([[one.p_value for one in compared(pair(seed)).values()] for seed in range(100)])
+    every = [compared(pair(seed)) for seed in range(100)]
+    p = np.array([[one.p_value for one in both.values()] for both in every])
     beyond = float(np.mean(p < 0.05))
+    alarms = sum(one.disagrees for both in every for one in both.values())
     named = [bool(remarks(compared(pair(seed, gain=1.1)))) for seed in range(20)]
     keep(
         "joint fits: records that agree",
-        {"beyond 95 % of the chi-square": beyond, "named with 10 % more gain": np.mean(named)},
+        {
+            "beyond 95 % of the chi-square": beyond,
+            "named": alarms,
+            "smallest p": round(float(p.min()), 5),
+            "named with 10 % more gain": np.mean(named),
+        },
     )
     assert beyond <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
-    assert p.min() > 1e-4
+    assert alarms <= 2
     assert np.mean(named) > 0.9
     assert stats.kstest(p[:, 0], "uniform").pvalue > 1e-3
 

@@ -18,7 +18,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
-from bwbayes.results.identifiability import remarks, sway
+from bwbayes.results.identifiability import percent, remarks, sway
 from tests.inference.problems import decaying_sine, posterior_of, ring_bender, short_posterior
 from tests.results.test_identifiability import at_truth, measured, sine
 
@@ -122,6 +122,11 @@ def test_prior_that_decides_is_said_to(amplitude: float, said: str) -> None:
     assert said in remark
     asked = "drive the actuator up and down several times" if amplitude > 20 else "drive over more"
     assert asked in remark
+
+
+def test_no_more_than_all_of_a_prior_is_left() -> None:
+    """A posterior that is wider than its prior has all of it, and not 101 %."""
+    assert ["34%", "99%", "all", "all"] == [percent(part) for part in (0.34, 0.99, 0.996, 1.25)]
 
 
 def test_known_loop_needs_no_words() -> None:

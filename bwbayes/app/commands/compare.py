@@ -50,7 +50,7 @@ def compare(
 ) -> int:
     """Compare the runs in folders PATHS, or models that one config is run with.
 
-    Scores on what was held out, on the training record's own future, log evidence; differences
+    Scores on what was held out, on the training readings' own future, log evidence; differences
     with paired errors; what is recommended, and what speaks against it. Of --models the first word
     is an operator; gain, creep, dynamics and noise follow after plus signs.
 

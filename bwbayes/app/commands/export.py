@@ -22,7 +22,7 @@ __all__ = ["export"]
     "--voltage",
     type=(float, float),
     metavar="LOW HIGH",
-    help="Lowest and highest voltage that the inverse may give, V; default: the record's.",
+    help="Lowest and highest voltage that the inverse may give, V; default: what was fitted.",
 )
 @click.option(
     "--rate", type=float, help="The controller's samples a second; default: the record's."

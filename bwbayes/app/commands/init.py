@@ -30,9 +30,16 @@ CONFIG = ".toml"
     help="A column's unit, if its name does not say it: displacement=nm; -nm turns the sign.",
 )
 @click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="QUANTITY=NAME",
+    help="Which column holds the time, voltage or displacement, if its name does not say it.",
+)
+@click.option(
     "--out", type=click.Path(path_type=Path), help="The config; default: NAME-OF-RECORD.toml."
 )
-def init(record: Path, units: tuple[str, ...], out: Path | None) -> int:
+def init(record: Path, units: tuple[str, ...], columns: tuple[str, ...], out: Path | None) -> int:
     """Look at a RECORD and write a config for it, with comments.
 
     Example: bwbayes init my_record.csv --unit displacement=nm
@@ -42,7 +49,9 @@ def init(record: Path, units: tuple[str, ...], out: Path | None) -> int:
     out = out or record.with_suffix(CONFIG)
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    made = propose(record, out.parent, dict(_unit(text) for text in units))
+    said = [dict(_pair("--unit", text) for text in units)]
+    said += [dict(_pair("--column", text) for text in columns)]
+    made = propose(record, out.parent, *said)
     try:
         out.write_text(made.text, encoding="utf-8")
     except OSError as error:
@@ -103,8 +112,8 @@ def _show(made: Proposal, console: Console) -> None:
         console.print(escape(text), highlight=False, soft_wrap=True)
 
 
-def _unit(text: str) -> tuple[str, str]:
-    quantity, equals, unit = text.partition("=")
+def _pair(option: str, text: str) -> tuple[str, str]:
+    quantity, equals, value = text.partition("=")
     if not equals:
-        raise InputError(f"init: --unit {text}: write QUANTITY=UNIT, displacement=nm for instance")
-    return quantity.strip(), unit.strip()
+        raise InputError(f"init: {option} {text}: write {option} displacement=..., with a value")
+    return quantity.strip(), value.strip()

@@ -50,7 +50,7 @@ voltage_option = click.option(
     "--voltage",
     type=(float, float),
     metavar="LOW HIGH",
-    help="Lowest and highest voltage of the amplifier, V; default: the record's.",
+    help="Lowest and highest voltage of the amplifier, V; default: what was fitted.",
 )
 slew_option = click.option("--slew", type=float, help="Its fastest change of the voltage, V/s.")
 current_option = click.option(

@@ -20,11 +20,12 @@ import numpy as np
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect, isolated_outliers
-from bwbayes.data.io.columns import UNITS, Naming, recognised, unit_in
-from bwbayes.data.io.formats import column_names
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.data.io.checks import Table
+from bwbayes.data.io.columns import Naming, unit_in
+from bwbayes.data.io.formats import read_table
+from bwbayes.errors import InputWarning
 
-__all__ = ["Proposal", "naming_of", "propose", "read_recognised"]
+__all__ = ["Proposal", "propose"]
 
 # Of the record's readings: what is held out, first choice first, and the fewest of either part.
 QUARTERS = ((0.75, 1.0), (0.5, 0.75))
@@ -60,7 +61,12 @@ class Proposal:
         return next((one for one in self.findings if one.kind in POINTLESS), None)
 
 
-def propose(path: Path, where: Path, units: Mapping[str, str] | None = None) -> Proposal:
+def propose(
+    path: Path,
+    where: Path,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> Proposal:
     """Propose a config for a record.
 
     Parameters
@@ -71,100 +77,38 @@ def propose(path: Path, where: Path, units: Mapping[str, str] | None = None) -> 
         The folder in which the config is going to be.
     units
         Units by quantity, where the names of the columns do not say them.
+    columns
+        Names of columns by quantity, where they are not to be recognised.
 
     Raises
     ------
     InputError
         A column that is not recognised or has no unit, or a record that cannot be used.
     """
-    naming = naming_of(path, units or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        record = read_record(path, columns=naming.columns, units=naming.units)
+        record = read_record(path, columns=columns, units=units)
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
-    findings = tuple(_with_sign(one, path, naming) for one in inspect(record))
-    text = _text(path, where, naming, record, findings)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        table = read_table(path, Naming(columns or {}, units or {}))
+    findings = tuple(_with_sign(one, path, table) for one in inspect(record))
+    text = _text(path, where, table.naming, record, findings)
     return Proposal(text, parse(text, str(path)), record, findings, remarks)
 
 
-def naming_of(
-    path: Path, units: Mapping[str, str] | None = None, *, need_displacement: bool = True
-) -> Naming:
-    """Recognise a file's columns and their units; the package's own names need no table.
-
-    Parameters
-    ----------
-    path
-        The record's file.
-    units
-        Units by quantity, where the names of the columns do not say them.
-    need_displacement
-        False also accepts a file of a planned voltage.
-
-    Raises
-    ------
-    InputError
-        A column that is not recognised or has no unit.
-    """
-    units = units or {}
-    needed = ("time", "voltage", *(["displacement"] if need_displacement else []))
-    names = column_names(path)
-    Naming({}, units)  # refuses what does not exist
-    own = {quantity for name in names if (quantity := _own(name, units))}
-    guessed = recognised(names)
-    columns = {q: name for q, name in guessed.items() if q not in own}
-    missing = [q for q in needed if q not in {*own, *columns}]
-    if missing:
-        raise InputError(
-            f"{path}: which column is the {missing[0]}? There are {', '.join(map(repr, names))}; "
-            f'write a config with columns = {{ {missing[0]} = "..." }} under [record]'
-        )
-    for quantity, name in columns.items():
-        if quantity not in units and unit_in(name, quantity) is None:
-            known = ", ".join(UNITS[quantity])
-            raise InputError(
-                f"{path}: {name}: no unit of the {quantity} in its name; write it there, or give "
-                f"it: `bwbayes init {path} --unit {quantity}=UNIT` with one of {known}"
-            )
-    return Naming(columns, units)
-
-
-def read_recognised(path: Path) -> Record:
-    """Read a record or a planned voltage whose columns may have other people's names.
-
-    Raises
-    ------
-    InputError
-        A column that is not recognised or has no unit, or a record that cannot be used.
-    """
-    naming = naming_of(path, need_displacement=False)
-    return read_record(path, need_displacement=False, columns=naming.columns, units=naming.units)
-
-
-def _own(name: str, units: Mapping[str, str]) -> str | None:
-    """Return the quantity of one of the package's own names; None of any other."""
-    try:
-        return Naming({}, units).of(name)[0]
-    except ValueError:
-        return None
-
-
-def _with_sign(finding: Finding, path: Path, naming: Naming) -> Finding:
+def _with_sign(finding: Finding, path: Path, table: Table) -> Finding:
     """Return a finding; of a reversed sign with the command that turns it without a new file."""
     if finding.kind != "reversed sign":
         return finding
-    names = [name for name in column_names(path) if _is_displacement(name, naming)]
-    unit = naming.units.get("displacement") or unit_in(names[0], "displacement") or "um"
+    name = table.columns["displacement"].name
+    unit = table.naming.units.get("displacement") or unit_in(name, "displacement") or "um"
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
-    command = f"bwbayes init {path} --unit displacement={turned}"
-    return replace(finding, remedy=f"{finding.remedy}, or here with `{command}`")
-
-
-def _is_displacement(name: str, naming: Naming) -> bool:
-    try:
-        return naming.of(name)[0] == "displacement"
-    except ValueError:
-        return False
+    here = (
+        f'units = {{ displacement = "{turned}" }} under [record], or '
+        f"`bwbayes init {path} --unit displacement={turned}`"
+    )
+    return replace(finding, remedy=f"{finding.remedy}, or say {here}")
 
 
 def _text(

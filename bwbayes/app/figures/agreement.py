@@ -26,7 +26,7 @@ def draw_agreement(every: Mapping[str, Agreement]) -> Figure:
             panel.plot(one.time, values, ".", color=colour, ms=2, mew=0, alpha=0.7, label=label)
         panel.axhline(0, color=MEAN_COLOUR, lw=0.8)
         verdict = "DOES NOT AGREE" if one.disagrees else "agrees"
-        told = f"chi-square {one.distance:.3g} of {one.degrees}, p = {one.p_value:.2g}"
+        told = f"chi-square {one.distance:.3g} of {one.degrees:.3g}, p = {one.p_value:.2g}"
         panel.set_title(f"{name}: {verdict} with the others ({told})", fontsize=10)
         panel.set_ylabel("residual (µm)")
         panel.legend(loc="upper right", markerscale=4)

@@ -88,4 +88,4 @@ def _draw_pit(panel: Axes, bands: Bands, colour: str) -> None:
     heights, edges = np.histogram(
         bands.pit[bands.scored_from :], PIT_BINS, range=(0, 1), density=True
     )
-    panel.stairs(heights, edges, color=colour, lw=1.4, label=plain(title(bands)))
+    panel.stairs(heights, edges, baseline=None, color=colour, lw=1.4, label=plain(title(bands)))

@@ -131,7 +131,7 @@ def _legend(plot: figure) -> None:
     """Put the legend above the plot, where a click hides what it names."""
     legend = plot.legend[0]
     legend.update(ncols=2, click_policy="hide", border_line_color=None, padding=0)
-    legend.update(label_text_font_size=FONT_SIZE, glyph_height=14, spacing=0, margin=4)
+    legend.update(label_text_font_size=FONT_SIZE, glyph_height=14, spacing=8, margin=4)
     plot.add_layout(legend, "above")
 
 

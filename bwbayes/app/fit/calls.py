@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.config.proposal import naming_of
 from bwbayes.app.fit.fitted import Fit, carried_on, to_know
 from bwbayes.app.fit.surroundings import Scratch, warn
 from bwbayes.app.problem.problem import resolve
@@ -73,9 +72,6 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
-    if isinstance(record, str | Path) and "columns" not in keys:
-        naming = naming_of(Path(record), keys.get("units"))
-        keys |= {key: table for key, table in vars(naming).items() if table}
     config, records = config_of(record, keys)
     problem = resolve(config, Path(), records)
     warn(problem.remarks, 3)

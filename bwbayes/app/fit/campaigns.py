@@ -14,7 +14,6 @@ from typing import Any
 
 from bwbayes.app.config.config import dump
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.fit.calls import open_run
 from bwbayes.app.fit.fitted import Fit
@@ -105,7 +104,9 @@ class Campaign:
             There is no population, or the record cannot be used.
         """
         first = self.fit(self.population.names[0])
-        other = record if isinstance(record, Record) else read_recognised(Path(record))
+        other = (
+            record if isinstance(record, Record) else read_record(record, need_displacement=False)
+        )
         source = generator(first.problem.config.seed, "next specimen")
         posterior = first.problem.posterior
         draws = next_specimen(self.population, posterior, first.result.flat_draws, source)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.fit.advice import Advice
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
@@ -44,7 +43,7 @@ from bwbayes.app.screen import (
 )
 from bwbayes.control.exported import Exported
 from bwbayes.control.tracking import Tracking
-from bwbayes.data import Record
+from bwbayes.data import Record, read_record
 from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.outputs import posterior_tree
@@ -237,7 +236,7 @@ class Fit(Advice):
         other = record
         if not isinstance(other, Record):
             name = name or Path(other).stem
-            other = read_recognised(Path(other))
+            other = read_record(other, need_displacement=False)
         hold = self.problem.config.model.hold
         known = None if hold == "auto" else hold
         start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
@@ -319,7 +318,9 @@ class Fit(Advice):
 
     @property
     def _title(self) -> str:
-        name = self.problem.config.name or self.problem.record.origin
+        name = self.problem.config.name or ", ".join(
+            record.origin for record in self.problem.records.values()
+        )
         if not self.converged:
             return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; no interval is given"
         known = {True: "its bands hold", False: "its bands DO NOT HOLD", None: "bands not judged"}

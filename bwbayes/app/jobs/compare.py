@@ -251,9 +251,7 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
     sampled, density = draws(posterior, run.chain), log_densities(run.chain)
     flat = sampled.reshape(-1, sampled.shape[-1])
     bands = tuple(one for one in held_out(problem, flat) if one.measured is not None)
-    windows = [v.window for v in problem.validations.values() if v.window is not None]
-    # Of several records, none is another's future.
-    alone = len(posterior.datasets) == 1
+    windows = {name: list(problem.held_out(name).values()) for name in problem.records}
     log_prior = posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
     return replace(
         plain,
@@ -261,10 +259,10 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         scores={one.name: score(one, scoring(seed, one)) for one in bands},
         not_holding=_not_holding(problem, flat, bands),
         joint=joint_log_score(posterior, flat, windows, generator(seed, "joint"))
-        if windows and alone
+        if any(windows.values())
         else None,
-        future=future(posterior, problem.plan, problem.record, generator(seed, "future"), pool)
-        if with_future and alone
+        future=future(posterior, problem.plan, problem.records, generator(seed, "future"), pool)
+        if with_future
         else None,
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
         log_likelihood=float(np.max(density.ravel() - log_prior)),
@@ -289,8 +287,7 @@ def held_out(problem: Problem, flat: FloatArray) -> list[Bands]:
     chosen = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
     for name, alone, its in posterior.each(chosen):
-        every = problem.validations.items()
-        windows = {n: v.window for n, v in every if v.window is not None and v.of == name}
+        windows = problem.held_out(name)
         if windows:
             record = problem.records[name]
             source = generator(seed, f"predict {record.sha256}")

@@ -130,8 +130,9 @@ def compensate_draws(
     command, from_rest, nearest, limit
         As of :func:`~bwbayes.control.compensation.compensate`.
     voltage, slew, current, capacitance
-        Limits of the amplifier: lowest and highest voltage, V, by default the record's; its fastest
-        change, V/s, and the largest current, A, into the actuator's capacitance, F, by default any.
+        Limits of the amplifier: lowest and highest voltage, V, by default those of all records
+        fitted; its fastest change, V/s, and the largest current, A, into the actuator's
+        capacitance, F, by default any.
     interval, smoothed
         Sampling interval, and sd of a smoothing, s, of displacements.
 

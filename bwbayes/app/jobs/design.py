@@ -21,7 +21,6 @@ from rich.table import Table
 
 from bwbayes.app.config.config import SignalConfig
 from bwbayes.app.config.keys import one_line
-from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.design import draw_design
 from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
@@ -29,7 +28,7 @@ from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.app.report.design_report import render
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Asked, Promise, promises, ranked
-from bwbayes.data import Record, write_record
+from bwbayes.data import Record, read_record, write_record
 from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal, signal_names
 from bwbayes.errors import InputError
 from bwbayes.model.drive import time_between_turns, turning_points
@@ -302,7 +301,7 @@ def _drive(name: str, problem: Problem) -> FloatArray:
     interval = problem.records[liveliest(problem)].interval
     if name in signal_names():
         return signal(name).sample(1 / interval)[1]
-    record = read_recognised(Path(name))
+    record = read_record(Path(name), need_displacement=False)
     if not np.isclose(record.interval, interval, rtol=1e-6):
         times = np.arange(0.0, record.duration, interval)
         since = record.interval * np.arange(record.samples)

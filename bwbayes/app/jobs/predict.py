@@ -11,7 +11,6 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.config.proposal import read_recognised
 from bwbayes.app.figures import save_one
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.folder import RunFolder
@@ -22,7 +21,7 @@ from bwbayes.app.running.predictions import (
 )
 from bwbayes.app.running.run import finished
 from bwbayes.app.screen import show_scores, show_verdicts
-from bwbayes.data import Record
+from bwbayes.data import Record, read_record
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.results.outputs import write_bands, write_summary
@@ -103,7 +102,7 @@ def predict(
 def _record(problem: Problem, of: str, path: Path | None, waveform: str | None) -> Record:
     """Read the record, or sample the signal as the training record was sampled."""
     if path is not None:
-        return read_recognised(path)
+        return read_record(path, need_displacement=False)
     assert waveform is not None
     interval = problem.records[of].interval
     _, voltage = signal(waveform).sample(1 / interval)

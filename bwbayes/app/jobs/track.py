@@ -44,7 +44,7 @@ class Setup:
     Parameters
     ----------
     voltage
-        Lowest and highest of the amplifier, V; by default those of the record.
+        Lowest and highest of the amplifier, V; by default those of all records fitted.
     rate
         Samples a second.
     delay

@@ -172,7 +172,7 @@ def _parameter(column: Column, given: ParameterConfig, context: Context) -> Para
         else:
             fixed = default
     _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
-    unit = declared.unit_in(context)
+    unit = declared.unit_in(context.stated)
     if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
         raise InputError(
             f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"

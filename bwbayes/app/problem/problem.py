@@ -129,8 +129,12 @@ class Problem:
             name if len(one.training) == 1 else f"{name}-{i + 1}": window
             for i, window in enumerate(one.training)
         }
-        held_out = {n: v.window for n, v in self.validations.items() if v.of == record}
-        return windows | {n: window for n, window in held_out.items() if window is not None}
+        return windows | self.held_out(record)
+
+    def held_out(self, record: str) -> dict[str, slice]:
+        """Return the windows of a training record that were held out, by name."""
+        every = self.validations.items()
+        return {name: v.window for name, v in every if v.window is not None and v.of == record}
 
 
 def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:

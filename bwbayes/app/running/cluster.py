@@ -121,20 +121,19 @@ class Cluster(Executor):
         self.waiting.discard(future)
         if future.cancelled():
             return
-        if made.status == "finished":
-            try:
-                result = made.result(timeout=PATIENCE)
-            except Exception as error:
-                _fail(future, self._gone(error))
+        try:
+            if made.status == "finished":
+                _succeed(future, made.result(timeout=PATIENCE))
+            elif made.status == "error":
+                raised = made.exception(timeout=PATIENCE)
+                if type(raised).__name__ == "KilledWorker":
+                    why = f"{DEATHS} workers died during one call; free some memory"
+                    raised = BrokenExecutor(why)
+                _fail(future, raised)
             else:
-                _succeed(future, result)
-        elif made.status == "error":
-            raised = made.exception(timeout=PATIENCE)
-            if type(raised).__name__ == "KilledWorker":
-                raised = BrokenExecutor(f"{DEATHS} workers died during one call; free some memory")
-            _fail(future, raised)
-        else:
-            _fail(future, self._gone(None))
+                _fail(future, self._gone(None))
+        except Exception as error:  # nobody sees what a callback raises, and the caller waits
+            _fail(future, self._gone(error))
 
     def _gone(self, error: BaseException | None) -> BrokenExecutor:
         why = f": {error}" if error is not None and str(error) else ""

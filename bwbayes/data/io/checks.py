@@ -10,10 +10,9 @@ the sample, counted from 0.
 
 from __future__ import annotations
 
-import difflib
 import math
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypedDict, get_args
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.data.io.columns import COMMON_NAMES, Naming
+from bwbayes.data.io.columns import COMMON_NAMES, Naming, missing
 from bwbayes.errors import InputError, InputWarning
 
 __all__ = [
@@ -35,7 +34,7 @@ __all__ = [
     "VoltageIs",
     "checked",
     "checked_reference",
-    "named_columns",
+    "named_table",
     "require_voltage_is",
 ]
 
@@ -67,7 +66,8 @@ class Table:
     """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
 
     `notes` holds what the file says in words: `voltage_is`, `origin`, `interval_s`. `first_line`
-    is the line of the first sample in a text file. `names` are all names that the file has.
+    is the line of the first sample in a text file. `names` are all names that the file has, and
+    `naming` says which of them are the columns.
     """
 
     path: Path
@@ -75,6 +75,7 @@ class Table:
     notes: Mapping[str, str] = field(default_factory=dict)
     first_line: int | None = None
     names: tuple[str, ...] = ()
+    naming: Naming = field(default_factory=Naming)
 
     def error(self, problem: str, quantity: str = "", sample: int | None = None) -> InputError:
         """Return the error ``file:line: column: problem``; sample and quantity may be left out."""
@@ -110,21 +111,23 @@ def require_voltage_is(text: str) -> VoltageIs:
     raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
 
 
-def named_columns(
+def named_table(
     path: Path,
-    names: Collection[str],
+    names: tuple[str, ...],
     naming: Naming,
     size: Callable[[str], int],
     load: Callable[[str], Any],
-) -> dict[str, Column]:
+    notes: Mapping[str, str],
+) -> Table:
     """Return the columns among the named arrays of a binary file; other arrays are passed over.
 
-    `naming` says which arrays are meant. `size` gives the number of values of an array before
-    `load` reads it, so that a damaged file cannot ask for all memory.
+    `naming` says which arrays are meant, and what it leaves open is recognised. `size` gives the
+    number of values of an array before `load` reads it, so that a damaged file cannot ask for all
+    memory.
     """
     columns: dict[str, Column] = {}
     try:
-        naming.require_in(names)
+        naming = naming.completed(names)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     for name in names:
@@ -140,7 +143,7 @@ def named_columns(
         if size(name) > MAXIMUM_SAMPLES:
             raise InputError(f"{path}: {name}: {size(name)} values; give at most {MAXIMUM_SAMPLES}")
         columns[quantity] = Column(name, _real_vector(path, name, load(name)), power, sign)
-    return columns
+    return Table(path, columns, notes, names=names, naming=naming)
 
 
 def _real_vector(path: Path, name: str, values: Any) -> NDArray[Any]:
@@ -226,11 +229,10 @@ def checked_reference(table: Table) -> tuple[FloatArray, float]:
 def _check_lengths(table: Table, needed: Iterable[str]) -> None:
     for quantity in needed:
         if quantity not in table.columns:
-            names = [name for name in table.names if name]
-            near = difflib.get_close_matches(COMMON_NAMES[quantity], names, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names[:10])}"
             header = None if table.first_line is None else -1  # the line above the first sample
-            raise table.error(f"missing; add it ({hint})", quantity, header)
+            used = [column.name for column in table.columns.values()]
+            rest = [name for name in table.names if name not in used]
+            raise table.error(missing(quantity, rest), sample=header)
     samples = table.columns["time"].values.size
     for quantity, column in table.columns.items():
         if column.values.size != samples:
@@ -304,8 +306,9 @@ def _time_grid(table: Table, held: bool) -> tuple[float, float, IntArray | None]
     if places[-1] < time.size:
         return float(time[0]), interval, None
     sample = int(np.argmax(gaps)) + 1
-    missing = int(places[-1]) + 1 - time.size
-    remark = f"{missing} samples are missing, from here on in {np.count_nonzero(gaps)} gaps"
+    lost = int(places[-1]) + 1 - time.size
+    count = int(np.count_nonzero(gaps))
+    remark = f"{lost} samples are missing, from here on in {count} gap{'s' * (count > 1)}"
     error = table.error(f"{remark}; the commanded voltage is taken as held there", "time", sample)
     warnings.warn(str(error), InputWarning, stacklevel=4)
     return float(time[0]), interval, places

@@ -2,11 +2,13 @@
 
 The package's own names carry quantity and unit, ``voltage_mV`` for instance. A :class:`Naming`
 says which columns of a file with other names are meant, and in which units; where it says none,
-the unit is read from the name itself, as in ``t [ms]``, ``pos (nm)`` or ``U_mV``.
+the unit is read from the name itself, as in ``t [ms]``, ``pos (nm)`` or ``U_mV``, and a column that
+can be nothing else is recognised by its name: :meth:`Naming.completed`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import re
 from collections.abc import Collection, Mapping
@@ -14,7 +16,7 @@ from dataclasses import dataclass, field
 
 from bwbayes.errors import InputError
 
-__all__ = ["COMMON_NAMES", "UNITS", "Naming", "recognised", "unit_in"]
+__all__ = ["COMMON_NAMES", "UNITS", "Naming", "by_unit", "missing", "recognised", "unit_in"]
 
 # Powers of ten that lead from a column's unit to s, V and um. Both micro signs of Unicode count.
 _TIME = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
@@ -91,6 +93,34 @@ class Naming:
                 hint = f"did you mean {near[0]!r}?" if near else f"there are {_listed(names)}"
                 raise ValueError(f"no column {name!r} for the {quantity}; {hint}")
 
+    def completed(self, names: Collection[str]) -> Naming:
+        """Return this naming with what it leaves open recognised among a file's columns.
+
+        The columns that are named here and the package's own names come first.
+
+        Raises
+        ------
+        ValueError
+            With the text ``problem; what to do``: a column that is named and missing, or one that
+            is recognised and has no unit, or none that is known.
+        """
+        self.require_in(names)
+        known = dict(self.columns)
+        for name in names:
+            with contextlib.suppress(ValueError):
+                known.setdefault(self.of(name)[0], name)
+        rest = [name for name in names if name not in known.values()]
+        more = {q: name for q, name in recognised(rest).items() if q not in known}
+        for name in rest:
+            quantity, _, unit = name.strip().lower().rpartition("_")
+            if quantity in WORDS and quantity not in {*known, *more}:
+                written = ", ".join(UNITS[quantity])
+                raise ValueError(f"{name}: unknown unit {unit!r}; write one of {written}")
+        for quantity, name in more.items():
+            if quantity not in self.units and unit_in(name, quantity) is None:
+                raise ValueError(f"{name}: {_no_unit(quantity)}")
+        return Naming({**self.columns, **more}, self.units) if more else self
+
     def of(self, name: str) -> tuple[str, int, int]:
         """Return the quantity of a column of this name, its unit's power of ten, and its sign.
 
@@ -113,9 +143,28 @@ class Naming:
         """Return the power of ten and the sign of a column's unit."""
         unit = self.units.get(quantity) or unit_in(name, quantity)
         if unit is None:
-            example = f'units = {{ {quantity} = "{next(iter(UNITS[quantity]))}" }}'
-            raise ValueError(f"no unit in the name; say it: {example}")
+            raise ValueError(_no_unit(quantity))
         return UNITS[quantity][unit.removeprefix("-")], -1 if unit.startswith("-") else 1
+
+
+def _no_unit(quantity: str) -> str:
+    example = f'units = {{ {quantity} = "{next(iter(UNITS[quantity]))}" }}'
+    return (
+        f"no unit of the {quantity} in its name; write it there, or say {example} "
+        f"(bwbayes init: --unit {quantity}={next(iter(UNITS[quantity]))})"
+    )
+
+
+def missing(quantity: str, rest: Collection[str]) -> str:
+    """Return what to do about a quantity that no column has; ``rest`` are the file's others."""
+    if not rest:
+        return f"{COMMON_NAMES[quantity]}: missing; add it"
+    near = difflib.get_close_matches(COMMON_NAMES[quantity], rest, 1)
+    name = near[0] if near else "..."
+    return (
+        f"which column is the {quantity}? There are {_listed(rest)}; "
+        f'say columns = {{ {quantity} = "{name}" }} (bwbayes init: --column {quantity}={name})'
+    )
 
 
 def unit_in(name: str, quantity: str) -> str | None:
@@ -146,6 +195,11 @@ def recognised(names: Collection[str]) -> dict[str, str]:
     return guessed
 
 
+def by_unit(quantity: str, name: str) -> bool:
+    """Whether only the unit of a column's name says that it holds the quantity."""
+    return _word(name) not in WORDS[quantity]
+
+
 def _word(name: str) -> str:
     """Return what a column's name says besides a unit, in lower case."""
     units = [unit_in(name, quantity) for quantity in WORDS]
@@ -159,18 +213,11 @@ def _own(name: str, units: Mapping[str, str]) -> tuple[str, int]:
     quantity, _, unit = name.strip().rpartition("_")
     known = UNITS.get(quantity.lower())
     bare = name.strip().lower()
-    if known is None and bare in UNITS:
-        if bare in units:
-            return bare, 0
-        raise ValueError(f"no unit in the name; write {COMMON_NAMES[bare]}")
-    if known is None:
-        common = [COMMON_NAMES[key] for key in ("time", "voltage", "displacement")]
-        near = difflib.get_close_matches(name.strip(), common, 1, 0.4)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(common)};"
-        raise ValueError(f"unknown column; {hint} `columns` maps other names")
-    if unit not in known:
-        raise ValueError(f"unknown unit {unit!r}; write one of {', '.join(known)}")
-    return quantity.lower(), known[unit]
+    if known is not None and unit in known:
+        return quantity.lower(), known[unit]
+    if bare in units:
+        return bare, 0
+    raise ValueError("not one of the package's own names; say it under `columns`")
 
 
 def _listed(names: Collection[str]) -> str:

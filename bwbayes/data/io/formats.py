@@ -7,6 +7,7 @@ The noise-free displacement of a simulated record travels with it: in a second t
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,14 +22,14 @@ from bwbayes.data.io.checks import (
     checked_reference,
     require_voltage_is,
 )
-from bwbayes.data.io.columns import Naming
+from bwbayes.data.io.columns import Naming, by_unit
 from bwbayes.data.io.hdf5 import read_hdf5, write_hdf5
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.data.io.text import header_names, read_csv, write_csv
+from bwbayes.data.io.text import read_csv, write_csv
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["SUFFIXES", "column_names", "read_record", "read_reference", "write_record"]
+__all__ = ["SUFFIXES", "read_record", "read_reference", "read_table", "write_record"]
 
 _TEXT = (".csv", ".txt")
 _READERS: dict[str, Callable[[Path, Naming], Table]] = {
@@ -55,13 +56,14 @@ def read_record(
     ----------
     path : path
         The suffix says the format. Columns carry their units in their names: `time_s`,
-        `voltage_V`, `displacement_um`, or with other SI prefixes; time must be uniform.
+        `voltage_V`, `displacement_um`, or with other SI prefixes; time must be uniform. Other names
+        are recognised where they can mean nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``.
     voltage_is : "command", "output" or None
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
         False also accepts a planned voltage without a displacement.
     columns : dict
-        Names of the columns in the file by quantity, where they are others than above:
+        Names of the columns in the file by quantity, where they are not to be recognised:
         ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "pos"}``.
     units : dict
         Units by quantity, ``{"displacement": "nm"}``, where the names do not say them; ``"-nm"``
@@ -76,12 +78,15 @@ def read_record(
     Warns
     -----
     InputWarning
-        If columns are ignored, or a commanded voltage is held where samples are missing.
+        If columns are ignored, a column is recognised by nothing but its unit, or a commanded
+        voltage is held where samples are missing.
     """
     path = Path(path)
     if voltage_is is not None:
         require_voltage_is(voltage_is)
-    table = _read_table(path, Naming(columns or {}, units or {}))
+    naming = Naming(columns or {}, units or {})
+    table = read_table(path, naming)
+    _say_guesses(path, naming, table.naming)
     record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() in _TEXT and truth_path.exists():
@@ -100,21 +105,19 @@ def read_reference(path: str | Path) -> tuple[FloatArray, float]:
     InputError
         For every problem, in one line, as of :func:`read_record`.
     """
-    return checked_reference(_read_table(Path(path), Naming()))
+    return checked_reference(read_table(Path(path), Naming()))
 
 
-def column_names(path: str | Path) -> list[str]:
-    """Return the names of all columns or arrays that a record's file has.
+def read_table(path: str | Path, naming: Naming) -> Table:
+    """Read a file's columns as they stand in it, with the naming that they were recognised by.
 
     Raises
     ------
     InputError
-        The file cannot be read, or has no header.
+        The file cannot be read, or a column cannot be told.
     """
     path = Path(path)
-    if path.suffix.lower() in _TEXT:
-        return _opened(path, lambda: header_names(path))
-    return list(_read_table(path, Naming()).names)
+    return _opened(path, lambda: _READERS[path.suffix.lower()](path, naming))
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
@@ -150,10 +153,6 @@ def _known_suffix(path: Path) -> str:
     return suffix
 
 
-def _read_table(path: Path, naming: Naming) -> Table:
-    return _opened(path, lambda: _READERS[path.suffix.lower()](path, naming))
-
-
 def _opened[T](path: Path, read: Callable[[], T]) -> T:
     """Return what is read from a file, and say what keeps it from being opened."""
     try:
@@ -173,12 +172,21 @@ def _opened[T](path: Path, read: Callable[[], T]) -> T:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
 
 
+def _say_guesses(path: Path, given: Naming, used: Naming) -> None:
+    """Say which columns were recognised by nothing but their units."""
+    more = {q: name for q, name in used.columns.items() if q not in given.columns}
+    guesses = [f"{q} is {name!r}" for q, name in more.items() if by_unit(q, name)]
+    if guesses:
+        remark = f"{path}: taken by its unit: {', '.join(guesses)}; `columns` says otherwise"
+        warnings.warn(one_line(remark), InputWarning, stacklevel=3)
+
+
 def _truth_path(path: Path) -> Path:
     return path.with_suffix(f".truth{path.suffix}")
 
 
 def _with_truth(record: Record, path: Path) -> Record:
-    truth = Record(**checked(_read_table(path, Naming())))
+    truth = Record(**checked(read_table(path, Naming())))
     same = truth.samples == record.samples and np.allclose(
         truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
     )

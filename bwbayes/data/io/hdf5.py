@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.data.io.checks import Table, named_columns
+from bwbayes.data.io.checks import Table, named_table
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
@@ -57,10 +57,12 @@ def read_hdf5(path: Path, naming: Naming) -> Table:
 def group_table(path: Path, group: Any, naming: Naming, notes: dict[str, str]) -> Table:
     """Return the columns among the datasets of an open HDF5 group."""
     names = tuple(datasets(group))
-    columns = named_columns(
-        path, names, naming, lambda name: int(group[name].size or 0), lambda name: group[name][()]
+    return named_table(
+        *(path, names, naming),
+        lambda name: int(group[name].size or 0),
+        lambda name: group[name][()],
+        notes,
     )
-    return Table(path, columns, notes, names=names)
 
 
 def write_hdf5(record: Record, path: Path) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.io
 from scipy.io.matlab import MatReadWarning, matfile_version
 
-from bwbayes.data.io.checks import MAXIMUM_SAMPLES, Table, named_columns
+from bwbayes.data.io.checks import MAXIMUM_SAMPLES, Table, named_table
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.hdf5 import check_lists, datasets, group_table, record_arrays
 from bwbayes.data.record import Record
@@ -88,12 +88,12 @@ def _read_5(path: Path, naming: Naming) -> Table:
                 raise InputError(f"{path}: {name}: is of class {classes[name]}; store real numbers")
             return scipy.io.loadmat(path, appendmat=False, variable_names=[name])[name]
 
-        columns = named_columns(path, shapes, naming, lambda name: math.prod(shapes[name]), load)
         notes = {}
         for key in ("voltage_is", "origin", "interval_s"):
             if math.prod(shapes.get(key, (0,))) > 0:
                 notes[key] = _first(load(key))
-    return Table(path, columns, notes, names=tuple(shapes))
+        names = tuple(shapes)
+        return named_table(path, names, naming, lambda name: math.prod(shapes[name]), load, notes)
 
 
 def _check_elements(data: bytes) -> None:

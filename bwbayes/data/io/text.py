@@ -1,10 +1,11 @@
 """Records as text: ``time_s,voltage_V,displacement_um``, one sample per line.
 
 Lines ``# key: value`` may stand above the header; ``voltage`` (command or output), ``origin`` and
-``interval_s`` are understood, others are comments. An empty cell or ``nan`` in the displacement is
-a missing reading; columns of other quantities are ignored, with a remark. NumPy's C parser reads
-the numbers; only when it fails does a slow pass look for the line that is wrong, and says what is
-wrong with it.
+``interval_s`` are understood, others are comments. Where semicolons or tabs separate the columns of
+the header, they do so below it too, and a comma there is a decimal comma. An empty cell or ``nan``
+in the displacement is a missing reading; columns of other quantities are ignored, with a remark.
+NumPy's C parser reads the numbers; only when it fails does a slow pass look for the line that is
+wrong, and says what is wrong with it.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.io.checks import AT_EVERY_SAMPLE, Column, Table
-from bwbayes.data.io.columns import Naming
+from bwbayes.data.io.columns import Naming, missing
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["header_names", "read_csv", "write_csv"]
+__all__ = ["read_csv", "write_csv"]
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
@@ -41,12 +42,6 @@ class _Header(NamedTuple):
     sign: int
 
 
-def header_names(path: Path) -> list[str]:
-    """Return the names of a text file's columns; errors as of :func:`read_csv`."""
-    line, header, _, _ = _header_and_body(path, _decoded(path, path.read_bytes()))
-    return _cells(f"{path}:{line}:", header)
-
-
 def read_csv(path: Path, naming: Naming) -> Table:
     """Return the columns of a text file that ``naming`` says.
 
@@ -58,7 +53,15 @@ def read_csv(path: Path, naming: Naming) -> Table:
     """
     text = _decoded(path, path.read_bytes())
     header_line, header, body, notes = _header_and_body(path, text)
-    columns = _header_columns(path, header_line, header, naming)
+    separator = next((one for one in _SEPARATORS if one in header), ",")
+    names = _cells(f"{path}:{header_line}:", header, separator)
+    if separator != ",":
+        body = body.translate({ord(","): ".", ord(separator): ","})
+    try:
+        naming = naming.completed(names)
+    except ValueError as error:
+        raise InputError(f"{path}:{header_line}: {error}") from None
+    columns = _header_columns(f"{path}:{header_line}:", names, naming)
     ended = body.endswith("\n")
     body = body.rstrip("\n ")
     if not body:
@@ -82,7 +85,8 @@ def read_csv(path: Path, naming: Naming) -> Table:
         {c.quantity: Column(c.name, values[:, i], c.power, c.sign) for i, c in enumerate(known)},
         notes,
         first_line=header_line + 1,
-        names=tuple(column.name for column in columns),
+        names=tuple(names),
+        naming=naming,
     )
 
 
@@ -140,29 +144,19 @@ def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, st
     raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
 
 
-def _cells(where: str, header: str) -> list[str]:
+def _cells(where: str, header: str, separator: str) -> list[str]:
     """Return the names in a header."""
-    for separator, words in _SEPARATORS.items():
-        if separator in header:
-            raise InputError(f"{where} {words} separate the columns; separate them by commas")
-    if "," not in header and len(header.split()) > 1:
+    if separator not in header and len(header.split()) > 1:
         raise InputError(f"{where} blanks separate the columns; separate them by commas")
-    names = [cell.strip().strip('"') for cell in header.split(",")]
-    if all(_NUMBER.fullmatch(name) for name in names):
+    names = [cell.strip().strip('"') for cell in header.split(separator)]
+    if all(_NUMBER.fullmatch(name.replace(",", ".")) for name in names):
         raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
     return names
 
 
-def _header_columns(path: Path, line: int, header: str, naming: Naming) -> list[_Header]:
+def _header_columns(where: str, names: list[str], naming: Naming) -> list[_Header]:
     """Return what stands in the header; columns of other quantities only beside all that count."""
-    where = f"{path}:{line}:"
-    names = _cells(where, header)
-    try:
-        naming.require_in(names)
-    except ValueError as error:
-        raise InputError(f"{where} {error}") from None
     columns: list[_Header] = []
-    unknown = ""
     for number, name in enumerate(names, start=1):
         shown = _quoted(name)[1:-1] or f"column {number}"
         try:
@@ -170,17 +164,18 @@ def _header_columns(path: Path, line: int, header: str, naming: Naming) -> list[
         except ValueError as error:
             if name in naming.columns.values():
                 raise InputError(f"{where} {shown}: {error}") from None
-            unknown = unknown or f"{where} {shown}: {error}"
             quantity, power, sign = "", 0, 1
         if quantity == "truth":
             raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
         if quantity and quantity in [column.quantity for column in columns]:
             raise InputError(f"{where} {name}: second {quantity} column; remove one")
         columns.append(_Header(name if quantity else shown, quantity, power, sign))
-    # An unknown name is most likely the missing one, misspelt.
-    missing = {"time", "voltage", "displacement"} - {column.quantity for column in columns}
-    if unknown and missing:
-        raise InputError(unknown)
+    # A column of another quantity is most likely the missing one.
+    quantities = [column.quantity for column in columns]
+    rest = [column.name for column in columns if not column.quantity]
+    for quantity in ("time", "voltage", "displacement"):
+        if rest and quantity not in quantities:
+            raise InputError(f"{where} {missing(quantity, rest)}")
     return columns
 
 

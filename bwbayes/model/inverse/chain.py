@@ -109,15 +109,15 @@ def _together(
     growing = actuator.creep is not None and actuator.creep.growing
     if len(ones) < MANY or growing or not _has_step(actuator, columns):
         return known
-    if isinstance(actuator.hysteresis, BoucWen | BacklashLike) and actuator.gain is None:
+    if isinstance(actuator.hysteresis, BoucWen | BacklashLike):
         state, start = columns["initial"], 0.0 if ones[0].from_rest else None
         if ones[0].state is not None:
             begun = [one.begun(0.0, one.anywhere(0.0))[1] for one in ones]
             state, start = np.array([one.state[0] for one in begun]), float(begun[0].voltage)
         for part in _parts(np.flatnonzero(able(columns, state))):
             here, drive = _drives(ones, columns, asked, part, result)
-            _put(voltages(here, drive, state[part], start, drive), part, result)
-            known[part] = True
+            made, known[part] = voltages(here, drive, state[part], start, actuator.gain, drive)
+            _put(made, part, result)
     # Fewer are done sooner alone.
     left = np.flatnonzero(~known)
     for part in _parts(left) if left.size >= MANY else ():

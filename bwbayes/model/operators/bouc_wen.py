@@ -11,6 +11,7 @@ priors, not the record, say how large β is, and leave room for the value that a
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -207,8 +208,8 @@ def _top(column: Values) -> FloatArray:
     return np.fmin(top, HIGHEST_CEILING)
 
 
-def _rate_unit(known: Context) -> str:
-    return "1/V" if known.stated.get("exponent", 1.0) == 1.0 else "um^(1-n)/V"
+def _rate_unit(stated: Mapping[str, float | Distribution]) -> str:
+    return "1/V" if stated.get("exponent", 1.0) == 1.0 else "um^(1-n)/V"
 
 
 def _beta(known: Context) -> Distribution:

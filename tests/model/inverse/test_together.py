@@ -12,6 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse.chain import MANY, inverse
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.stepped import DriveStep, step_of
@@ -79,7 +80,8 @@ def test_steps_as_large_as_the_range_against_a_search() -> None:
     state = np.array([-5.0, 3.0, 12.0, 0.0])
     drive = np.array([[30.0, -25.0, 10.0, 10.0, 12.0, -30.0]]).repeat(4, axis=0)
     assert able(column, state).all()
-    made = voltages(column, drive, state, 0.0)
+    made, right = voltages(column, drive, state, 0.0)
+    assert right.all()
     for row in range(4):
         d = float(column["d"][row])
         shape = {name: column[name][row] for name in ("alpha", "beta", "gamma")}
@@ -161,6 +163,26 @@ def test_plays_go_on_from_a_state_side_by_side() -> None:
         np.testing.assert_allclose(made, asked[row], rtol=0, atol=CLOSE * np.ptp(asked))
 
 
+def test_models_whose_gain_turns_back_are_told() -> None:
+    """One falls before it gets there, one falls and rises again; the others meet their drive."""
+    actuator = Actuator("none", gain=PolynomialGain(("quadratic", "cubic"), SPAN), span=SPAN)
+    theta = cases.theta(actuator, 4, "gain")
+    columns = actuator.columns(theta)
+    columns["initial"][:] = 0.0
+    rise = columns["d"] * SPAN.half
+    columns["quadratic"][1] = -2 * rise[1]
+    columns["quadratic"][2], columns["cubic"][2] = -0.9 * rise[2], 0.5 * rise[2]
+    drive = np.tile(np.concatenate([np.linspace(0, 60, 31), np.linspace(58, -30, 45)]), (4, 1))
+    made, right = voltages(columns, drive, np.zeros(4), 0.0, actuator.gain)
+    assert [True, False, False, True] == right.tolist()
+    columns["offset"][:] = 0.0
+    rows = np.flatnonzero(right)
+    again = np.column_stack([columns[name] for name in actuator.parameters])
+    for row in rows:
+        reached = actuator.displacement(again[row], made[row], from_rest=True)[0]
+        np.testing.assert_allclose(reached, drive[row], rtol=0, atol=CLOSE * 90)
+
+
 def test_models_that_are_not_followed_are_told() -> None:
     """Where the drive falls with the voltage: the others go on, and none of them is disturbed."""
     actuator = Actuator("none", span=SPAN)
@@ -175,5 +197,5 @@ def test_models_that_are_not_followed_are_told() -> None:
     assert [True, False, True, True] == right.tolist()
     some = np.flatnonzero(right)
     here = {name: values[some] for name, values in columns.items()}
-    expected = voltages(here, drive[some], np.zeros(3), 0.0)
+    expected, _ = voltages(here, drive[some], np.zeros(3), 0.0)
     np.testing.assert_allclose(made[some], expected, rtol=0, atol=CLOSE * np.ptp(expected))
