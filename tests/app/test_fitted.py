@@ -17,8 +17,8 @@ from bwbayes.app.config.model_settings import StandConfig
 from bwbayes.app.fit import fitted
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.predict import predict
-from bwbayes.app.running import run
 from bwbayes.app.report.words import digits
+from bwbayes.app.running import run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands
