@@ -112,9 +112,9 @@ def test_a_long_tuning_is_fitted_to_its_last_round_and_goes_on_in_any(
     expected, outcome = run()
     assert MOST_TUNING_BLOCKS == expected.blocks("tuning")
     *_, third, fourth = np.split(expected.coordinates("tuning"), [40, 80, 160])
-    for phase, last in (("tuning", third), ("sampling", fourth)):
-        fit_to_last = StudentMixture.fitted(last.reshape(-1, 3))
-        assert_same_proposal(fit_to_last, expected.proposals[phase])
+    proposals = expected.proposals["tuning"], expected.proposals["sampling"]
+    for last, fitted in zip((third, fourth), proposals, strict=True):
+        assert_same_proposal(StudentMixture.fitted(last.reshape(-1, 3)), fitted)
     chain, calls = new_chain(), PLAN.ensembles * (expected.blocks("pilot") + blocks)
     with pytest.raises(InterruptedRunError):
         sample(POSTERIOR, PLAN, chain, PluggedExecutor(calls))
