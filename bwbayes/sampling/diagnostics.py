@@ -34,6 +34,8 @@ __all__ = [
     "nested_rhat",
     "pareto_k",
     "smoothed_weights",
+    "stuck",
+    "times",
 ]
 
 LARGEST_RHAT = 1.01
@@ -155,7 +157,23 @@ def _told(value: float, limit: float, digits: int = 0) -> str:
     return text
 
 
-def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> Check:
+def times(draws: FloatArray, thin: int = 1) -> FloatArray:
+    """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
+    steps, ensembles, walkers, free = draws.shape
+    walks = draws.reshape(steps, ensembles * walkers, free)
+    # One parameter at a time: the spectra of all would be many times as large as the draws.
+    each = [autocorrelation_time(walks[..., i : i + 1]) for i in range(free)]
+    # A thinned series does not tell times below its own step.
+    return thin * np.concatenate(each)
+
+
+def check(
+    draws: FloatArray,
+    accepted: IntArray,
+    block: int,
+    thin: int = 1,
+    autocorrelation: FloatArray | None = None,
+) -> Check:
     """Judge the draws of a sampling.
 
     Parameters
@@ -168,14 +186,16 @@ def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> C
         Steps in a block.
     thin
         Of how many steps the draws are one.
+    autocorrelation
+        Their autocorrelation times, if they are known.
     """
     free = draws.shape[-1]
+    if autocorrelation is None:
+        autocorrelation = times(draws, thin)
     # Where threads silence warnings side by side, as arviz does, the last to end may leave them so.
     with warnings.catch_warnings(), ThreadPoolExecutor(THREADS) as executor:
         each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
-        rhat, bulk, tail, mean, autocorrelation, walker_rhat = np.array([*each]).T
-    # A thinned series does not tell times below its own step.
-    autocorrelation = thin * autocorrelation
+        rhat, bulk, tail, mean, walker_rhat = np.array([*each]).T
     return Check(
         steps=len(accepted) * block,
         rhat=rhat,
@@ -185,17 +205,16 @@ def check(draws: FloatArray, accepted: IntArray, block: int, thin: int = 1) -> C
         autocorrelation=autocorrelation,
         acceptance=float(accepted.sum() / (accepted.size * block)),
         walker_rhat=float(np.max(walker_rhat)),
-        stuck=_stuck(accepted, STILL * np.max(autocorrelation) / block),
+        stuck=stuck(accepted, block, autocorrelation),
     )
 
 
 def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     """Judge the draws (steps, ensembles, walkers) of one parameter.
 
-    R-hat, effective draws in bulk and tail and for the mean, autocorrelation time, and R-hat of
-    the walkers.
+    R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers.
     """
-    steps, ensembles, walkers = values.shape
+    steps, ensembles, _ = values.shape
     draws = np.ascontiguousarray(values)[..., np.newaxis]
     scores, folded = _scores(draws)
     bulk, tail, mean = (float(ess[0]) for ess in _effective_draws(draws, scores))
@@ -205,12 +224,15 @@ def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     )
     # np.maximum keeps a nan of either.
     rhat = np.maximum(_rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles))
-    time = autocorrelation_time(draws.reshape(steps, ensembles * walkers, 1))
-    return float(rhat[0]), bulk, tail, mean, float(time[0]), _walker_rhat(scores)
+    return float(rhat[0]), bulk, tail, mean, _walker_rhat(scores)
 
 
-def _stuck(accepted: IntArray, blocks: float) -> int:
-    """Count walkers without a move in the last so many blocks, if that is a number, or in all."""
+def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
+    """Count the walkers that have not moved for ``STILL`` autocorrelation times, or never.
+
+    Arguments as in :func:`check`.
+    """
+    blocks = STILL * np.max(autocorrelation) / block
     last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
     return int(np.sum(~accepted[-last:].any(axis=0)))
 

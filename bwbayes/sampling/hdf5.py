@@ -13,7 +13,9 @@ from io import SEEK_END, SEEK_SET, FileIO
 from pathlib import Path
 from typing import Any
 
-__all__ = ["DAMAGE", "FULL", "Image", "reserve"]
+from numpy.typing import NDArray
+
+__all__ = ["DAMAGE", "FULL", "Image", "either", "put", "reserve"]
 
 # What reading a damaged file raises.
 DAMAGE = (OSError, LookupError, ValueError, RuntimeError)
@@ -52,6 +54,20 @@ class Image(FileIO):
         if done < len(view):
             raise OSError("its end is missing")
         return done
+
+
+def either(dataset: Any) -> Any:
+    """Read what is written twice: the first copy that is whole."""
+    try:
+        return dataset[0]
+    except DAMAGE:
+        return dataset[1]
+
+
+def put(dataset: Any, first: int, values: NDArray[Any]) -> None:
+    """Write values (rows, ...) to the end of a dataset, from row ``first`` on."""
+    dataset.resize(first + len(values), axis=0)
+    dataset[first:] = values
 
 
 def reserve(file: Any, size: int) -> None:

@@ -2,10 +2,11 @@
 
 Differential evolution steps along the difference of two other walkers, so it follows any ridge the
 ensemble lies on; a snooker step now and then helps between modes. Neither needs tuning, and they
-bring the pilot to the posterior. Once the pilot is there, a mixture of Student-t distributions
-fitted to its draws proposes places independently of where a walker is, which mixes about ten times
-faster. The fit is frozen before the draws that count, and a quarter of the steps remain
-differential evolution and snooker, so that whatever the fit does not cover stays reachable.
+bring the pilot to the posterior, where half of its steps try places of the point fit's own guess.
+Once the pilot is there, a mixture of Student-t distributions fitted to its draws proposes places
+independently of where a walker is, which mixes about ten times faster. The fit is frozen before
+the draws that count, and a seventh of the steps remain differential evolution and snooker, so
+that whatever the fit does not cover is reached, and left again.
 """
 
 from __future__ import annotations
@@ -27,29 +28,28 @@ Weighted = list[tuple[moves.Move, float]]
 class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
     """A step along the line through another walker, as long as two more are apart on that line.
 
-    With e the unit vector from walker z to x, and walkers z₁, z₂ from two other splits,
+    With e the unit vector from walker z to x, and walkers z₁, z₂, all of the half that rests,
 
         x' = x + 1.7 e (e·z₁ − e·z₂),   log factor (p − 1) log(|x' − z| / |x − z|),
 
-    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. Which split gives which
-    of the three is drawn at each step: the way back swaps z₁ and z₂, and must be as likely as the
-    way there. It stands in for
-    ``emcee.moves.DESnookerMove``, which in emcee up to 3.1.6 takes half of the logarithm and makes
-    a posterior of nine parameters a fifth too narrow.
+    after ter Braak and Vrugt (2008), Statistics and Computing 18, 435-446. The way back swaps z₁
+    and z₂, and is as likely as the way there. It stands in for ``emcee.moves.DESnookerMove``, which
+    in emcee up to 3.1.6 takes half of the logarithm and makes a posterior of nine parameters a
+    fifth too narrow.
     """
 
     def __init__(self, stretch: float = 1.7) -> None:
-        super().__init__(nsplits=4)
+        super().__init__()
         self.stretch = stretch
 
     def get_proposal(
         self, moving: FloatArray, others: list[FloatArray], random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
-        """Propose for ``moving`` (walkers, free), given the walkers of the other three splits."""
-        z, z1, z2 = (
-            others[role][random.randint(len(others[role]), size=len(moving))]
-            for role in random.permutation(3)
-        )
+        """Propose for ``moving`` (walkers, free), given the walkers of the other half."""
+        resting, count = np.concatenate(others), len(moving)
+        number, first = random.randint(len(resting), size=(2, count))
+        second = (first + random.randint(1, len(resting), size=count)) % len(resting)
+        z, z1, z2 = resting[number], resting[first], resting[second]
         away = moving - z
         distance = np.linalg.norm(away, axis=1, keepdims=True)
         direction = away / distance
@@ -60,13 +60,15 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
         return z + proposed * direction, factor[:, 0]
 
 
-def pilot_moves() -> Weighted:
-    """Return moves and weights for the pilot, when nothing about the posterior is known yet."""
-    return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
+def pilot_moves(proposal: Proposal | None = None) -> Weighted:
+    """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
+    if proposal is None:
+        return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
+    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (moves.MHMove(proposal), 0.5)]
 
 
 def sampling_moves(proposal: Proposal | None) -> Weighted:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()
-    return [(moves.DEMove(), 0.2), (SnookerMove(), 0.05), (moves.MHMove(proposal), 0.75)]
+    return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (moves.MHMove(proposal), 0.85)]

@@ -22,10 +22,10 @@ __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 CUTS = (0.5, 0.85)
 COMPONENTS = len(CUTS) + 1
 
-# Rounds of the fit: first with so many of the draws that its cost does not count, then with all.
-ROUGH_ROUNDS = 40
-ROUGH_DRAWS = 4096
-ROUNDS = 10
+# Rounds of the fit: first with so few of the draws that they cost little, then with all.
+ROUGH_ROUNDS = 25
+ROUGH_DRAWS = 1024
+ROUNDS = 5
 
 # Part of the covariance of all components together that each keeps: the draws of a pilot are few.
 # That of all draws would be far too wide where components are modes apart.
@@ -71,7 +71,7 @@ class StudentProposal:
 
     centre: FloatArray
     factor: FloatArray
-    freedom: float = 5.0
+    freedom: float = 6.0
 
     @classmethod
     def fitted(cls, draws: FloatArray) -> StudentProposal:
@@ -162,11 +162,30 @@ class StudentMixture:
             mixture = mixture._fitted_on(draws)
         return mixture
 
+    @classmethod
+    def around(cls, optima: FloatArray, covariance: FloatArray) -> StudentMixture:
+        """Take the places (modes, free) of a posterior's modes and the covariance of the best.
+
+        The first three modes; of fewer, the same ones again, twice and three times as wide.
+        """
+        factor = np.linalg.cholesky(covariance)
+        modes = len(optima)
+        parts = (
+            StudentProposal(optima[i % modes], (1 + i // modes) * factor) for i in range(COMPONENTS)
+        )
+        return cls(np.full(COMPONENTS, 1 / COMPONENTS), tuple(parts))
+
     @cached_property
     def _ends(self) -> FloatArray:
         """Where each component's part of the numbers from 0 to 1 ends."""
         ends = np.cumsum(self.weights)
         return np.asarray(ends / ends[-1])
+
+    @cached_property
+    def _places(self) -> tuple[FloatArray, FloatArray]:
+        """The components' centres (components, free) and factors (components, free, free)."""
+        centres, factors = zip(*((c.centre, c.factor) for c in self.components), strict=True)
+        return np.stack(centres), np.stack(factors)
 
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
         """Take a round of expectation maximisation."""
@@ -186,9 +205,13 @@ class StudentMixture:
         """Draw coordinates (count, free) with emcee's generator."""
         # As ``random.choice`` does with these weights, without its checks of them.
         chosen = self._ends.searchsorted(random.random_sample(count), side="right")
-        drawn = np.stack([component.draw(random, count) for component in self.components])
-        picked: FloatArray = drawn[chosen, np.arange(count)]
-        return picked
+        centres, factors = self._places
+        freedom = self.components[0].freedom
+        normal = random.standard_normal((count, centres.shape[1]))
+        spread = np.sqrt(freedom / random.chisquare(freedom, count))
+        away = (factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
+        drawn: FloatArray = centres[chosen] + away
+        return drawn
 
     def __call__(
         self, coordinates: FloatArray, random: np.random.RandomState
@@ -203,7 +226,9 @@ def _require_spread(draws: FloatArray) -> None:
     """Refuse draws (count, free) that do not span the space."""
     # Rounding leaves some variance to draws that lie in a plane, or do not differ at all.
     plane = np.column_stack([np.ones(len(draws)), draws])
-    if np.linalg.matrix_rank(plane) < plane.shape[1]:
+    # The triangle has the singular values of all draws, and is small.
+    sizes = np.linalg.svd(np.linalg.qr(plane, mode="r"), compute_uv=False)
+    if np.sum(sizes > sizes[0] * max(plane.shape) * np.finfo(float).eps) < plane.shape[1]:
         raise np.linalg.LinAlgError("the draws do not span the space")
 
 

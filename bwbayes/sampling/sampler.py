@@ -1,19 +1,22 @@
 """Sampling: several independent ensembles, run until the chain says that it has converged.
 
-The ensembles start far apart. A pilot of differential evolution brings them to the posterior; a
-short tuning with a first fit of the proposal gives the draws for its last one. Both are thrown
-away. Then draws count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two
-judgements in a row find nothing wrong, the first on half the draws that are to be reached, the
-second on all of them and a fifth more than the first at least; or the budget of steps is used up.
-To judge costs as much as some steps, so each judgement predicts how long the chain must become,
-and the next one waits until then.
+The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
+by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
+draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on,
+each time with a new fit and twice as long: a long, curved posterior needs more draws to be seen
+whole. Pilot and tuning are thrown away. Then draws count, and the chain is judged
+(:mod:`bwbayes.sampling.diagnostics`), until two judgements in a row find nothing wrong, the first
+on half the draws that are to be reached, the second on all of them and a fifth more than the first
+at least; or the budget of steps is used up.
+To judge costs as much as many steps, so each judgement predicts how long the chain must become,
+and the next one waits until then, and until the chain is long against its autocorrelation times.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
-differential evolution starts the sampling again from where the ensembles are: so all draws that
-count come from one kernel, fixed before the first of them. To keep the early draws would save
-little, because differential evolution alone needs about ten times the steps, and they are the very
-draws that are not to be trusted.
+the sampling starts again from where the ensembles are with a second proposal, which is fitted to
+them, for they have been where the first hardly goes. If that one does not cover its draws either,
+these are set aside too, and differential evolution goes on alone, which needs about ten times the
+steps. So all draws that count come from one kernel, fixed before the first of them.
 
 All decisions are functions of the chain alone, and are taken again from its beginning when a run
 that was interrupted goes on: it comes to the same end.
@@ -21,7 +24,8 @@ that was interrupted goes on: it comes to the same end.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -31,17 +35,17 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import MOST_DRAWS, Chain, Phase, thinning
+from bwbayes.sampling.chain import Chain, Phase, thinning
 from bwbayes.sampling.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
     Check,
-    check,
     nested_rhat,
     pareto_k,
 )
 from bwbayes.sampling.ensemble import Block, advance_together, start
-from bwbayes.sampling.moves import sampling_moves
+from bwbayes.sampling.judge import Judge, constrained
+from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 
 __all__ = [
@@ -61,11 +65,15 @@ __all__ = [
 PILOT_RHAT = 1.1
 APART_STEPS = 500
 
+# Blocks of the tuning, and how many it may become while walkers take less than this part of the
+# places that are proposed to them.
 TUNING_BLOCKS = 2
+MOST_TUNING_BLOCKS = 16
+TAKEN = 0.5
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing.
-FIRST_CHECK = 4
+FIRST_CHECK = 3
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
@@ -115,7 +123,7 @@ class SamplingPlan:
     walkers: int = 24
     block: int = 50
     most_steps: int = 20_000
-    least_pilot_steps: int = 100
+    least_pilot_steps: int = 50
     most_pilot_steps: int = 3_000
     together: int = 1
 
@@ -162,7 +170,9 @@ def first_chain(
             f"parameters; use at least {2 * posterior.prior.dimensions}"
         )
     seeds = generator.spawn(plan.ensembles)
-    return Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
+    chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
+    chain.freeze("pilot", StudentMixture.around(point.optima, point.covariance))
+    return chain
 
 
 def sample(
@@ -179,14 +189,10 @@ def sample(
     """
     while not chain.blocks("tuning") and not _pilot_done(posterior, plan, chain):
         _extend(posterior, plan, chain, "pilot", executor, watcher)
-    while not chain.blocks("sampling") and chain.blocks("tuning") < TUNING_BLOCKS:
-        if not chain.blocks("tuning"):
-            chain.freeze("tuning", _fitted(chain, "pilot"))
-        _extend(posterior, plan, chain, "tuning", executor, watcher)
     if not chain.history("sampling"):
-        chain.freeze("sampling", _fitted(chain, "tuning"))
+        _tune(posterior, plan, chain, executor, watcher)
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        chain.fall_back(chain.blocks("sampling"))
+        _fall_back(chain)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
@@ -196,7 +202,7 @@ def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> Floa
     Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
     """
     thin = thinning(chain.draws(phase))
-    return _constrained(posterior, chain.coordinates(phase, thin))
+    return constrained(posterior, chain.coordinates(phase, thin))
 
 
 def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
@@ -211,7 +217,7 @@ def _sampled(
 
     A chain that has blocks already is judged where it was, or would have been, on its way.
     """
-    judge = _Judge(posterior, plan, chain)
+    judge = Judge(posterior, chain, plan.ess)
     # A chain may be longer than its budget, if that was made smaller.
     most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
     blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
@@ -219,6 +225,11 @@ def _sampled(
         blocks = min(blocks, most)
         while chain.blocks("sampling") < blocks:
             _extend(posterior, plan, chain, "sampling", executor, watcher)
+        # Mostly the last thing that is missing, and cheap to see.
+        least = judge.least(blocks, 1.0 if passed else FIRST_PART)
+        if least > blocks and blocks < most:
+            blocks = math.ceil(min(least, LARGEST_STRETCH * blocks))
+            continue
         now = judge(blocks)
         watcher("sampling", now)
         missing = now.shortcomings(plan.ess)
@@ -255,73 +266,41 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
-class _Judge:
-    """Judges the first blocks that count, each of which it prepares once; more of them each time.
-
-    Of many draws it takes every second step, or every fourth, and so on, to bound its memory. How
-    many is a function of the blocks that it judges, so that a run that goes on judges the same.
-    """
-
-    def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain) -> None:
-        self.posterior, self.plan, self.chain = posterior, plan, chain
-        self.proposal = chain.proposal_in_use("sampling")
-        self.prepared, self.thin = 0, 1
-        self.draws: list[FloatArray] = []
-        self.log_weights: list[FloatArray] = []
-
-    def __call__(self, blocks: int) -> Check:
-        """Judge the first ``blocks`` blocks."""
-        plan = self.plan
-        # Far more draws than are to be effective, so that none is missed.
-        most = max(MOST_DRAWS, round(4 * plan.ess))
-        thin = thinning(blocks * plan.block * plan.ensembles * plan.walkers, most)
-        while self.thin < thin:
-            self.thin *= 2
-            for kept in (self.draws, self.log_weights):
-                kept[:] = [values[1::2] for values in self._joined(kept)]
-        for number in range(self.prepared, blocks):
-            self._prepare(number)
-        self.prepared = blocks
-        (every,) = self.draws = self._joined(self.draws)
-        latest = check(every, self.chain.accepted("sampling")[:blocks], plan.block, self.thin)
-        if self.proposal is None:
-            return latest
-        (weights,) = self.log_weights = self._joined(self.log_weights)
-        return replace(latest, pareto_k=pareto_k(weights.ravel()))
-
-    @staticmethod
-    def _joined(kept: list[FloatArray]) -> list[FloatArray]:
-        return [np.concatenate(kept)] if kept else []
-
-    def _prepare(self, number: int) -> None:
-        blocks = self.chain.block_of("sampling", number)
-        steps = slice(-(number * self.plan.block + 1) % self.thin, None, self.thin)
-        coordinates = np.stack([block.coordinates[steps] for block in blocks], axis=1)
-        self.draws.append(_constrained(self.posterior, coordinates))
-        if self.proposal is not None:
-            flat = coordinates.reshape(-1, coordinates.shape[-1])
-            density = np.stack([block.log_density[steps] for block in blocks], axis=1)
-            proposed = self.proposal.log_density(flat).reshape(density.shape)
-            self.log_weights.append(density - proposed)
+def _fall_back(chain: Chain) -> None:
+    """Set what the sampling has made aside; the first time, go on with a fit to that."""
+    thin = thinning(chain.draws("sampling"))
+    second = None if chain.set_aside else _fitted(chain.coordinates("sampling", thin))
+    chain.fall_back(len(chain.history("sampling")), second)
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
     """Say what a user should know of the moves."""
     alone = "differential evolution and snooker moves alone made the draws that count"
-    proposal = chain.proposals["sampling"]
-    if proposal is None:
+    first, refitted = chain.proposals["sampling"], chain.refitted
+    if first is None:
         return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
     if not chain.set_aside:
         return ()
     aside = chain.history("sampling")[: chain.set_aside]
+    if not refitted:
+        return (f"the proposal {_uncovered(first, aside)}: they are set aside, and {alone}",)
+    told = f"the proposal {_uncovered(first, aside[:refitted])}: they are set aside, and "
+    if chain.second is None or chain.set_aside == refitted:
+        return (f"{told}a second one, fitted to them, made draws that count",)
+    again = _uncovered(chain.second, aside[refitted:])
+    return (f"{told}so are those of a second one, fitted to them, which {again}: {alone}",)
+
+
+def _uncovered(proposal: StudentMixture, aside: Sequence[Sequence[Block]]) -> str:
+    """Say how badly a proposal covers the blocks that were set aside."""
     each = [block for blocks in aside for block in blocks]
     coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in each])
     density = np.concatenate([b.log_density.ravel() for b in each])
     shape = pareto_k(density - proposal.log_density(coordinates))
     steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
     return (
-        f"the proposal did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
-        f"{LARGEST_PARETO_K}): they are set aside, and {alone}",
+        f"did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
+        f"{LARGEST_PARETO_K})"
     )
 
 
@@ -331,12 +310,6 @@ def _thinned(chain: Chain) -> tuple[str, ...]:
     if thin == 1:
         return ()
     return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to limit the memory",)
-
-
-def _constrained(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
-    """Return coordinates (steps, ensembles, walkers, free) in their own units."""
-    flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
-    return flat.reshape(coordinates.shape)
 
 
 def _extend(
@@ -352,7 +325,8 @@ def _extend(
     futures = []
     for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
         # Moves of its own for each: some of emcee's write to themselves.
-        moves = [sampling_moves(proposal) for _ in group]
+        make = pilot_moves if phase == "pilot" else sampling_moves
+        moves = [make(proposal) for _ in group]
         futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
     blocks: list[Block] = []
     for future in futures:
@@ -366,7 +340,7 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     steps = chain.steps("pilot")
     if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
-    second_half = _constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
+    second_half = constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
     if (nested_rhat(second_half) < PILOT_RHAT).all():
         return True
     return steps >= APART_STEPS and all(_stays(each) for each in np.moveaxis(second_half, 1, 0))
@@ -379,10 +353,36 @@ def _stays(draws: FloatArray) -> bool:
     return bool((nested_rhat(halves) < PILOT_RHAT).all())
 
 
-def _fitted(chain: Chain, phase: Phase) -> StudentMixture | None:
-    """Fit a proposal to the later half of a phase's draws, if they span the space."""
-    later = chain.coordinates(phase)[chain.steps(phase) // 2 :]
+def _tune(
+    posterior: Posterior, plan: SamplingPlan, chain: Chain, executor: Executor, watcher: Watcher
+) -> None:
+    """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last of all.
+
+    A run that goes on within a round fits again to what that round had begun with.
+    """
+    proposal = _fitted(chain.coordinates("pilot")[chain.steps("pilot") // 2 :])
+    begin, end, rate = 0, TUNING_BLOCKS, 0.0
+    while rate < TAKEN and end <= MOST_TUNING_BLOCKS:
+        if chain.blocks("tuning") < end:
+            chain.freeze("tuning", proposal)
+        while chain.blocks("tuning") < end:
+            _extend(posterior, plan, chain, "tuning", executor, watcher)
+        proposal = _fitted(chain.coordinates("tuning")[begin * plan.block : end * plan.block])
+        rate = _taken(chain.history("tuning")[begin:end])
+        begin, end = end, 2 * end
+    chain.freeze("sampling", proposal)
+
+
+def _taken(blocks: Sequence[Sequence[Block]]) -> float:
+    """Return which part of the places that the proposal proposed was taken; 1 without one."""
+    moves = np.sum([block.moves for each in blocks for block in each], axis=0)
+    proposed, accepted = np.sum(moves[len(pilot_moves()) :], axis=0)
+    return float(accepted / proposed) if proposed else 1.0
+
+
+def _fitted(draws: FloatArray) -> StudentMixture | None:
+    """Fit a proposal to draws (..., free), if they span the space."""
     try:
-        return StudentMixture.fitted(later.reshape(-1, later.shape[-1]))
+        return StudentMixture.fitted(draws.reshape(-1, draws.shape[-1]))
     except np.linalg.LinAlgError:
         return None

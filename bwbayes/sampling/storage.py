@@ -7,10 +7,11 @@ that was cut or changed on the disk the blocks before the damage are read. Going
 first copies what counts into a fresh one. This module alone knows the layout:
 
     /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
-    /proposal/PHASE                      weights, centres, factors of that phase's proposal
+    /proposal/PHASE, /proposal/second    weights, centres, factors of the proposals
     /point                               the point fit
     /committed                           blocks of each phase; proposals of each phase (0 or 1);
-                                         blocks of the sampling that were set aside
+                                         blocks of the sampling that were set aside, and those
+                                         that the second proposal was fitted to
 
 and what was run (config, versions, seed, hash of the data) as the file's attributes.
 """
@@ -35,7 +36,7 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
-from bwbayes.sampling.hdf5 import DAMAGE, Image, reserve
+from bwbayes.sampling.hdf5 import DAMAGE, Image, either, put, reserve
 from bwbayes.sampling.moves import MOVES
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
 
@@ -43,8 +44,9 @@ __all__ = ["ChainFile"]
 
 FORMAT = 2
 
-# Where /committed says how many blocks were set aside.
+# Where /committed says how many blocks were set aside, and for a second proposal.
 SET_ASIDE = 2 * len(PHASES)
+REFITTED = SET_ASIDE + 1
 
 
 class ChainFile(Chain):
@@ -101,7 +103,9 @@ class ChainFile(Chain):
                 made.freeze(phase, chain.proposals[phase])
                 for blocks in chain.history(phase):
                     made.append(phase, blocks)
-            if chain.set_aside:
+            if chain.set_aside and chain.second is not None:
+                made.fall_back(chain.refitted, chain.second)
+            if chain.set_aside != made.set_aside:
                 made.fall_back(chain.set_aside)
         return made
 
@@ -193,24 +197,24 @@ class ChainFile(Chain):
             reserve(self._file, sum(values.nbytes for values in rows.values()))
         number = len(self.history(phase))
         for name, values in rows.items():
-            _put(self._file[phase][name], number * len(values), values)
+            put(self._file[phase][name], number * len(values), values)
         self._commit(PHASES.index(phase), number + 1)
         super().append(phase, blocks)
 
     def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
         """Fix the proposal of a phase, in the file too."""
         if proposal is not None:
-            group = self._file[f"proposal/{phase}"]
-            group["weights"][:] = proposal.weights
-            group["centres"][:] = np.stack([c.centre for c in proposal.components])
-            group["factors"][:] = np.stack([c.factor for c in proposal.components])
+            self._write(phase, proposal)
             self._commit(len(PHASES) + PHASES.index(phase), 1)
         super().freeze(phase, proposal)
 
-    def fall_back(self, blocks: int) -> None:
+    def fall_back(self, blocks: int, second: StudentMixture | None = None) -> None:
         """Set the first blocks of the sampling aside, in the file too."""
+        if second is not None:
+            self._write("second", second)
+            self._commit(REFITTED, blocks)
         self._commit(SET_ASIDE, blocks)
-        super().fall_back(blocks)
+        super().fall_back(blocks, second)
 
     def close(self) -> None:
         """Close the file."""
@@ -223,6 +227,12 @@ class ChainFile(Chain):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _write(self, name: str, proposal: StudentMixture) -> None:
+        group = self._file[f"proposal/{name}"]
+        group["weights"][:] = proposal.weights
+        group["centres"][:] = np.stack([c.centre for c in proposal.components])
+        group["factors"][:] = np.stack([c.factor for c in proposal.components])
 
     def _open(self) -> None:
         self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
@@ -247,13 +257,16 @@ class ChainFile(Chain):
     @classmethod
     def _load(cls, path: Path) -> tuple[ChainFile | None, str]:
         """Return what can be read of a file, and what is wrong with the rest, if anything."""
-        loaded, damage, set_aside = None, "", 0
+        loaded, damage, set_aside, refitted = None, "", 0, 0
         with Image(path) as image:
             try:
                 with h5py.File(image, "r") as file:
                     loaded = cls._begun(path, file)
-                    committed = _either(file["committed"])
-                    set_aside = int(committed[SET_ASIDE])
+                    committed = either(file["committed"])
+                    # Files of versions that fitted no second one say nothing of it.
+                    set_aside, refitted = [*committed[SET_ASIDE:].tolist(), 0][:2]
+                    if refitted:
+                        loaded.second = _proposal(file["proposal/second"])
                     for place, phase in enumerate(PHASES):
                         if committed[len(PHASES) + place]:
                             loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
@@ -261,8 +274,11 @@ class ChainFile(Chain):
                             Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
             except DAMAGE as error:
                 damage = " ".join(str(error.args[-1] if error.args else error).split())
-        if loaded is not None and set_aside <= len(loaded.history("sampling")):
-            loaded.set_aside = set_aside
+        if loaded is not None:
+            whole = len(loaded.history("sampling"))
+            loaded.refitted = refitted if refitted <= whole else 0
+            # Blocks are lost from the end: then the second proposal's, or all, count again.
+            loaded.set_aside = set_aside if set_aside <= whole else loaded.refitted
         return loaded, damage
 
     @classmethod
@@ -273,10 +289,10 @@ class ChainFile(Chain):
         if number != FORMAT:
             raise ValueError(f"its format is {number}, this version reads {FORMAT}")
         point = PointFit(
-            **{name: _either(file["point"][name]) for name in _POINT[:-1]},
-            log_density=float(_either(file["point"]["log_density"])),
+            **{name: either(file["point"][name]) for name in _POINT[:-1]},
+            log_density=float(either(file["point"]["log_density"])),
         )
-        parts = [_either(file["start"][n]) for n in ("coordinates", "log_density", "random_state")]
+        parts = [either(file["start"][n]) for n in ("coordinates", "log_density", "random_state")]
         block = int(file["pilot"]["coordinates"].chunks[0])
         return cls(
             path, point, [EnsembleState(*s) for s in zip(*parts, strict=True)], block, attributes
@@ -286,14 +302,6 @@ class ChainFile(Chain):
 def _digest(path: Path) -> bytes:
     with path.open("rb") as file:
         return file_digest(file, "sha256").digest()
-
-
-def _either(dataset: Any) -> Any:
-    """Read what is written twice: the first copy that is whole."""
-    try:
-        return dataset[0]
-    except DAMAGE:
-        return dataset[1]
 
 
 _POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
@@ -306,11 +314,11 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
     whole: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
     for name in ("coordinates", "log_density", "random_state"):
         whole[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
-    for phase in PHASES:
-        whole[f"proposal/{phase}/weights"] = np.zeros(COMPONENTS)
-        whole[f"proposal/{phase}/centres"] = np.zeros((COMPONENTS, free))
-        whole[f"proposal/{phase}/factors"] = np.zeros((COMPONENTS, free, free))
-    whole["committed"] = np.zeros(SET_ASIDE + 1, dtype=np.int64)
+    for name in (*PHASES, "second"):
+        whole[f"proposal/{name}/weights"] = np.zeros(COMPONENTS)
+        whole[f"proposal/{name}/centres"] = np.zeros((COMPONENTS, free))
+        whole[f"proposal/{name}/factors"] = np.zeros((COMPONENTS, free, free))
+    whole["committed"] = np.zeros(REFITTED + 1, dtype=np.int64)
     for name, values in whole.items():
         # Twice, since nothing else could stand in for it; only chunks carry checksums.
         data = np.stack([values, values])
@@ -334,12 +342,6 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
             )
 
 
-def _put(dataset: Any, first: int, values: NDArray[Any]) -> None:
-    """Write values (rows, ...) to the end of a dataset, from row ``first`` on."""
-    dataset.resize(first + len(values), axis=0)
-    dataset[first:] = values
-
-
 def _padded(counts: IntArray) -> IntArray:
     """Return the counts of a block's moves with a row for each of MOVES."""
     padded = np.zeros((len(MOVES), 2), dtype=np.int64)
@@ -349,10 +351,8 @@ def _padded(counts: IntArray) -> IntArray:
 
 def _proposal(group: Any) -> StudentMixture:
     """Read a frozen proposal."""
-    pairs = zip(_either(group["centres"]), _either(group["factors"]), strict=True)
-    return StudentMixture(
-        _either(group["weights"]), tuple(StudentProposal(*pair) for pair in pairs)
-    )
+    pairs = zip(either(group["centres"]), either(group["factors"]), strict=True)
+    return StudentMixture(either(group["weights"]), tuple(StudentProposal(*pair) for pair in pairs))
 
 
 def _blocks(group: Any, number: int, block: int) -> list[Block]:

@@ -25,7 +25,7 @@ import pytest
 from bwbayes.app.commands.cli import main
 from bwbayes.app.running import run as run_module
 from bwbayes.errors import InputError
-from bwbayes.sampling import storage
+from bwbayes.sampling import hdf5, storage
 from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
@@ -61,7 +61,7 @@ def follow(where: Path, arguments: list[str], last_write: int, last_step: str) -
             os.dup2(file.fileno(), number)
     patched = pytest.MonkeyPatch()
     patched.setattr(run_module, "draw_all", lambda _: {})
-    patched.setattr(storage, "_put", mortal(storage._put, last_write))
+    patched.setattr(storage, "put", mortal(hdf5.put, last_write))
     if last_step:
         patched.setattr(run_module, last_step, die)
     sys.argv = ["bwbayes", *arguments]

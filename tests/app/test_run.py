@@ -116,8 +116,9 @@ def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> No
 
 def test_acceptance_of_each_phase_is_in_the_facts(run: Path) -> None:
     page = (run / "report.html").read_text()
-    each = r"differential evolution \d+%, snooker \d+%"
-    assert re.search(f"pilot: {each}; tuning: {each}, mixture .*; sampling: {each}, mixture", page)
+    each = r"differential evolution \d+%, snooker \d+%, mixture \d+%"
+    phases = "; ".join(f"{phase}: {each}" for phase in ("pilot", "tuning", "sampling"))
+    assert re.search(phases, page)
 
 
 def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
@@ -272,7 +273,7 @@ def test_interrupted_run_goes_on_to_the_same_bits(
 ) -> None:
     """Interrupted in its pilot, its tuning, twice in its sampling, and while it writes files."""
     made = small.begun(tmp_path / "small")
-    for phase, blocks in (("pilot", 2), ("tuning", 1), ("sampling", 1), ("sampling", 2)):
+    for phase, blocks in (("pilot", 1), ("tuning", 1), ("sampling", 1), ("sampling", 2)):
         watch_until(monkeypatch, phase, 4 * blocks + 1)  # in the middle of a block
         with pytest.raises(KeyboardInterrupt):
             carry_on(made, small.quiet(), workers=1)

@@ -427,7 +427,7 @@ def test_a_check_leaves_the_warnings_as_they_were(monkeypatch: pytest.MonkeyPatc
 
     def silencing(_: FloatArray) -> FloatArray:
         warnings.simplefilter("ignore")
-        return np.ones(6)
+        return np.ones(5)
 
     monkeypatch.setattr(diagnostics, "_one_parameter", silencing)
     before = list(warnings.filters)

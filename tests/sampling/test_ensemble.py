@@ -103,10 +103,10 @@ def test_accepted_counts_the_moves_of_each_walker() -> None:
 
 @pytest.mark.parametrize("phase", MOVES)
 def test_every_step_and_every_acceptance_is_one_moves(phase: str) -> None:
-    block = advance(POSTERIOR, MOVES[phase], begin(), 60)
+    block = advance(POSTERIOR, MOVES[phase], begin(), 300)
     assert (len(MOVES[phase]), 2) == block.moves.shape
     proposed, accepted = np.sum(block.moves, axis=0)
-    assert 60 * WALKERS == proposed
+    assert 300 * WALKERS == proposed
     assert np.sum(block.accepted) == accepted
     assert (block.moves[:, 0] > 0).all()
     assert (block.moves[:, 0] % WALKERS == 0).all()

@@ -148,11 +148,13 @@ def test_far_modes_converge_to_their_weights() -> None:
 
 
 def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Differential evolution alone never changes between them."""
+    """Differential evolution alone never changes between them: walkers stay where the pilot was."""
     monkeypatch.setattr(sampler, "_fitted", lambda *_: None)
     chain, outcome = sampled(target(two_far_modes, 2), MODES, PLAN, seed=2)
     assert not outcome.converged
-    assert {0.5} == set(np.mean(chain.coordinates("sampling")[..., 0] > 0, axis=(1, 2)))
+    upper = chain.coordinates("sampling")[..., 0] > 0
+    assert (upper == upper[0]).all()
+    assert 0 < np.mean(upper[0]) < 1
 
 
 def test_likelihood_that_turns_into_nan_never_converges() -> None:

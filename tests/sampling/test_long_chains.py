@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling import sampler
+from bwbayes.sampling import judge, sampler
 from bwbayes.sampling.chain import thinning
 from bwbayes.sampling.diagnostics import check
 from bwbayes.sampling.sampler import draws, log_densities
@@ -83,7 +83,7 @@ def test_thinning_is_the_least_power_of_two_that_is_enough(count: int) -> None:
 def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """As its steps counted from one are, however often it was thinned on the way; and says so."""
     plan, most = replace(PLAN, ess=200), 800
-    monkeypatch.setattr(sampler, "MOST_DRAWS", most)
+    monkeypatch.setattr(judge, "MOST_DRAWS", most)
     monkeypatch.setattr(sampler, "thinning", lambda count, most=most: thinning(count, most))
     chain, outcome = run(plan)
     assert outcome.check.steps == chain.steps("sampling")

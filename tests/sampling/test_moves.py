@@ -75,7 +75,11 @@ def test_twin_a_snooker_move_without_its_factor_is_found(name: str) -> None:
 
 
 class OneWay(SnookerMove):
-    """A snooker move whose splits have fixed roles, so that most of its steps have no way back."""
+    """A snooker move of splits with fixed roles, so that most of its steps have no way back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.nsplits = 4
 
     def get_proposal(
         self, moving: FloatArray, others: list[FloatArray], random: Any
@@ -180,11 +184,11 @@ def test_a_mode_without_walkers_is_reached_by_the_mixture_alone(name: str, expec
     assert expected == pytest.approx(lower_share(ACROSS[name](), 1.0), abs=0.1)
 
 
-def test_a_quarter_of_the_steps_stays_differential_evolution_and_snooker() -> None:
+def test_a_seventh_of_the_steps_stays_differential_evolution_and_snooker() -> None:
     proposal = TARGETS["banana"].proposal
     weights = {type(move).__name__: weight for move, weight in sampling_moves(proposal)}
     assert 1.0 == pytest.approx(sum(weights.values()))
-    assert 0.25 == pytest.approx(weights["DEMove"] + weights["SnookerMove"])
+    assert 0.15 == pytest.approx(weights["DEMove"] + weights["SnookerMove"])
     assert {"MHMove", "DEMove", "SnookerMove"} == set(weights)
 
 
@@ -192,6 +196,12 @@ def test_without_a_proposal_the_pilots_moves_go_on() -> None:
     names = [(type(move).__name__, weight) for move, weight in pilot_moves()]
     assert {"DEMove", "SnookerMove"} == {name for name, _ in names}
     assert names == [(type(move).__name__, weight) for move, weight in sampling_moves(None)]
+
+
+def test_half_of_the_pilots_steps_try_places_of_the_point_fits_guess() -> None:
+    proposal = TARGETS["banana"].proposal
+    weights = {type(move).__name__: weight for move, weight in pilot_moves(proposal)}
+    assert {"MHMove": 0.5, "DEMove": 0.4, "SnookerMove": 0.1} == weights
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,13 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.diagnostics import pareto_k
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import (
     FIRST_CHECK,
+    MOST_TUNING_BLOCKS,
     TUNING_BLOCKS,
     Outcome,
     draws,
@@ -31,6 +33,7 @@ from tests.inference.problems import TARGETS, short_posterior, target
 from tests.sampling.samplings import (
     LONG,
     PLAN,
+    POINT,
     POSTERIOR,
     InterruptedRunError,
     PluggedExecutor,
@@ -69,18 +72,56 @@ def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
 
 
 @pytest.mark.parametrize(("phase", "before"), [("tuning", "pilot"), ("sampling", "tuning")])
-def test_a_proposal_is_fitted_to_the_later_half_of_the_phase_before(
+def test_a_proposal_is_fitted_to_the_phase_before(
     finished: tuple[Chain, Outcome], phase: Phase, before: Phase
 ) -> None:
-    """And stays frozen: it is a function of draws that do not count."""
+    """Of the pilot the later half. It stays frozen: a function of draws that do not count."""
     chain, _ = finished
-    assert chain.proposals["pilot"] is None
-    half = chain.coordinates(before)[chain.steps(before) // 2 :]
-    assert_same_proposal(StudentMixture.fitted(half.reshape(-1, 3)), chain.proposals[phase])
+    part = 2 if before == "pilot" else 1
+    later = chain.coordinates(before)[-(chain.steps(before) // part) :]
+    assert_same_proposal(StudentMixture.fitted(later.reshape(-1, 3)), chain.proposals[phase])
+
+
+def test_the_pilots_proposal_is_the_point_fits_own_guess(finished: tuple[Chain, Outcome]) -> None:
+    guess = StudentMixture.around(POINT.optima, POINT.covariance)
+    assert_same_proposal(guess, finished[0].proposals["pilot"])
 
 
 def test_the_tuning_has_its_length(finished: tuple[Chain, Outcome]) -> None:
     assert TUNING_BLOCKS == finished[0].blocks("tuning")
+
+
+@pytest.mark.parametrize(("part", "blocks"), [(0.99, TUNING_BLOCKS), (1.01, 2 * TUNING_BLOCKS)])
+def test_the_tuning_goes_on_while_few_places_are_taken(
+    finished: tuple[Chain, Outcome], monkeypatch: pytest.MonkeyPatch, part: float, blocks: int
+) -> None:
+    """With a limit a little below and above the part that was taken in its first round."""
+    proposed, accepted = finished[0].moves("tuning")["mixture"]
+    monkeypatch.setattr(sampler, "TAKEN", part * accepted / proposed)
+    monkeypatch.setattr(sampler, "MOST_TUNING_BLOCKS", 2 * TUNING_BLOCKS)
+    chain, _ = run()
+    assert blocks == chain.blocks("tuning")
+
+
+@pytest.mark.parametrize("blocks", [3, 5, MOST_TUNING_BLOCKS])
+def test_a_long_tuning_is_fitted_to_its_last_round_and_goes_on_in_any(
+    monkeypatch: pytest.MonkeyPatch, blocks: int
+) -> None:
+    """Each is twice as long; interrupted in one or after the last, it comes to the same end."""
+    monkeypatch.setattr(sampler, "TAKEN", 1.1)
+    expected, outcome = run()
+    assert MOST_TUNING_BLOCKS == expected.blocks("tuning")
+    *_, third, fourth = np.split(expected.coordinates("tuning"), [40, 80, 160])
+    proposals = expected.proposals["tuning"], expected.proposals["sampling"]
+    for last, fitted in zip((third, fourth), proposals, strict=True):
+        assert_same_proposal(StudentMixture.fitted(last.reshape(-1, 3)), fitted)
+    chain, calls = new_chain(), PLAN.ensembles * (expected.blocks("pilot") + blocks)
+    with pytest.raises(InterruptedRunError):
+        sample(POSTERIOR, PLAN, chain, PluggedExecutor(calls))
+    with ThreadPoolExecutor(1) as executor:
+        again = sample(POSTERIOR, PLAN, chain, executor)
+    assert_same_chain(expected, chain)
+    assert_same_outcome(outcome, again)
 
 
 def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
@@ -110,9 +151,12 @@ def test_two_checks_of_nearly_the_same_draws_are_one() -> None:
     with ThreadPoolExecutor(1) as executor:
         outcome = sample(POSTERIOR, plan, new_chain(plan), executor, watched)
     assert outcome.converged
-    *_, first, second = watched.checks
-    assert second.steps >= 600
-    assert second.steps >= 1.2 * first.steps
+    *before, last = watched.checks
+    # The checks in a row, up to the end, that half of the draws are enough for.
+    missing = [bool(each.shortcomings(plan.ess, 0.5)) for each in reversed(before)]
+    first = before[-missing.index(True)] if True in missing else before[0]
+    assert last.steps >= 600
+    assert last.steps >= 1.2 * first.steps
 
 
 def test_the_watcher_hears_of_every_block_of_every_ensemble(
@@ -233,7 +277,7 @@ def test_every_move_is_counted_in_every_phase(finished: tuple[Chain, Outcome]) -
     names = ["differential evolution", "snooker", "mixture"]
     for phase in PHASES:
         moves = chain.moves(phase)
-        assert names[: 2 if phase == "pilot" else 3] == list(moves)
+        assert names == list(moves)
         proposed, accepted = np.sum(list(moves.values()), axis=0)
         assert chain.steps(phase) * PLAN.ensembles * PLAN.walkers == proposed
         assert np.sum(chain.accepted(phase)) == accepted
@@ -259,6 +303,21 @@ def test_checks_wait_until_the_chain_is_predicted_to_be_long_enough() -> None:
         assert required > before.steps
         steps = min(required, 3 * before.steps)
         assert plan.block * np.ceil(steps / plan.block) == after.steps
+
+
+def test_no_check_comes_before_its_autocorrelation_times() -> None:
+    """Half of fifty before the first that may pass, all of them before the second.
+
+    With differential evolution alone, whose times are long.
+    """
+    plan, watched = replace(LONG, ess=1), Watched()
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as executor:
+        patch.setattr(StudentMixture, "fitted", flat)
+        sample(POSTERIOR, plan, new_chain(plan), executor, watched)
+    times = [each.steps / np.max(each.autocorrelation) for each in watched.checks]
+    assert min(times) >= 25
+    assert times[-1] >= 50
+    assert 2 == sum(not each.shortcomings(1, 0.5) for each in watched.checks)
 
 
 def test_a_long_sampling_is_checked_rarely() -> None:
@@ -287,15 +346,17 @@ def test_a_chain_whose_budget_is_made_smaller_is_judged_at_its_end(
     assert chain.steps("sampling") == outcome.check.steps
 
 
+def flat(draws: FloatArray) -> StudentMixture:
+    """Fit nothing."""
+    raise np.linalg.LinAlgError(f"{len(draws)} draws in a plane")
+
+
 def test_without_any_proposal_differential_evolution_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def flat(draws: FloatArray) -> StudentMixture:
-        raise np.linalg.LinAlgError(f"{len(draws)} draws in a plane")
-
     monkeypatch.setattr(StudentMixture, "fitted", flat)
     chain, outcome = run(replace(PLAN, most_steps=20))
-    assert dict.fromkeys(PHASES) == chain.proposals
+    assert chain.proposals["tuning"] is chain.proposals["sampling"] is None
     assert 20 == outcome.check.steps
     assert outcome.check.pareto_k is None
     (remark,) = outcome.remarks

@@ -16,7 +16,7 @@ import pytest
 
 from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.ensemble import Block
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.storage import REFITTED, ChainFile
 from tests.forks import FORKS
 from tests.sampling.chains import (
     ATTRIBUTES,
@@ -30,6 +30,7 @@ from tests.sampling.chains import (
     new,
     proposal,
 )
+from tests.sampling.samplings import assert_same_proposal
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,42 @@ def test_chain_that_has_blocks_already_is_written_with_them(tmp_path: Path) -> N
         finish(chain)
         memory = arrays(chain)
     assert_same(memory, arrays(ChainFile.read(tmp_path / "chain.h5")))
+
+
+def test_a_second_proposal_is_kept_in_use_and_after_it(tmp_path: Path) -> None:
+    """Through a file that goes on; without the last blocks it is in use again."""
+    path = tmp_path / "chain.h5"
+    second = proposal("tuning")
+    with new(path) as chain:
+        chain.freeze("sampling", proposal("sampling"))
+        chain.append("sampling", blocks("sampling", 0))
+        chain.fall_back(1, second)
+    with ChainFile.resume(path) as chain:
+        assert_same_proposal(second, chain.proposal_in_use("sampling"))
+        chain.append("sampling", blocks("sampling", 1))
+        chain.fall_back(2)
+    with ChainFile.resume(path) as chain:
+        assert (1, 2) == (chain.refitted, chain.set_aside)
+        assert chain.proposal_in_use("sampling") is None
+        assert_same_proposal(second, chain.second)
+    with h5py.File(path, "r+") as file:
+        file["committed"][:, PHASES.index("sampling")] = 1
+    assert_same_proposal(second, ChainFile.read(path).proposal_in_use("sampling"))
+
+
+def test_a_file_that_knows_no_second_proposal_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    with new(path) as chain:
+        chain.freeze("sampling", proposal("sampling"))
+        chain.append("sampling", blocks("sampling", 0))
+        chain.fall_back(1)
+    with h5py.File(path, "r+") as file:
+        shorter = file["committed"][:, :REFITTED]
+        del file["committed"], file["proposal/second"]
+        file.create_dataset("committed", data=shorter, chunks=(1, REFITTED), fletcher32=True)
+    read = ChainFile.read(path)
+    assert (1, 0) == (read.set_aside, read.refitted)
+    assert read.proposal_in_use("sampling") is None
 
 
 def test_blocks_that_were_set_aside_stay_so_and_are_kept(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_independent_steps_in_a_row_ask_once() -> None:
     posterior, calls = counted()
     block = advance(posterior, sampling_moves(MIXTURE), begin(1), STEPS)
     mixture = int(block.moves[2, 0])
-    others = 2 * int(block.moves[0, 0]) // WALKERS + 4 * int(block.moves[1, 0]) // WALKERS
+    others = 2 * int(block.moves[0, 0]) // WALKERS + 2 * int(block.moves[1, 0]) // WALKERS
     assert STEPS * WALKERS == sum(calls)
     assert max(calls) > 2 * WALKERS
     assert len(calls) < others + mixture // WALKERS
