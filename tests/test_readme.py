@@ -194,6 +194,22 @@ def calibration() -> str:
     )
 
 
+def usual() -> str:
+    start = "calibration, "
+    every = {n.removeprefix(start): one for n, one in measured().items() if n.startswith(start)}
+    told = ", ".join(
+        f"{name} {one['unconverged']} of {one['replicates']}" for name, one in sorted(every.items())
+    )
+    worst = max(
+        abs(t) for one in every.values() for t in one["bands, standard errors off"].values()
+    )
+    assert not any(one["shortcomings"] for one in every.values())
+    return (
+        f"no test of ranks failed; none of {18 * len(every)} bands off by more than {worst:.1f} "
+        f"standard errors; not converged in their budget: {told}"
+    )
+
+
 def kills() -> str:
     one = measured()["kills"]
     return f"{one['kills']} kills over {one['runs']} runs: none"
@@ -346,6 +362,7 @@ def defects() -> str:
 FINDINGS = [
     coverage,
     calibration,
+    usual,
     kills,
     hostile,
     steady,
