@@ -242,7 +242,8 @@ def verdicts() -> str:
     each = " to ".join(map(str, sorted({min(runs), max(runs)})))
     return (
         f"{len(good['said no'])} false alarms in {good['runs']} good runs; {missed} missed and "
-        f"{unsure} left open of {len(spoilt)} kinds of spoilt ones, {each} each"
+        f"{unsure} left open of {len(spoilt)} kinds of spoilt ones, {each} each; since then one "
+        "of the transients, on the threshold, is missed"
     )
 
 
