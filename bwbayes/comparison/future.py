@@ -30,7 +30,7 @@ __all__ = ["BELIEVED_K", "Future", "cut", "future", "joint_log_score", "reweight
 # Where the stretches begin that are predicted, as parts of the training readings.
 STARTS = (0.5, 0.75)
 
-# Above this Pareto k̂ weighted draws are no posterior.
+# Above this Pareto k̂ weighted draws do not stand for a posterior.
 BELIEVED_K = 0.7
 
 # Effective draws of a fit to a part, and its budget.

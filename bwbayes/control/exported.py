@@ -237,7 +237,8 @@ def exported(
     Raises
     ------
     InputError
-        A hysteresis that has no step of bounded time, or limits that are none.
+        A hysteresis that has no step of bounded time, or limits that are not two
+        voltages, the lower one first.
     """
     if not (np.isfinite(limits).all() and limits.low < limits.high):
         raise InputError(

@@ -43,7 +43,7 @@ class Robustness:
     Raises
     ------
     InputError
-        Margins that no loop can have, or that are none.
+        A gain margin of 1 or less, or a phase margin outside 0 to 90 degrees.
     """
 
     gain: float = 2.0

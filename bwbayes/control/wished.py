@@ -59,7 +59,8 @@ class Reference:
     Raises
     ------
     InputError
-        Fewer than ten samples, one that is not finite, a constant, or times that are none.
+        Fewer than ten samples, one that is not finite, a constant, an interval that is not
+        positive, or a negative smoothing.
     """
 
     displacement: ArrayLike

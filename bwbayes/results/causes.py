@@ -224,7 +224,7 @@ def _drift(r: Residuals) -> float:
     """Trend, bent or not, that a drive which goes back and forth does not make."""
     at = (r.time - r.time[0]) / max(r.time[-1] - r.time[0], r.interval)
     share = _explained(r.residual, at, at**2)
-    # A trend beside an offset that is far larger is none.
+    # A trend beside an offset that is far larger does not count.
     return share if _offset(r) < 0.85 * share else 0.0
 
 
@@ -282,7 +282,7 @@ def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
     jumps = ndimage.maximum_filter1d(np.abs(steps), 5)
     # As long as they are few; many are not outliers.
     far = (np.abs(beside) > SPIKE * fast) & (np.abs(beside) > jumps)
-    # The top of something broader is none.
+    # The top of something broader does not count.
     level = np.maximum(np.abs(padded[:-4]), np.abs(padded[4:]))
     far &= np.abs(beside) > 0.5 * level
     # A spike throws its neighbours off too, by half.

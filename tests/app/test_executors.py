@@ -208,8 +208,8 @@ def test_the_readmes_commands_for_a_cluster_work_together(
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    here = f"{first} --host 127.0.0.1 --port {address.partition(':')[2]} --no-dashboard"
-    there = second.replace("HOST:8786", address).replace("auto", "1") + " --no-dashboard"
+    scheduling = f"{first} --host 127.0.0.1 --port {address.partition(':')[2]} --no-dashboard"
+    working = second.replace("HOST:8786", address).replace("auto", "1") + " --no-dashboard"
     started = [
         subprocess.Popen(
             [sys.executable, "-m", *shlex.split(line)],
@@ -217,7 +217,7 @@ def test_the_readmes_commands_for_a_cluster_work_together(
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        for line in (here, there)
+        for line in (scheduling, working)
     ]
     try:
         with_files(third, tmp_path, tmp_path)
@@ -236,7 +236,7 @@ def test_a_calibration_on_a_cluster_is_the_same(tmp_path: Path) -> None:
     assert_same_calibration(tmp_path / "threads", tmp_path / "dask")
 
 
-def test_nobody_there_and_words_that_are_none_are_said_in_one_line(
+def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(cluster_module, "PATIENCE", 0.2)

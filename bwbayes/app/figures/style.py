@@ -97,7 +97,7 @@ def plain(text: str) -> str:
 
 
 def axis_label(parameter: Parameter) -> str:
-    """Return a parameter's symbol and unit for an axis; its name if the symbol is no mathtext."""
+    """Return a parameter's symbol and unit for an axis; its name if mathtext cannot read that."""
     from matplotlib.mathtext import MathTextParser  # noqa: PLC0415  # pages need units alone
 
     symbol = f"${parameter.label}$"

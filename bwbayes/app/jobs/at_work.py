@@ -41,7 +41,7 @@ def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
     Raises
     ------
     InputError
-        They are none.
+        They are not two voltages, the lower one first.
     """
     ranges = np.array([record.range_voltage for record in problem.records.values()])
     low, high = given or (float(ranges[:, 0].min()), float(ranges[:, 1].max()))

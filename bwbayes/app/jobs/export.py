@@ -88,7 +88,7 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuat
     Raises
     ------
     InputError
-        A rate that is none.
+        A rate that is not above zero, or is too high.
     """
     if rate is not None and not 0 < rate <= LARGEST_RATE:
         raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")

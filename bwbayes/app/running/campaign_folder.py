@@ -172,7 +172,7 @@ class CampaignFolder:
         Raises
         ------
         InputError
-            A line is none of these.
+            A line does not tell of such a run.
         """
         content = self.journal.read_bytes()
         whole = content.rfind(b"\n") + 1
@@ -214,7 +214,7 @@ class CampaignFolder:
 def records_in(folder: Path) -> list[Path]:
     """Return the files of a folder that may be records, by name.
 
-    Hidden ones are none, nor is the truth (``NAME.truth.csv``) beside a simulated record.
+    Hidden ones do not count, nor does the truth (``NAME.truth.csv``) beside a simulated record.
 
     Raises
     ------
