@@ -56,6 +56,7 @@ HELD_OUT = "\n[validation.held_out]\nwindow = [2.0, 2.5]\n"
 # What takes minutes or hours, and what is run in its place; the rest of a line is as it is shown.
 SHORTER = {
     "--replicates 500": "--replicates 2",
+    "--replicates 1000": "--replicates 2",
     "; maxwell-slip + quadratic": "; maxwell-slip(thresholds=2)",
     "ess = 4000": "ess = 400",
 }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -34,6 +36,7 @@ from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, sample
 from tests.app import small
 from tests.app.test_calibrate import assert_same_end as assert_same_calibration
 from tests.app.test_calibrate import begun as begun_calibration
+from tests.examples import lines_of_shell, typed, with_files
 from tests.inference.problems import short_posterior
 
 distributed = pytest.importorskip("distributed", reason="bwbayes[dask] is not installed")
@@ -194,6 +197,35 @@ def _kill_at_first_block(folder: RunFolder, process: Any) -> None:
     while time.monotonic() < end and folder.chain.stat().st_size == size:
         time.sleep(0.01)
     process.kill()
+
+
+def test_the_readmes_commands_for_a_cluster_work_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On this machine, with one worker, and without the dashboard's port."""
+    monkeypatch.chdir(tmp_path)
+    first, second, third = [line for line in lines_of_shell() if re.search(r"^dask |dask://", line)]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    here = f"{first} --host 127.0.0.1 --port {address.partition(':')[2]} --no-dashboard"
+    there = second.replace("HOST:8786", address).replace("auto", "1") + " --no-dashboard"
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", *shlex.split(line)],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for line in (here, there)
+    ]
+    try:
+        with_files(third, tmp_path, tmp_path)
+        typed(third.replace("HOST:8786", address))
+    finally:
+        for process in reversed(started):  # the worker's nanny ends its worker
+            process.terminate()
+            process.wait(PATIENCE)
 
 
 @pytest.mark.slow

@@ -313,6 +313,11 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         cell(9, 0, "0.0352"),
         "record.csv:9: time_s: irregular sampling: 0.0052 s",
     ),
+    (
+        "text above the header",
+        f"bench 2, 3 May\nby: me\n\n{GOOD}",
+        "record.csv:1: the header is in line 4; remove the lines above it",
+    ),
     ("header missing", "\n".join(ROWS), "record.csv:1: the header is missing"),
     (
         "column unknown",

@@ -177,7 +177,7 @@ def _say_guesses(path: Path, given: Naming, used: Naming) -> None:
     more = {q: name for q, name in used.columns.items() if q not in given.columns}
     guesses = [f"{q} is {name!r}" for q, name in more.items() if by_unit(q, name)]
     if guesses:
-        remark = f"{path}: taken by its unit: {', '.join(guesses)}; `columns` says otherwise"
+        remark = f"{path}: taken by its unit: {', '.join(guesses)}; if not, say `columns`"
         warnings.warn(one_line(remark), InputWarning, stacklevel=3)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.io.checks import AT_EVERY_SAMPLE, Column, Table
-from bwbayes.data.io.columns import Naming, missing
+from bwbayes.data.io.columns import Naming, missing, recognised
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning, one_line
 
@@ -31,6 +31,8 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
 _EXAMPLE = "time_s,voltage_V,displacement_um"
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
+# Lines below the first in which a header is looked for.
+_MOST_ABOVE = 50
 
 
 class _Header(NamedTuple):
@@ -53,7 +55,8 @@ def read_csv(path: Path, naming: Naming) -> Table:
     """
     text = _decoded(path, path.read_bytes())
     header_line, header, body, notes = _header_and_body(path, text)
-    separator = next((one for one in _SEPARATORS if one in header), ",")
+    _refuse_lines_above(path, header_line, header, body)
+    separator = _separator(header)
     names = _cells(f"{path}:{header_line}:", header, separator)
     if separator != ",":
         body = body.translate({ord(","): ".", ord(separator): ","})
@@ -142,6 +145,25 @@ def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, st
         elif content:
             return line, content, text[offset:], notes
     raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
+
+
+def _separator(line: str) -> str:
+    return next((one for one in _SEPARATORS if one in line), ",")
+
+
+def _refuse_lines_above(path: Path, number: int, first: str, body: str) -> None:
+    """Refuse text above the header, which many programs write: a title, a date, an operator."""
+    below = body.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]
+    headers = [
+        number + i
+        for i, line in enumerate([first, *below])
+        if len(recognised(line.split(_separator(line)))) > 1
+    ]
+    if headers and headers[0] > number:
+        raise InputError(
+            f"{path}:{number}: the header is in line {headers[0]}; remove the lines above it, or "
+            "begin them with #"
+        )
 
 
 def _cells(where: str, header: str, separator: str) -> list[str]:
