@@ -147,10 +147,10 @@ def _part(
             else:
                 high = t
             closer = t - (rise - left) / (most * steep)
-            if not (low <= closer <= high):
-                closer = 0.5 * (low + high)
-            moved, t = abs(closer - t), closer
-            if abs(bend) * most * moved <= CLOSE * slope:
+            moved = most * abs(closer - t)
+            t = closer if low <= closer <= high else 0.5 * (low + high)
+            if (abs(bend) + 3.0 * most * abs(line[2])) * moved <= CLOSE * slope:
+                t = min(max(closer, low), high)
                 break
         rise = left
     v = most * t
