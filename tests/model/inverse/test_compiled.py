@@ -144,7 +144,7 @@ def test_a_spring_that_is_sampled_fast_is_not_undone_sample_by_sample() -> None:
     assert undoable(with_creep.sections(both))
     both["mass"][:], both["damping"][:] = 100.0, 300.0
     assert not undoable(with_creep.sections(both))
-    with pytest.raises(InputError, match="creep of 0.031 of the drive cannot be undone"):
+    with pytest.raises(InputError, match=r"creep of 0\.031 of the drive cannot be undone"):
         inverse(with_creep, rows, asked)
 
 
