@@ -8,26 +8,18 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from bwbayes.app.commands import cli
-from bwbayes.app.config.config import parse
-from bwbayes.data import write_record
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.results.bands import LEVELS
+from tests.examples import README, ROOT, blocks
 from tests.measured import measured
-
-ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def block(name: str) -> str:
@@ -59,57 +51,10 @@ def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
         "displacement": record.displacement,
         "new_record": stand.run(Waveform(Sine(80.0, 0.7), 4.0), generator),
     }
-    (lines,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    (lines,) = blocks("python")
     exec(lines, names)  # that is what a reader does
     assert names["fit"].converged
     assert names["bands"].scores.nrmse < 0.05
-
-
-@pytest.mark.parametrize("text", re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL))
-def test_each_config_of_the_readme_can_be_read(text: str) -> None:
-    record = "" if "[record" in text else '[record]\nfile = "my_record.csv"\n'
-    parse(record + text, "README")
-
-
-# A line of the shell that calls the package, without what is said of it.
-COMMANDS = [
-    line.partition("#")[0].strip()
-    for lines in re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
-    for line in lines.splitlines()
-    if line.startswith("bwbayes ")
-]
-
-# Those of a first record, in their order; the last takes minutes, however small its record is.
-FIRST = [line for line in COMMANDS if re.search(r"my_record|my\.toml$|results/my|stand", line)][:8]
-
-
-@pytest.mark.parametrize("line", COMMANDS)
-def test_each_command_takes_what_the_readme_gives_it(line: str) -> None:
-    _, name, *given = shlex.split(line)
-    assert cli.cli.commands[name].make_context(name, given).params
-
-
-def test_the_commands_for_a_first_record_go_through(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a short record, in the order in which a reader types them."""
-    monkeypatch.chdir(tmp_path)
-    stand = VirtualTestStand(discrepancy="none", sample_rate=25.0)
-    generator = np.random.default_rng(2)
-    for name in ("my_record.csv", "next.csv"):
-        drive = Waveform(Sine(100.0, 0.8), 12.0, decay=Decay(0.0, 0.07))
-        write_record(replace(stand.run(drive, generator), truth=None), name)
-    (first, *_) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
-    (tmp_path / "my.toml").write_text(first)
-    assert {"run", "init", "check", "resume", "predict", "simulate", "report"} == {
-        line.split()[1] for line in FIRST
-    }
-    for line in FIRST:
-        done = CliRunner().invoke(cli.cli, shlex.split(line)[1:], standalone_mode=False)
-        assert done.exception is None, f"{line}: {done.output}"
-        assert done.return_value == 0, f"{line}: {done.output}"
-    for made in ("my_record.toml", "results/my/report.html", "stand.csv"):
-        assert (tmp_path / made).is_file(), made
 
 
 def test_each_command_starts_from_a_bare_checkout() -> None:

@@ -1,0 +1,121 @@
+"""Every example that people are shown is run: in README, help texts and notebooks.
+
+They are collected from these texts, so that a new one is run by itself. What the README does in
+Python is in ``test_readme.py``, docstrings are run by ``test_docstrings.py``, and the notebooks'
+cells by ``test_notebooks.py``.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from bwbayes.app.commands import cli
+from tests.app import small
+from tests.examples import (
+    LEAVES,
+    QUICK,
+    README,
+    blocks,
+    guides,
+    lines_of_shell,
+    records_of,
+    shorter,
+    typed,
+    with_files,
+)
+
+SHOWN = lines_of_shell()
+COMMANDS = [line for line in SHOWN if line.startswith("bwbayes ")]
+
+# With words in capitals for what a reader fills in.
+PATTERNS = [line for line in COMMANDS if re.search(r" [A-Z]+\b(?!:)", line)]
+
+# What the README shows of a first record goes from one line to the next.
+FIRST = [line.partition("#")[0].strip() for line in blocks("sh")[2].splitlines()]
+
+# What is not run here, and where it is.
+ELSEWHERE = {
+    "python3 -m venv": "the fixture `summary` of test_readme.py; pip in test_packaging.py",
+    "dask ": "app/test_executors.py",
+    "bwbayes calibrate runs/calibration.toml --replicates 1000 --executor": "and this with it",
+}
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Go to an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+def elsewhere(line: str) -> bool:
+    return line.startswith(tuple(ELSEWHERE))
+
+
+def test_every_line_is_run_somewhere() -> None:
+    assert [] == [line for line in SHOWN if line not in COMMANDS and not elsewhere(line)]
+    for start in ELSEWHERE:
+        assert any(line.startswith(start) for line in SHOWN), start
+    assert set(cli.cli.commands) == set(LEAVES)
+
+
+@pytest.mark.parametrize("line", PATTERNS)
+def test_a_pattern_is_one_that_the_command_takes(line: str) -> None:
+    _, name, *given = shlex.split(line)
+    assert cli.cli.commands[name].make_context(name, given).params
+
+
+@pytest.mark.parametrize(
+    "line", [one for one in COMMANDS if one not in PATTERNS + FIRST and not elsewhere(one)]
+)
+def test_a_command_leaves_what_it_promises(line: str, empty: Path, run: Path) -> None:
+    with_files(line, empty, run)
+    typed(line)
+
+
+def test_the_commands_for_a_first_record_follow_each_other(empty: Path) -> None:
+    """In the order in which a reader types them, with the README's first config."""
+    (empty / "my.toml").write_text(blocks("toml")[0] + QUICK)
+    records_of('file = "my_record.csv" file = "next.csv"', empty)
+    assert FIRST[0].startswith("bwbayes run my_record.csv")
+    for line in FIRST:
+        typed(line)
+
+
+# The first is run above.
+CONFIGS = [text for page in (README, *guides().values()) for text in blocks("toml", page)][1:]
+
+
+@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" not in text])
+def test_a_config_is_run(text: str, empty: Path) -> None:
+    typed(f"bwbayes run {written(text, empty)}")
+
+
+@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" in text])
+def test_a_config_of_a_large_model_is_fitted(text: str, empty: Path) -> None:
+    """Its posterior has twenty parameters and takes minutes."""
+    typed(f"bwbayes check {written(text, empty)}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" in text])
+def test_a_config_of_a_large_model_is_run(text: str, empty: Path) -> None:
+    typed(f"bwbayes run {written(text, empty)}")
+
+
+def written(text: str, folder: Path) -> str:
+    """Write a config, with the record of the first one if it names none, and what it names."""
+    text = text if "[record" in text else f"{blocks('toml')[0].partition('[model]')[0]}{text}"
+    text = shorter(text) if "[sampling]" in text else text + QUICK
+    records_of(text, folder)
+    (folder / "my.toml").write_text(text)
+    return "my.toml"
