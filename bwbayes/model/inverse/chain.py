@@ -19,7 +19,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.inverse.alone import One
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.rows import of_row
+from bwbayes.model.inverse.rows import of_rows
 from bwbayes.model.inverse.together import together
 from bwbayes.model.operator import UNIT
 
@@ -82,7 +82,7 @@ def inverse(
     ones = []
     for row, slope in enumerate(slopes.tolist()):
         column = {name: values[row : row + 1] for name, values in columns.items()}
-        ones.append(One(actuator, column, from_rest, _state_of(state, row), slope))
+        ones.append(One(actuator, column, from_rest, of_rows(state, slice(row, row + 1)), slope))
     asked = np.broadcast_to(asked, (len(models), asked.shape[1]))
     result = np.empty(asked.shape)
     known = together(ones, columns, state, asked, result)
@@ -104,14 +104,3 @@ def _checked(displacement: ArrayLike, models: int) -> FloatArray:
         sample = int(np.argmin(np.isfinite(asked).all(axis=0)))
         raise InputError(f"reference: not a finite number in sample {sample}; give every sample")
     return asked
-
-
-def _state_of(state: State | None, row: int) -> State | None:
-    """Return the state of one of a batch's models."""
-    if state is None:
-        return None
-    return State(
-        of_row(state.hysteresis, row),
-        tuple(one[row : row + 1] for one in state.rest),
-        tuple(one[row : row + 1] for one in state.filter),
-    )

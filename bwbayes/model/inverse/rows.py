@@ -1,4 +1,4 @@
-"""One model of a batch: what is remembered of it, cut out of what is remembered of all."""
+"""Some models of a batch: what is remembered of them, cut out of what is remembered of all."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["of_row"]
+__all__ = ["of_rows"]
 
 
-def of_row(memory: Any, row: int) -> Any:
-    """Return a memory with its arrays (models,) cut to one model, whatever it is made of."""
+def of_rows(memory: Any, rows: slice) -> Any:
+    """Return a memory with its arrays (models, ...) cut to some models, whatever it is made of."""
     if isinstance(memory, np.ndarray):
-        return memory[row : row + 1]
+        return memory[rows]
     if isinstance(memory, tuple):
-        parts = [of_row(one, row) for one in memory]
+        parts = [of_rows(one, rows) for one in memory]
         return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
     if hasattr(memory, "__dataclass_fields__"):
         return type(memory)(
-            **{name: of_row(getattr(memory, name), row) for name in memory.__dataclass_fields__}
+            **{name: of_rows(getattr(memory, name), rows) for name in memory.__dataclass_fields__}
         )
     return memory

@@ -14,15 +14,14 @@ from importlib.util import find_spec
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.errors import InputError
 from bwbayes.model.actuator import State
 from bwbayes.model.inverse.alone import One
 from bwbayes.model.inverse.curved_steps import AsymmetricStep, DuhemStep, PowerStep
-from bwbayes.model.inverse.rows import of_row
-from bwbayes.model.inverse.stepped import DriveStep, step_of
+from bwbayes.model.inverse.rows import of_rows
+from bwbayes.model.inverse.stepped import DriveStep, has_step, step_of
 from bwbayes.model.inverse.steps import HysteresisStep, LinearStep, PlaysStep
 from bwbayes.model.inverse.stretch import searched
-from bwbayes.model.linear import Sections
+from bwbayes.model.inverse.undoing import undo, undoable
 
 __all__ = ["MANY", "follow", "together"]
 
@@ -32,8 +31,13 @@ MANY = 50
 # Doublings of the first reach, V at least, for the voltage at which a record starts.
 DOUBLINGS, SHORTEST = 30, 1e-9
 
-# Taps of a first-order lag, and rates of a relaxation.
-LAG_TAPS, RATES = 2, 8
+# Models that are in the cache together; rounds at most in which creep that grows with the voltage
+# and the voltage are made to agree, and how far the growth moves in the last one: what that leaves
+# is less again by the part of the displacement that creeps, twice.
+PART, ROUNDS, AGREED = 64, 30, 1e-11
+
+# Rates of a relaxation.
+RATES = 8
 
 
 def together(
@@ -55,61 +59,73 @@ def together(
         Where their voltages go, (models, samples), V.
     """
     actuator, known = ones[0].actuator, np.zeros(len(ones), dtype=np.bool_)
+    if len(ones) < MANY or find_spec("numba") is None or not has_step(actuator.hysteresis):
+        return known
     growing = actuator.creep is not None and actuator.creep.growing
-    if len(ones) < MANY or growing or find_spec("numba") is None:
-        return known
-    try:
-        step = step_of(actuator.hysteresis, columns)
-    except InputError:
-        # There is none.
-        return known
-    shaped = DriveStep(step, actuator.gain, columns)
-    np.subtract(asked, columns["offset"][:, np.newaxis], out=result)
-    peak = np.maximum(result.max(axis=1), -result.min(axis=1))
+    # All at once; in rounds, as many as are in the cache.
+    size = PART if growing else len(ones)
+    for first in range(0, len(ones), size):
+        rows = slice(first, first + size)
+        here = {name: values[rows] for name, values in columns.items()}
+        known[rows] = _part(ones[rows], here, of_rows(state, rows), asked[rows], result[rows])
+    return known
+
+
+def _part(
+    ones: Sequence[One],
+    columns: Mapping[str, FloatArray],
+    state: State | None,
+    asked: FloatArray,
+    result: FloatArray,
+) -> BoolArray:
+    """Do the same for some models.
+
+    Creep that grows with the voltage is undone for the voltage of the round before, until they
+    agree.
+    """
+    actuator, creep = ones[0].actuator, ones[0].actuator.creep
+    shaped = DriveStep(step_of(actuator.hysteresis, columns), actuator.gain, columns)
+    offset, sections = columns["offset"][:, np.newaxis], actuator.sections(columns)
+    peak = np.maximum(asked.max(axis=1) - offset[:, 0], offset[:, 0] - asked.min(axis=1))
     most = [one.anywhere(size).high for one, size in zip(ones, peak.tolist(), strict=True)]
-    _undo(ones, actuator.sections(columns), state, result)
-    known[:] = True
+    growing = creep is not None and creep.growing
+    growth = np.ones_like(result) if growing else None
+    known = np.full(len(ones), not growing)
+    if growing and not undoable(sections):
+        return known
+    for _ in range(ROUNDS if growing else 1):
+        np.subtract(asked, offset, out=result)
+        undo(ones, sections, state, growth, result)
+        memory, start, right = _start(ones, shaped, columns, state, result[:, 0])
+        right &= follow(shaped, memory, start, result)
+        if creep is None or growth is None:
+            break
+        before = growth
+        growth = 1 + columns["creep_growth"][:, np.newaxis] * creep.size(result)
+        known = np.max(np.abs(growth - before), axis=1) <= AGREED
+        if (known | ~right).all():
+            break
+    return known & right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < most)
+
+
+def _start(
+    ones: Sequence[One],
+    shaped: DriveStep,
+    columns: Mapping[str, FloatArray],
+    state: State | None,
+    drive: FloatArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return memories and voltages (models,), V, where the paths start, and who has one."""
+    known = np.ones(len(ones), dtype=np.bool_)
     if state is not None:
-        memory, start = step.remembered(state.hysteresis), state.hysteresis.voltage
+        memory, start = shaped.step.remembered(state.hysteresis), state.hysteresis.voltage
     elif ones[0].from_rest:
-        at_rest = actuator.hysteresis.begin(columns, 0.0, ones[0].span, from_rest=True)
-        memory, start = step.remembered(at_rest), 0.0
+        operator = ones[0].actuator.hysteresis
+        at_rest = operator.begin(columns, 0.0, ones[0].span, from_rest=True)
+        memory, start = shaped.step.remembered(at_rest), 0.0
     else:
-        memory, start, known = _begun(ones, shaped, columns["initial"], result[:, 0])
-    known &= follow(shaped, memory, np.broadcast_to(start, known.shape), result)
-    return known & (np.maximum(result.max(axis=1), -result.min(axis=1)) < most)
-
-
-def _undo(
-    ones: Sequence[One], sections: Sections, state: State | None, displacement: FloatArray
-) -> None:
-    """Write the drives over displacements (models, samples), um."""
-    recursions = sections.recursions
-    if len(recursions) > 1 and all(one.numerator.shape[1] <= LAG_TAPS for one in recursions):
-        # Here, because numba may not be installed, and takes half a second to load.
-        from bwbayes.model.inverse.compiled.sections import undone_lags  # noqa: PLC0415
-
-        nothing = np.zeros((len(ones), len(recursions)))
-        taps = [np.zeros((2, len(ones), LAG_TAPS)) for _ in recursions]
-        for (numerator, denominator), one in zip(taps, recursions, strict=True):
-            numerator[:, : one.numerator.shape[1]] = one.numerator
-            denominator[:, : one.denominator.shape[1]] = one.denominator
-        rest, carried = nothing, nothing
-        if state is not None:
-            rest = np.stack(state.rest, axis=1)
-            carried = np.stack([one.sum(axis=1) for one in state.filter], axis=1)
-        undone_lags(
-            np.stack([numerator for numerator, _ in taps], axis=1),
-            -np.stack([denominator[:, 1] for _, denominator in taps], axis=1),
-            np.stack(sections.gains, axis=1),
-            rest,
-            carried,
-            state is None,
-            displacement,
-        )
-        return
-    for row, alone in enumerate(ones):
-        displacement[row] = alone.drive(displacement[row], of_row(sections, row))
+        memory, start, known = _begun(ones, shaped, columns["initial"], drive)
+    return memory, np.broadcast_to(start, known.shape), known
 
 
 def _begun(

@@ -16,9 +16,9 @@ from bwbayes.arrays import BoolArray, FloatArray
 
 __all__ = ["played"]
 
-# Newton's rounds at most, and by what part of itself a step may change the slope that is the last:
-# it doubles the digits to more than there are.
-ROUNDS, CLOSE = 60, 1e-8
+# Rounds of the search at most; the step that changes the slope by less than this part of it is the
+# last, because it doubles the digits to more than there are.
+ROUNDS, CLOSE = 60, 1e-10
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -162,7 +162,7 @@ def _where(
 ) -> float:
     """Return the voltage of a goal on the cubic through u and w, up to where the next play joins.
 
-    By Newton's rule, with bisection where the end of the cubic is known; nan where it fails.
+    By Chebyshev's rule, with bisection where the end of the cubic is known; nan where it fails.
     """
     low, high, x = u, join, guess
     level = w - _curve(gain, u)
@@ -172,12 +172,14 @@ def _where(
             low = x
         else:
             high = x
-        slope = _slope(steep, gain, x)
-        closer = x - s * off / slope
+        one = 1.0 / _slope(steep, gain, x)
+        bend, step = gain[2] + 3.0 * x * gain[3], s * off * one
+        # With the parabola that touches, as far as that is a small correction.
+        closer = x - step * (1.0 + min(max(bend * one * step, -0.25), 0.25))
+        moved = abs(closer - x)
+        if (abs(bend) + 3.0 * moved * abs(gain[3])) * moved * one <= CLOSE:
+            return float(min(max(closer, min(low, high)), max(low, high)))
         if not (s * (closer - low) >= 0.0 and s * (high - closer) >= 0.0) and math.isfinite(high):
             closer = 0.5 * (low + high)
-        bend = abs(2.0 * gain[2] + 6.0 * x * gain[3])
-        moved, x = abs(closer - x), closer
-        if bend * moved <= CLOSE * slope:
-            return x
+        x = closer
     return math.nan

@@ -30,6 +30,9 @@ __all__ = ["powered"]
 # Terms at most, and what part of the first one the last may be.
 TERMS, LAST = 20, 1e-17
 
+# One over each number of a term.
+OVER = tuple(1.0 / max(i, 1) for i in range(TERMS + 1))
+
 # A step of so large a part of g is near zero, if |x| is below a bound there: the sum converges.
 NEAR, SMALL = 0.2, 0.25
 
@@ -44,6 +47,9 @@ CLOSE, ROUNDS, PARTS = 1e-8, 60, 400
 NEARER = 1e-10
 
 EPSILON = float(np.finfo(np.float64).eps)
+
+# So far from one, times 1 + n, x is at the ceiling.
+RESTS = 4 * EPSILON
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -122,7 +128,8 @@ def _part(
     Return how far the voltage has gone, nan where the drive does not rise all along; g there, and
     what is left then.
     """
-    k = alpha * (1.0 - x)
+    # At the ceiling it stays, where rounding would never let it arrive.
+    k = alpha * (1.0 - x) if abs(1.0 - x) > RESTS * (1.0 + n) else 0.0
     slope = line[0] - k
     if not slope > 0.0:
         return math.nan, g, left
@@ -133,26 +140,24 @@ def _part(
         if abs(x) <= SMALL:
             return _near_zero(alpha, below, above, n, line, g, x, left)
         most = NEAR * abs(g) / abs(k)
-    terms, until = _expand(alpha, n, g, x, most, series)
-    whole = most == far and until >= 1.0
+    terms, until = _expand(alpha, n, g, x, k, most, series)
     # The guess may be a little short.
-    t = high = LONGER if whole else min(until, 1.0)
-    rise, steep, after = _added(line, series[0], terms, most, high)
-    if rise >= left:
-        low, t = 0.0, min(high, 1.0)
-        for _ in range(ROUNDS):
-            rise, steep, after = _added(line, series[0], terms, most, t)
-            if rise < left:
-                low = t
-            else:
-                high = t
-            closer = t - (rise - left) / (most * steep)
-            if not (low <= closer <= high):
-                closer = 0.5 * (low + high)
-            moved, t = abs(closer - t), closer
-            if abs(bend) * most * moved <= CLOSE * slope:
+    low, high = 0.0, LONGER if most == far and until >= 1.0 else min(until, 1.0)
+    t = min(high, 1.0)
+    for _ in range(ROUNDS):
+        rise, steep, after = _added(line, series[0], terms, most, t)
+        if rise < left:
+            if t == high:
                 break
-        rise = left
+            low = t
+        closer = t - (rise - left) / (most * steep)
+        moved = most * abs(closer - t)
+        if (abs(bend) + 3.0 * most * abs(line[2])) * moved <= CLOSE * slope and closer <= high:
+            t, rise = closer, left
+            break
+        t = min(closer, high) if closer > low else 0.5 * (low + t)
+    else:
+        return math.nan, g, left
     v = most * t
     end = line[0] + v * (2.0 * line[1] + 3.0 * v * line[2]) - steep
     if not flattest(line, v) > max(k, end):
@@ -162,7 +167,7 @@ def _part(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _expand(
-    alpha: float, n: float, g: float, x: float, most: float, series: FloatArray
+    alpha: float, n: float, g: float, x: float, k: float, most: float, series: FloatArray
 ) -> tuple[int, float]:
     """Write the coefficients of g and x in t = v / most.
 
@@ -170,14 +175,16 @@ def _expand(
     """
     gs, xs = series[0], series[1]
     gs[0], xs[0] = g, x
-    gs[1] = first = alpha * most * (1.0 - x)
+    gs[1] = first = k * most
     one, least = 1.0 / g if g != 0.0 else 0.0, LAST * abs(first)
     for i in range(1, TERMS):
         total = 0.0
+        weight = -float(i)
         for j in range(1, i + 1):
-            total += (n * j - (i - j)) * gs[j] * xs[i - j]
-        xs[i] = total * one / i
-        gs[i + 1] = -alpha * most * xs[i] / (i + 1)
+            weight += n + 1.0
+            total += weight * gs[j] * xs[i - j]
+        xs[i] = total * one * OVER[i]
+        gs[i + 1] = -alpha * most * xs[i] * OVER[i + 1]
         if abs(gs[i]) + abs(gs[i + 1]) <= least:
             return i + 1, 1.0
     last = max(abs(gs[TERMS]), abs(gs[TERMS - 1]))
@@ -214,16 +221,16 @@ def _near_zero(
 ) -> tuple[float, float, float]:
     """Go on as :func:`_part` does, by the sum of v(g), as far as that is short."""
     begun, start = x, _clock(alpha, n, g, x)
-    high = (2.0 * SMALL / above) ** (1.0 / n) if above > 0.0 else math.inf
-    if high < math.inf:
-        v = _clock(alpha, n, high, 2.0 * SMALL) - start
-        rise = v * (line[0] + v * (line[1] + v * line[2])) - (high - g)
-        if rise < left:
-            steepest = alpha * max(1.0 - begun, 1.0)
-            return (v if flattest(line, v) > steepest else math.nan), high, left - rise
+    edge = (2.0 * SMALL / above) ** (1.0 / n) if above > 0.0 else math.inf
     k = alpha * (1.0 - x)
-    low, after = g, g + k * left / (line[0] - k)
+    low, high, after = g, edge, g + k * left / (line[0] - k)
     for _ in range(ROUNDS):
+        if after >= edge:
+            v = _clock(alpha, n, edge, 2.0 * SMALL) - start
+            rise = v * (line[0] + v * (line[1] + v * line[2])) - (edge - g)
+            if rise < left:
+                steepest = alpha * max(1.0 - begun, 1.0)
+                return (v if flattest(line, v) > steepest else math.nan), edge, left - rise
         if not (low <= after <= high):
             after = 0.5 * (low + high)
         x = (below if after < 0.0 else above) * abs(after) ** n

@@ -127,7 +127,8 @@ def _closer(own: FloatArray) -> int:
         steep = slope + v * (2.0 * bend + v * (3.0 * (third - tail) + z * rest))
         step = off / steep
         # Whatever is not a number is not close.
-        close = (abs(c) * slope + abs(bend)) * abs(step) <= CLOSE * slope
+        curved = abs(c) * slope + abs(bend) + 3.0 * abs(third) * v
+        close = curved * abs(step) <= CLOSE * slope
         far += not close
         own[V + i] = v - step
         own[K + i] = steep if close else 0.0
