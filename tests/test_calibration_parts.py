@@ -124,7 +124,7 @@ def test_every_part_is_calibrated(part: str, tmp_path: Path) -> None:
     common = resolved(EVERY[part], "", tmp_path)
     every = made(common, REPLICATES)
     result = figures(common, every)
-    keep(f"calibration, {part}", result)
+    keep(f"calibrated part, {part}", result)
     assert [] == result["shortcomings"]
     assert result["unconverged"] <= MOST_UNCONVERGED * REPLICATES
     assert together_test(every, common.posterior.prior) > LEVEL

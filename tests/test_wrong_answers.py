@@ -8,7 +8,7 @@ Which test keeps which:
 | another record that starts with a transient | here |
 | lead-ins of any length on a record in motion | here |
 | a copy of a record under another name; another seed | here |
-| a switch-on transient in a record that is fitted whole | here, ``results/test_refit.py``, \
+| a switch-on transient in a record that is fitted whole | here, ``results/test_transient.py``, \
 ``results/test_innovations.py``, ``data/test_inspection.py`` |
 | ``start`` forgot the history; so did ``train`` | here, ``app/test_problem.py`` |
 | a record at 5 kHz and its every 20th sample | here, ``inference/test_rates.py`` |

@@ -25,7 +25,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.causes import Cause, Residuals, cause, drifts, likeliest
 from bwbayes.results.innovations import OddStart
-from bwbayes.results.refit import Moved
+from bwbayes.results.transient import Transient
 
 __all__ = ["Background", "Verdict", "assess"]
 
@@ -166,7 +166,7 @@ def assess(
     background: Background,
     *,
     start: OddStart | None = None,
-    moved: Moved | None = None,
+    transient: Transient | None = None,
     beyond: Sequence[str] = (),
 ) -> Verdict | None:
     """Judge bands by the readings after ``scored_from``; None if there are none.
@@ -181,8 +181,8 @@ def assess(
         What is known of the fit.
     start
         Of a fitted record, a start that does not go with the rest.
-    moved
-        Of a fitted record, a parameter that is another one without the start.
+    transient
+        Of a fitted record, a transient at its start that the fit has swallowed.
     beyond
         In what the record's drive leaves the one that was fitted, a line each.
     """
@@ -198,7 +198,7 @@ def assess(
         *residuals.reversed,
         *_lead_in(bands),
         *_odd(start),
-        *_moved(moved),
+        *_swallowed(transient),
         *_coverage(bands, judged, standard),
         *_size(standard),
         *_leaning(bands, judged, standard),
@@ -211,8 +211,8 @@ def assess(
         why = likeliest(residuals) if reasons else cause("noise", residuals)
         if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
             why = cause("lead-in", residuals)
-        if (start or moved) and why.kind not in ("sign", "outliers"):
-            until = max(one.until for one in (start, moved) if one is not None)
+        if (start or transient) and why.kind not in ("sign", "outliers"):
+            until = max(one.until for one in (start, transient) if one is not None)
             # A start that is off bends the fit, and looks like a drift that ends soon.
             if why.kind != "drift" or not drifts(residuals, until):
                 why = cause("start", residuals, until)
@@ -360,14 +360,16 @@ def _odd(start: OddStart | None) -> list[str]:
     ]
 
 
-def _moved(moved: Moved | None) -> list[str]:
-    """Say that the parameters of a fit depend on the record's start."""
-    if moved is None:
+def _swallowed(transient: Transient | None) -> list[str]:
+    """Say that the parameters of a fit depend on a transient at the record's start."""
+    if transient is None:
         return []
-    (whole, sd), (rest, its_sd) = moved.whole, moved.rest
+    (whole, sd), (rest, its_sd) = transient.whole, transient.rest
     return [
-        f"without the readings before {moved.until:.4g} s {moved.name} is {rest:.4g} +- "
-        f"{its_sd:.2g} {moved.unit}, with them {whole:.4g} +- {sd:.2g}"
+        f"a transient of {transient.size:.3g} um that decays within {transient.decay:.2g} s "
+        f"explains its start better, by {transient.nats:.3g} nats; without the readings before "
+        f"{transient.until:.4g} s {transient.name} is {rest:.4g} +- {its_sd:.2g} "
+        f"{transient.unit}, with them {whole:.4g} +- {sd:.2g}"
     ]
 
 

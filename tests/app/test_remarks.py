@@ -59,7 +59,7 @@ def test_a_transient_in_sight_counts(
         assert record == "record"
         counted.append(seen)
 
-    monkeypatch.setattr("bwbayes.app.running.assembling.without_start", told)
+    monkeypatch.setattr("bwbayes.app.running.assembling.swallowed", told)
     transient = Finding("switch-on transient", 0.0, 1.0, "it starts off", "leave it out")
     drift = replace(transient, kind="drift")
     for findings in ((), (drift,), (drift, transient)):

@@ -28,8 +28,8 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import innovations
 from bwbayes.results.prediction import predict_record, predict_windows
-from bwbayes.results.refit import without_start
 from bwbayes.results.result import Result
+from bwbayes.results.transient import swallowed
 from bwbayes.results.verdict import Background, Verdict
 from bwbayes.sampling.proposals import StudentMixture, StudentProposal
 from bwbayes.sampling.sampler import first_chain, sample
@@ -185,9 +185,9 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     odd = innovations(posterior, best, record.start)
     seen = any(one.kind == "switch-on transient" for one in problem.findings["record"])
-    moved = without_start(posterior, draws, source, record.start, seen=seen) if again else None
+    transient = swallowed(posterior, draws, source, record.start, seen=seen) if again else None
     verdicts = judged(
-        problem, bands, Background.of(posterior, draws), {"record": odd}, {"record": moved}
+        problem, bands, Background.of(posterior, draws), {"record": odd}, {"record": transient}
     )
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 

@@ -16,11 +16,11 @@ from bwbayes.results import agreement, identifiability, innovations
 from bwbayes.results.learned import learned
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.prediction import thinned
-from bwbayes.results.refit import without_start
 from bwbayes.results.replicated import replicated
 from bwbayes.results.result import Result
 from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
+from bwbayes.results.transient import swallowed
 from bwbayes.results.verdict import Background
 from bwbayes.sampling.sampler import Outcome, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
@@ -76,8 +76,8 @@ def assemble(
     # By a second point fit, without a record's start.
     source = generator(problem.config.seed, "without start")
     some = thinned(flat, source)
-    moved = {
-        name: without_start(
+    transients = {
+        name: swallowed(
             posterior,
             some,
             source,
@@ -97,7 +97,7 @@ def assemble(
         for name, one in series.items()
         for remark in innovations.remarks(one)
     ]
-    verdicts = judged(problem, bands, Background.of(posterior, flat), series, moved)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, transients)
     return replace(
         result,
         bands=bands,

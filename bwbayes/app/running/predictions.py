@@ -36,9 +36,9 @@ from bwbayes.results.prediction import (
     predict_windows,
     thinned,
 )
-from bwbayes.results.refit import Moved
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores, as_summary, score
+from bwbayes.results.transient import Transient
 from bwbayes.results.verdict import Background, Verdict, assess
 
 if TYPE_CHECKING:
@@ -250,22 +250,22 @@ def judged(
     bands: Iterable[Bands],
     background: Background,
     series: Mapping[str, Innovations],
-    moved: Mapping[str, Moved | None],
+    transients: Mapping[str, Transient | None],
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name.
 
-    ``series`` and ``moved`` are by the name of the training record.
+    ``series`` and ``transients`` are by the name of the training record.
     """
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for one in bands:
         far = beyond_training(problem.posterior, one.voltage, one.interval)
         record = records.get(one.name) if one.training else None
-        start, away = None, None
+        start, transient = None, None
         # Of several training windows the first one holds the start.
         if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
-            start, away = innovations.odd_start(series[record]), moved[record]
-        verdict = assess(one, background, start=start, moved=away, beyond=far)
+            start, transient = innovations.odd_start(series[record]), transients[record]
+        verdict = assess(one, background, start=start, transient=transient, beyond=far)
         if verdict is not None:
             verdicts[one.name] = verdict
     return verdicts

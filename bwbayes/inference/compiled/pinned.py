@@ -11,15 +11,24 @@ import math
 
 import numpy as np
 from numba import njit
-from scipy.integrate import RK45
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.model.declaration import Values
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operators.domain_wall import DomainWall
-from bwbayes.model.operators.jiles_atherton import ABOVE, BELOW, STEPS
+from bwbayes.model.operators.jiles_atherton import ABOVE, BELOW, STEPS, TINY
 from bwbayes.model.operators.one_state import Memory
 from bwbayes.model.operators.pinned import LONGEST, Pinned
+from bwbayes.model.operators.rosenbrock import (
+    BETWEEN,
+    COUPLINGS,
+    DRIFTS,
+    END,
+    PLACES,
+    SHIFT,
+    STAGES,
+    WEIGHTS,
+)
 from bwbayes.model.operators.walls import (
     CONVERGED,
     FIRST,
@@ -28,14 +37,10 @@ from bwbayes.model.operators.walls import (
     SAFE,
     SATURATED,
     SHRINK,
-    STABLE,
     TOLERANCE,
 )
 
 __all__ = ["drive"]
-
-A, B, C, E, P = RK45.A, RK45.B, RK45.C, RK45.E, RK45.P
-STAGES = 6
 
 
 def drive(operator: Pinned, column: Values, voltage: FloatArray, memory: Memory) -> FloatArray:
@@ -109,58 +114,71 @@ def _move(
     end = s * voltage[-1]
     scale = TOLERANCE * min(own[0], own[6] * (end - u))
     step = FIRST * (own[3] - own[2] * own[5])
-    k = np.empty(STAGES + 1)
-    k[0], decay = _slope(spins, own, u, p)
+    k = np.empty(STAGES)
     while True:
-        step = min(step, STABLE * decay)
         last = step >= end - u
         h = end - u if last else step
-        for stage in range(1, STAGES):
-            change = h * _weighted(A[stage], k, stage)
-            k[stage], _ = _slope(spins, own, u + C[stage] * h, p + change)
-        reached = p + h * _weighted(B, k, STAGES)
-        arrived = end if last else u + h
-        k[STAGES], within = _slope(spins, own, arrived, reached)
-        error = abs(h * _weighted(E, k, STAGES + 1)) / scale
+        slope, drift, down = _slopes(spins, own, u, p)
+        shifted = 1 / (SHIFT * h) - down
+        for stage in range(STAGES):
+            if stage > 0:
+                near = p + _weighted(WEIGHTS[stage], k, stage)
+                slope = _slope(spins, own, u + PLACES[stage] * h, near)
+            coupled = _weighted(COUPLINGS[stage], k, stage) / h
+            k[stage] = (slope + DRIFTS[stage] * h * drift + coupled) / shifted
+        change = _weighted(END, k, STAGES)
+        first = _weighted(BETWEEN[0], k, STAGES)
+        second = _weighted(BETWEEN[1], k, STAGES)
+        third = _weighted(BETWEEN[2], k, STAGES)
+        middle = p + 0.5 * change + 0.25 * (first + 0.5 * (second + 0.5 * third))
+        off = _slope(spins, own, u + 0.5 * h, middle) - (change + 0.25 * (second + third)) / h
+        error = max(abs(k[STAGES - 1]), abs(off / shifted)) / scale
         step = h * (min(max(SAFE * error**-0.2, SHRINK), GROW) if error > 0.0 else GROW)
         if not error <= 1.0:
             continue
-        if t < voltage.size and s * voltage[t] <= arrived:
-            terms = (
-                _weighted(P[:, 0], k, STAGES + 1),
-                _weighted(P[:, 1], k, STAGES + 1),
-                _weighted(P[:, 2], k, STAGES + 1),
-                _weighted(P[:, 3], k, STAGES + 1),
-            )
-            while t < voltage.size and s * voltage[t] <= arrived:
-                travel = s * voltage[t] - u
-                part = travel / (arrived - u)
-                polynomial = terms[0] + part * (terms[1] + part * (terms[2] + part * terms[3]))
-                out[t] = s * (p + travel * polynomial)
-                t += 1
-        u, p, decay = arrived, reached, within
-        k[0] = k[STAGES]
+        arrived = end if last else u + h
+        while t < voltage.size and s * voltage[t] <= arrived:
+            part = (s * voltage[t] - u) / (arrived - u)
+            between = (1 - part) * (first + part * (second + part * third))
+            out[t] = s * (p + part * (change + between))
+            t += 1
+        u, p = arrived, p + change
         if last:
             return p
 
 
 @njit(nogil=True, cache=True)
-def _weighted(weights: FloatArray, slopes: FloatArray, count: int) -> float:
+def _weighted(weights: FloatArray, stages: FloatArray, count: int) -> float:
     total = 0.0
     for stage in range(count):
-        total += weights[stage] * slopes[stage]
+        total += weights[stage] * stages[stage]
     return total
 
 
 @njit(nogil=True, cache=True)
-def _slope(spins: bool, own: FloatArray, u: float, p: float) -> tuple[float, float]:
-    """Return dP/du while walls move under a rising voltage, and within what an error decays, V."""
+def _slope(spins: bool, own: FloatArray, u: float, p: float) -> float:
+    """Return f = dP/du while walls move under a rising voltage."""
     ws, e0, a, k, c, most = own[0], own[1], own[2], own[3], own[4], own[5]
     level, slope = _curve(spins, (u + a * p) / e0)
     behind = min(max((ws * level - p) / (1 - c), 0.0), most)
     slope = slope * ws / e0
-    left = k - a * behind
-    return (c * slope + (1 - c) * behind / left) / (1 - a * c * slope), left * left / k
+    return float((c * slope + (1 - c) * behind / (k - a * behind)) / (1 - a * c * slope))
+
+
+@njit(nogil=True, cache=True)
+def _slopes(spins: bool, own: FloatArray, u: float, p: float) -> tuple[float, float, float]:
+    """Return f, f_u and f_p."""
+    ws, e0, a, k, c, most = own[0], own[1], own[2], own[3], own[4], own[5]
+    y = (u + a * p) / e0
+    level, slope = _curve(spins, y)
+    bend = _bend(spins, y, level, slope) * ws / e0**2
+    behind = min(max((ws * level - p) / (1 - c), 0.0), most)
+    slope = slope * ws / e0
+    rest, moving = 1 - a * c * slope, k - a * behind
+    forward = (c * slope + (1 - c) * behind / moving) / rest
+    pull = k / (moving**2 * rest)
+    along = c * (1 + a * forward) / rest * bend + pull * slope
+    return forward, along, a * along - pull
 
 
 @njit(nogil=True, cache=True)
@@ -198,6 +216,16 @@ def _curve(spins: bool, y: float) -> tuple[float, float]:
     gone = math.exp(-2 * size)
     ratio = 2 * gone / (1 - gone)
     return math.copysign(1 + ratio - one, y), one * one - 2 * ratio / (1 - gone)
+
+
+@njit(nogil=True, cache=True)
+def _bend(spins: bool, y: float, level: float, slope: float) -> float:
+    """Return L″ of either model."""
+    if spins:
+        return -2 * level * slope
+    if abs(y) < TINY:
+        return -2 * y / 15
+    return -2 * level * slope - 2 * (slope - level / y) / y
 
 
 @njit(nogil=True, cache=True)

@@ -53,6 +53,10 @@ class _OneState(HysteresisStep):
         """Return voltage and h."""
         return of_one_state(memory)
 
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
+        """Return voltage and h."""
+        return np.stack([voltage, initial], axis=1)
+
 
 @dataclass(frozen=True)
 class AsymmetricStep(_OneState):
@@ -82,7 +86,7 @@ class AsymmetricStep(_OneState):
         start, travel = s * memory[:, 0], np.abs(voltage - memory[:, 0])
         early = np.clip(-start, 0.0, travel)
         # Towards zero volts first, where s x = −1; then away from them.
-        before, after = ([np.where(up, c[1, x], c[0, 1 - x]) for c in self._rates] for x in (0, 1))
+        before, after = ([np.where(up, c[1, x], c[0, 1 - x]) for c in self.rates] for x in (0, 1))
         g, slow = relaxed(s * memory[:, 1], early, self.alpha, *before)
         g, rate = relaxed(g, travel - early, self.alpha, *after)
         rate = np.where((start < 0) & (travel <= -start), slow, rate)
@@ -90,7 +94,8 @@ class AsymmetricStep(_OneState):
         return Gone(self.d * voltage - h, self.d - self.alpha + rate * g, np.stack([voltage, h], 1))
 
     @property
-    def _rates(self) -> tuple[FloatArray, FloatArray]:
+    def rates(self) -> tuple[FloatArray, FloatArray]:
+        """The rates c below zero and above, not exactly zero."""
         return not_zero(self.against), not_zero(self.ahead)
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
@@ -105,7 +110,7 @@ class AsymmetricStep(_OneState):
 
     def coefficients(self) -> dict[str, Any]:
         """Return d, α and the rates c by direction and sign."""
-        against, ahead = (rate[..., 0].tolist() for rate in self._rates)
+        against, ahead = (rate[..., 0].tolist() for rate in self.rates)
         numbers = {"d": float(self.d[0]), "alpha": float(self.alpha[0])}
         return {"kind": "asymmetric", **numbers, "against": against, "ahead": ahead}
 
@@ -212,7 +217,7 @@ class PowerStep(_OneState):
     exponent: FloatArray
 
     @cached_property
-    def _rates(self) -> tuple[FloatArray, FloatArray]:
+    def rates(self) -> tuple[FloatArray, FloatArray]:
         """C over α for g below zero and above."""
         return (self.gamma - self.beta) / self.alpha, (self.beta + self.gamma) / self.alpha
 
@@ -220,7 +225,7 @@ class PowerStep(_OneState):
     def ceiling(self) -> FloatArray:
         """Largest |h|, (α / (β + γ))^(1/n), um; infinite where there is none."""
         with np.errstate(divide="ignore", over="ignore"):
-            return np.asarray((1 / self._rates[1]) ** (1 / self.exponent))
+            return np.asarray((1 / self.rates[1]) ** (1 / self.exponent))
 
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return d u − h, its slope d − α + c gⁿ, and the voltage with h."""
@@ -235,7 +240,7 @@ class PowerStep(_OneState):
 
     def _x(self, g: FloatArray) -> FloatArray:
         """Return x with the sign that 1 − x = h′/α asks for, (models,)."""
-        below, above = self._rates
+        below, above = self.rates
         return np.where(g < 0, below, above) * np.abs(g) ** self.exponent
 
     def _clock(self, g: FloatArray) -> FloatArray:
@@ -276,7 +281,7 @@ class PowerStep(_OneState):
     def coefficients(self) -> dict[str, Any]:
         """Return the parameters, and what a program needs to sum F(x)."""
         n = float(self.exponent[0])
-        below, above = (float(rate[0]) for rate in self._rates)
+        below, above = (float(rate[0]) for rate in self.rates)
         # A rate of zero has no ceiling; this is far beyond all voltages.
         above = max(above, SMALL)
         lowest = min(below / above, 0.0)

@@ -23,7 +23,7 @@ from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, threshold_volts
 
-__all__ = ["STEPPED", "DriveStep", "step_of"]
+__all__ = ["STEPPED", "DriveStep", "has_step", "step_of"]
 
 # Names, as a config has them, of the operators that have a step.
 STEPPED = (
@@ -75,6 +75,12 @@ class DriveStep:
             power = TERMS[name].power
             added += self.column[name] * power * x ** (power - 1) / self.gain.reference.half
         return added
+
+
+def has_step(operator: Operator) -> bool:
+    """Tell whether an operator has a step of bounded time."""
+    kinds = BoucWen, BacklashLike, BoucWenAsymmetric, Duhem, NoHysteresis, Plays, MaxwellSlip
+    return isinstance(operator, kinds)
 
 
 def step_of(operator: Operator, column: Values) -> HysteresisStep:

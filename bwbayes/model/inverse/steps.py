@@ -60,6 +60,13 @@ class HysteresisStep(ABC):
         """Return the memory (models, any) of what the operator itself remembers."""
 
     @abstractmethod
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:
+        """Return the memory (models, any) of models that start at voltages (models,), V.
+
+        In the states that the ``initial`` ones (models,) say, within a span of earlier voltages.
+        """
+
+    @abstractmethod
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds of dw/du that hold on every path from the demagnetised state.
 
@@ -100,17 +107,21 @@ class LinearStep(HysteresisStep):
         """Return voltage and h."""
         return of_one_state(memory)
 
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
+        """Return voltage and h."""
+        return np.stack([voltage, initial], axis=1)
+
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return d u − h, its slope d − α + c g, and the voltage with h."""
         direction = np.where(voltage < memory[:, 0], -1.0, 1.0)
         travel = np.abs(voltage - memory[:, 0])
-        g, rate = relaxed(direction * memory[:, 1], travel, self.alpha, *self._rates)
+        g, rate = relaxed(direction * memory[:, 1], travel, self.alpha, *self.rates)
         h = direction * g
         slope = self.d - self.alpha + rate * g
         return Gone(self.d * voltage - h, slope, np.stack([voltage, h], axis=1))
 
     @property
-    def _rates(self) -> tuple[FloatArray, FloatArray]:
+    def rates(self) -> tuple[FloatArray, FloatArray]:
         """The rates c below zero and above, not exactly zero."""
         return not_zero(self.beta - self.gamma), not_zero(self.beta + self.gamma)
 
@@ -123,7 +134,7 @@ class LinearStep(HysteresisStep):
 
     def coefficients(self) -> dict[str, Any]:
         """Return d, α and the two rates c."""
-        against, ahead = self._rates
+        against, ahead = self.rates
         numbers = {"d": self.d, "alpha": self.alpha, "against": against, "ahead": ahead}
         return {"kind": "linear"} | {name: float(values[0]) for name, values in numbers.items()}
 
@@ -156,6 +167,14 @@ class PlaysStep(HysteresisStep):
         for one in memory.extrema:
             plays = self._moved(plays, np.array(one.voltage if one.own is None else one.own))
         return self._moved(plays, np.array(memory.voltage))
+
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:
+        """Return the plays after a drive through the span, as the operators begin."""
+        low, high = np.minimum(span.low, voltage), np.maximum(span.high, voltage)
+        plays = self.demagnetised()
+        for one in (high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage):
+            plays = self._moved(plays, one)
+        return plays
 
     def _moved(self, plays: FloatArray, voltage: FloatArray) -> FloatArray:
         target = voltage[..., np.newaxis]

@@ -15,7 +15,7 @@ from scipy.special import lambertw, wrightomega
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["reached", "travel"]
+__all__ = ["reached", "searched", "travel"]
 
 # Places at which a curve is looked at first.
 GRID = 33
@@ -73,7 +73,7 @@ def reached(
     heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
     heights = np.maximum.accumulate(heights)
     above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
-    result = _searched(
+    result = searched(
         lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
         (points[above - 1], points[above]),
         (heights[above - 1] - goal, heights[above] - goal),
@@ -111,7 +111,7 @@ def _in_order(
     return values
 
 
-def _searched(
+def searched(
     function: Callable[[FloatArray], FloatArray],
     ends: tuple[FloatArray, FloatArray],
     values: tuple[FloatArray, FloatArray],

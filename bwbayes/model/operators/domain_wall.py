@@ -44,6 +44,10 @@ class DomainWall(Pinned):
         gone = np.exp(-2 * np.abs(y))
         return np.tanh(y), 4 * gone / (1 + gone) ** 2
 
+    def bend(self, y: FloatArray, level: FloatArray, slope: FloatArray) -> FloatArray:  # noqa: ARG002  # the curve says it all
+        """Return L″ = −2 L L′."""
+        return -2 * level * slope
+
     def field_at(self, level: FloatArray) -> FloatArray:
         """Return artanh, infinite at ±1."""
         with np.errstate(divide="ignore"):

@@ -6,7 +6,7 @@ once the field pulls them forward, and bend reversibly in between. Both models a
 with another field and another anhysteretic curve.
 
 There is no closed form. Where the walls do not move, one implicit equation remains, which is
-solved to rounding; where they move, a Runge-Kutta method of order five with steps of its own for
+solved to rounding; where they move, an implicit method of order five with steps of its own for
 each model follows them, with an error below 1e-6 of the range of the displacement.
 """
 

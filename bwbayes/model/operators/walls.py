@@ -6,8 +6,9 @@ The displacement P in um follows the voltage u in V by
     dP_irr/du = (P_an − P_irr) / (k − a (P_an − P_irr))   where P_an > P_irr,
 
 and P_irr stays elsewhere. There, P follows from an implicit equation, which is solved to rounding;
-from where P_an reaches P_irr, which is known in closed form, a Runge-Kutta method of order five
-takes over, with steps of its own for each model.
+from where P_an reaches P_irr, which is known in closed form, an implicit method of order five
+(:mod:`~bwbayes.model.operators.rosenbrock`) takes over, with steps of its own for each model: walls
+that are hardly pinned follow P_an within a voltage k that is small against all others.
 """
 
 from __future__ import annotations
@@ -16,9 +17,18 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import RK45
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.model.operators.rosenbrock import (
+    BETWEEN,
+    COUPLINGS,
+    DRIFTS,
+    END,
+    PLACES,
+    SHIFT,
+    STAGES,
+    WEIGHTS,
+)
 
 __all__ = ["Solver", "Walls"]
 
@@ -27,9 +37,6 @@ TOLERANCE = 1e-8
 
 # How much a step may grow or shrink, and what part of the best step is taken.
 GROW, SHRINK, SAFE = 5.0, 0.2, 0.9
-
-# Longer steps than this, in units of the voltage within which an error decays, would let it grow.
-STABLE = 3.0
 
 # The first step of walls that begin to move, as a part of the voltage that they lag behind.
 FIRST = 0.1
@@ -78,6 +85,10 @@ class Solver(ABC):
     @abstractmethod
     def curve(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return L and L′ at fields in units of E₀, of any shape."""
+
+    @abstractmethod
+    def bend(self, y: FloatArray, level: FloatArray, slope: FloatArray) -> FloatArray:
+        """Return L″ at fields at which :meth:`curve` is known."""
 
     @abstractmethod
     def field_at(self, level: FloatArray) -> FloatArray:
@@ -137,18 +148,33 @@ class Solver(ABC):
         )
         return fixed
 
-    def _slope(self, walls: Walls, u: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return dP/du (models,) while walls move forward under a rising voltage.
-
-        And the voltage within which what P is off by decays to 1/e, or a longer one.
-        """
+    def _slope(self, walls: Walls, u: FloatArray, p: FloatArray) -> FloatArray:
+        """Return f = dP/du (models,) while walls move forward under a rising voltage."""
         ws, e0, a, k, c, most, _ = walls
         level, slope = self.curve((u + a * p) / e0)
         behind = np.clip((ws * level - p) / (1 - c), 0.0, most)
         slope = slope * ws / e0
-        left = k - a * behind
-        forward = (c * slope + (1 - c) * behind / left) / (1 - a * c * slope)
-        return forward, left * left / k
+        forward: FloatArray = (c * slope + (1 - c) * behind / (k - a * behind)) / (
+            1 - a * c * slope
+        )
+        return forward
+
+    def _slopes(
+        self, walls: Walls, u: FloatArray, p: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return f, f_u and f_p (models,)."""
+        ws, e0, a, k, c, most, _ = walls
+        y = (u + a * p) / e0
+        level, slope = self.curve(y)
+        bend = self.bend(y, level, slope) * ws / e0**2
+        behind = np.clip((ws * level - p) / (1 - c), 0.0, most)
+        slope = slope * ws / e0
+        rest, moving = 1 - a * c * slope, k - a * behind
+        forward = (c * slope + (1 - c) * behind / moving) / rest
+        # How f grows as walls lag further behind P_an.
+        pull = k / (moving**2 * rest)
+        along = c * (1 + a * forward) / rest * bend + pull * slope
+        return forward, along, a * along - pull
 
     def _move(
         self,
@@ -160,45 +186,50 @@ class Solver(ABC):
     ) -> FloatArray:
         """Let walls move from voltages u and displacements p (models,) to the last point.
 
-        Fills in P ``along`` (models, points) after u, and returns the last. Dormand and Prince's
-        method; every model has its own steps, so that it does not depend on the others.
+        Fills in P ``along`` (models, points) after u, and returns the last. Every model has its own
+        steps, so that it does not depend on the others.
         """
         u, p, end = u.copy(), p.copy(), points[-1]
         scale = TOLERANCE * np.minimum(walls.saturation, walls.slope * (end - u))
         step = FIRST * (walls.pinning - walls.coupling * walls.lag)
-        slope, decay = self._slope(walls, u, p)
         rows = np.arange(u.size)
         while rows.size:
             some = walls.rows(rows)
             at, now = u[rows], p[rows]
-            best = np.minimum(step[rows], STABLE * decay[rows])
-            last = best >= end - at
-            h = np.where(last, end - at, best)
-            stages = [slope[rows]]
-            for place, weights in zip(RK45.C[1:], RK45.A[1:], strict=True):
-                change = h * _weighted(weights, stages)
-                stages.append(self._slope(some, at + place * h, now + change)[0])
-            reached = now + h * _weighted(RK45.B, stages)
-            arrived = np.where(last, end, at + h)
-            after, within = self._slope(some, arrived, reached)
-            stages.append(after)
-            error = np.abs(h * _weighted(RK45.E, stages)) / scale[rows]
+            last = step[rows] >= end - at
+            h = np.where(last, end - at, step[rows])
+            slope, drift, own = self._slopes(some, at, now)
+            shifted, stages = 1 / (SHIFT * h) - own, list[FloatArray]()
+            for stage in range(STAGES):
+                if stage > 0:
+                    near = now + _weighted(WEIGHTS[stage], stages)
+                    slope = self._slope(some, at + PLACES[stage] * h, near)
+                coupled = _weighted(COUPLINGS[stage], stages) / h
+                stages.append((slope + DRIFTS[stage] * h * drift + coupled) / shifted)
+            change = _weighted(END, stages)
+            inner = [_weighted(one, stages) for one in BETWEEN]
+            # In between it is as good as the slope in the middle says that it is.
+            middle = now + 0.5 * change + 0.25 * (inner[0] + 0.5 * (inner[1] + 0.5 * inner[2]))
+            off = (
+                self._slope(some, at + 0.5 * h, middle)
+                - (change + 0.25 * (inner[1] + inner[2])) / h
+            )
+            error = np.maximum(np.abs(stages[-1]), np.abs(off / shifted)) / scale[rows]
             good = error <= 1
             with np.errstate(divide="ignore"):
                 step[rows] = h * np.clip(SAFE * error**-0.2, SHRINK, GROW)
-            done = rows[good]
-            u[done], p[done], slope[done] = arrived[good], reached[good], after[good]
-            decay[done] = within[good]
-            terms = [_weighted(power, stages)[good] for power in RK45.P.T]
+            done, arrived = rows[good], np.where(last, end, at + h)
+            u[done], p[done] = arrived[good], (now + change)[good]
+            terms = [term[good] for term in (change, *inner)]
             _fill(along, points, done, at[good], arrived[good], now[good], terms)
             rows = rows[~(good & last)]
         return p
 
 
 def _weighted(weights: FloatArray, stages: list[FloatArray]) -> FloatArray:
-    """Return the weighted sum of slopes (models,), term by term, so that no row sees another."""
-    total: FloatArray = weights[0] * stages[0]
-    for weight, one in zip(weights[1:], stages[1:], strict=False):
+    """Return the weighted sum of stages (models,), term by term, so that no row sees another."""
+    total = np.zeros(())
+    for weight, one in zip(weights, stages, strict=False):
         total = total + weight * one
     return total
 
@@ -217,9 +248,7 @@ def _fill(
     counts = high - low
     which = np.repeat(np.arange(rows.size), counts)
     column = np.arange(which.size) - np.repeat(np.cumsum(counts) - counts - low, counts)
-    travel = points[column] - first[which]
-    part = travel / (last - first)[which]
-    polynomial = np.zeros(which.size)
-    for term in terms[::-1]:
-        polynomial = polynomial * part + term[which]
-    along[rows[which], column] = start[which] + travel * polynomial
+    part = (points[column] - first[which]) / (last - first)[which]
+    change, *inner = (term[which] for term in terms)
+    between = (1 - part) * (inner[0] + part * (inner[1] + part * inner[2]))
+    along[rows[which], column] = start[which] + part * (change + between)

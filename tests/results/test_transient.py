@@ -1,20 +1,21 @@
-"""A fit that hangs on the start of its record is told by a second one without it."""
+"""A fit that has swallowed a transient at the start of its record is told."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
-from bwbayes.results.refit import Moved, without_start
+from bwbayes.results.transient import DECAYS, Transient, added, swallowed
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.inference import problems
 from tests.results.records import bands_of, made
 
-PUSHED = Moved("d", "um/V", 2.4, (0.91, 0.013), (0.699, 0.002))
+PUSHED = Transient(24.0, 0.6, 31.2, "d", "um/V", 2.4, (0.91, 0.013), (0.699, 0.002))
 
 
 def fitted(seed: int, transient: float = 0.0) -> Posterior:
@@ -40,25 +41,44 @@ def drawn(posterior: Posterior) -> FloatArray:
 def test_good_fits_stay_where_they_are() -> None:
     for seed in range(3):
         posterior = fitted(seed)
-        assert without_start(posterior, drawn(posterior), np.random.default_rng(2)) is None
+        assert swallowed(posterior, drawn(posterior), np.random.default_rng(2)) is None
 
 
 def test_a_transient_at_the_start_moves_the_parameters() -> None:
     """The twin: the same records with a switch-on transient of 25 um that dies out in 0.6 s."""
     for seed in range(3):
         posterior = fitted(seed, 25.0)
-        moved = without_start(posterior, drawn(posterior), np.random.default_rng(2), begin=3.0)
-        assert moved is not None
-        assert 3 + 2.4 == moved.until
+        told = swallowed(posterior, drawn(posterior), np.random.default_rng(2), begin=3.0)
+        assert told is not None
+        assert 3 + 2.4 == told.until
+        assert told.size == pytest.approx(25.0, abs=4.0)
+        assert told.decay == pytest.approx(0.6, rel=0.01)
+
+
+def test_what_a_transient_adds_is_the_largest_of_all_sizes() -> None:
+    """Against a search over sizes, one by one, for one draw."""
+    posterior = fitted(1, 8.0)
+    one = posterior.prior.unconstrain(drawn(posterior)[:1])
+    name, time = posterior.only.name, 0.02 * np.arange(600)
+
+    def plainly(size: float, decay: float) -> float:
+        readings = posterior.only.displacement - size * np.exp(-time / decay)
+        return float(posterior.with_readings({name: readings}).log_density(one)[0])
+
+    nats, size, decay = added(posterior, name, one, 2.4)
+    tried = [plainly(s, 2.4 * part) for s in np.linspace(-20, 20, 401) for part in DECAYS]
+    assert nats == pytest.approx(max(tried) - plainly(0.0, 1.0), abs=0.05)
+    assert nats >= max(tried) - plainly(0.0, 1.0) - 1e-6
+    assert plainly(size, decay) - plainly(0.0, 1.0) == pytest.approx(nats, abs=1e-6)
 
 
 def test_few_readings_tell_nothing() -> None:
     posterior = problems.short_posterior(samples=150)
-    assert without_start(posterior, drawn(posterior), np.random.default_rng(2)) is None
+    assert swallowed(posterior, drawn(posterior), np.random.default_rng(2)) is None
 
 
-def judged(bands: Bands, moved: Moved | None) -> Verdict:
-    verdict = assess(bands, Background(0.3, 0.0, (-100.0, 100.0)), moved=moved)
+def judged(bands: Bands, transient: Transient | None) -> Verdict:
+    verdict = assess(bands, Background(0.3, 0.0, (-100.0, 100.0)), transient=transient)
     assert verdict is not None
     return verdict
 
@@ -69,6 +89,7 @@ def test_a_fit_that_hangs_on_its_start_does_not_hold() -> None:
     verdict = judged(bands, PUSHED)
     assert verdict.holds is False
     assert verdict.reasons == (
+        "a transient of 24 um that decays within 0.6 s explains its start better, by 31.2 nats; "
         "without the readings before 2.4 s d is 0.699 +- 0.002 um/V, with them 0.91 +- 0.013",
     )
     assert verdict.cause is not None
@@ -79,7 +100,7 @@ def test_a_fit_that_hangs_on_its_start_does_not_hold() -> None:
 def test_a_drift_all_along_is_no_bad_start() -> None:
     """What a bad start leaves in the fit looks like a drift, but ends; a drift goes on."""
     record = made(np.random.default_rng(1), length=30)
-    for added, kind in ((record.time, "drift"), (30 * np.exp(-record.time / 1.2), "start")):
-        verdict = judged(bands_of(record, added - np.mean(added), training=True), PUSHED)
+    for extra, kind in ((record.time, "drift"), (30 * np.exp(-record.time / 1.2), "start")):
+        verdict = judged(bands_of(record, extra - np.mean(extra), training=True), PUSHED)
         assert verdict.cause is not None
         assert kind == verdict.cause.kind

@@ -1,0 +1,180 @@
+"""Whether a fit has swallowed a switch-on transient: the start of its record tells.
+
+A transient can drag the parameters far away while the noise model covers what is then missed
+everywhere, so that neither bands nor innovations show it. So the same record is looked at with a
+transient taken off its readings, A exp(−t/τ) from the first of them on: where parameters that fit
+the rest of the record, with a transient at its start, are far more probable than any without one,
+the fit belongs to the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+
+__all__ = ["DECAYS", "Transient", "added", "swallowed"]
+
+# Part of the readings that is left out to see what the rest says, and the time constants that are
+# tried, as parts of how long that is.
+PART = 0.2
+DECAYS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
+
+# Log density, nats, that a transient must add. A good record's adds half of a chi-squared of one
+# degree of freedom, the largest of six that are alike, give or take a nat for the best of some
+# hundred draws: in 171 good runs 4.2 at most, and once 7.0.
+ADDED = 9.0
+
+# Less is enough where the readings themselves show a switch-on transient, or where without the
+# start a parameter is off by so many sds of both fits together: both would have to be wrong. In
+# good runs one in forty moves so far, to another optimum.
+SEEN_ADDED = 4.0
+MOVED_ADDED, MOVED = 3.0, 3.0
+
+# Draws of the posterior, and of the Gaussian approximation without the start, that are compared.
+COMPARED, DRAWS = 1000, 400
+
+# The transient with which the parabola in A is found, as a part of the readings' range.
+TRIED = 0.05
+
+# Fewer readings than this tell too little without their first part.
+FEWEST = 200
+
+
+@dataclass(frozen=True)
+class Transient:
+    """A transient at a record's start, and the parameter that moves most without the start.
+
+    ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density. ``until`` in s is where
+    the start ends; ``whole`` and ``rest`` are mean and sd of the parameter with it and without it.
+    """
+
+    size: float
+    decay: float
+    nats: float
+    name: str
+    unit: str
+    until: float
+    whole: tuple[float, float]
+    rest: tuple[float, float]
+
+
+def swallowed(
+    posterior: Posterior,
+    draws: FloatArray,
+    generator: np.random.Generator,
+    begin: float = 0.0,
+    *,
+    record: str | None = None,
+    seen: bool = False,
+) -> Transient | None:
+    """Return the transient at a record's start that its fit has swallowed, if any.
+
+    For given parameters the log density is a parabola in A, of which three places tell the top;
+    parameters are draws of the posterior, and of a second point fit that leaves out the start.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units.
+    generator
+        Starts the point fit and draws from its approximation.
+    begin
+        Time of the record's first sample, s.
+    record
+        Its name; may be left out if there is one alone.
+    seen
+        The readings show a switch-on transient.
+    """
+    name = posterior.only.name if record is None else record
+    one = posterior.alone(name).only
+    rows = one.readings.rows
+    if rows.size < FEWEST:
+        return None
+    first = int(rows[round(PART * rows.size)])
+    later = tuple(slice(max(w.start, first), w.stop) for w in one.training if w.stop > first)
+    windows = {other.name: other.training for other in posterior.datasets}
+    try:
+        point = pointfit.fit(posterior.trained(windows | {name: later}), generator)
+    except InputError:
+        return None
+    without = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    sampled = posterior.prior.unconstrain(draws[:COMPARED])
+    length = one.actuator.interval * (first - int(rows[0]))
+    nats, size, decay = added(posterior, name, np.concatenate([without, sampled]), length)
+    if nats <= MOVED_ADDED:
+        return None
+    free, density = posterior.prior.constrain(without)
+    free = free[np.isfinite(density)]
+    physical = [
+        i
+        for i, p in enumerate(posterior.prior.free)
+        if p.plain in one.actuator.parameters and p.plain not in one.table.of_scope("record")
+    ]
+    if not physical or len(free) < DRAWS // 4:
+        return None
+    (mean, sd), (other, its_sd) = (_middle(some[:, physical]) for some in (draws, free))
+    moved = np.abs(other - mean) / np.sqrt(sd**2 + its_sd**2 + np.finfo(float).tiny)
+    most = int(np.argmax(moved))
+    if moved[most] <= MOVED and nats <= (SEEN_ADDED if seen else ADDED):
+        return None
+    parameter = posterior.prior.free[physical[most]]
+    return Transient(
+        size,
+        decay,
+        nats,
+        parameter.name,
+        parameter.unit,
+        begin + one.actuator.interval * first,
+        (float(mean[most]), float(sd[most])),
+        (float(other[most]), float(its_sd[most])),
+    )
+
+
+def added(
+    posterior: Posterior, name: str, coordinates: FloatArray, length: float
+) -> tuple[float, float, float]:
+    """Return how many nats the best transient adds, its size A, um, and its time constant, s.
+
+    To the best of all coordinates (draws, free) without one.
+    """
+    (one,) = (other for other in posterior.datasets if other.name == name)
+    readings = {other.name: other.displacement for other in posterior.datasets}
+    first = int(one.readings.rows[0])
+    time = one.actuator.interval * np.maximum(np.arange(one.displacement.size) - first, 0)
+    step = TRIED * float(np.ptp(one.displacement[one.readings.rows]))
+
+    def without(size: float, decay: float) -> Posterior:
+        return posterior.with_readings(
+            readings | {name: one.displacement - size * np.exp(-time / decay)}
+        )
+
+    plain = posterior.log_density(coordinates)
+    best = -np.inf, 0.0, length, 0
+    for decay in length * np.array(DECAYS):
+        more, less = (
+            without(size, decay).log_density(coordinates) - plain for size in (step, -step)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bend = more + less
+            sizes = np.where(bend < 0, step * (less - more) / (2 * bend), 0.0)
+            top = plain - np.where(bend < 0, (more - less) ** 2 / (8 * bend), 0.0)
+        row = int(np.nanargmax(np.where(np.isfinite(top), top, -np.inf)))
+        best = max(best, (float(top[row]), float(sizes[row]), float(decay), row))
+    _, size, decay, row = best
+    # With heavy tails the parabola only leads there.
+    reached = without(size, decay).log_density(coordinates[row : row + 1])
+    return float(reached[0] - np.max(plain)), size, decay
+
+
+def _middle(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Median and half the width of the middle 68 % of draws (draws, parameters)."""
+    low, middle, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
+    return middle, (high - low) / 2
