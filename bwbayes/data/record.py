@@ -170,7 +170,8 @@ class Record:
         Warns
         -----
         InputWarning
-            If samples are missing in which a commanded voltage was held.
+            If a column is recognised by nothing but its unit, or samples are missing in which a
+            commanded voltage was held.
         """
         given = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in given.items() if name is not None}

@@ -104,6 +104,9 @@ def test_a_column_that_is_recognised_by_its_unit_alone_is_named(tmp_path: Path) 
     path.write_text(path.read_text().replace("pos", "displcement_nm").replace("U_mV", "u_mV"))
     with pytest.warns(InputWarning, match=r"taken by its unit: displacement is 'displcement_nm';"):
         assert_same(read_record(path))
+    frame = pd.DataFrame(VALUES).rename(columns={"pos": "displcement_nm"})
+    with pytest.warns(InputWarning, match=r"DataFrame: taken by its unit: displacement is"):
+        assert_same(Record.from_pandas(frame))
 
 
 def test_the_packages_own_names_come_before_others(tmp_path: Path) -> None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["COMMON_NAMES", "UNITS", "Naming", "by_unit", "missing", "recognised", "unit_in"]
+__all__ = ["COMMON_NAMES", "UNITS", "Naming", "missing", "recognised", "say_guesses", "unit_in"]
 
 # Powers of ten that lead from a column's unit to s, V and um. Both micro signs of Unicode count.
 _TIME = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
@@ -195,9 +196,13 @@ def recognised(names: Collection[str]) -> dict[str, str]:
     return guessed
 
 
-def by_unit(quantity: str, name: str) -> bool:
-    """Whether only the unit of a column's name says that it holds the quantity."""
-    return _word(name) not in WORDS[quantity]
+def say_guesses(where: str, given: Naming, used: Naming) -> None:
+    """Warn of columns that were recognised by nothing but their units."""
+    more = {q: name for q, name in used.columns.items() if q not in given.columns}
+    guesses = [f"{q} is {name!r}" for q, name in more.items() if _word(name) not in WORDS[q]]
+    if guesses:
+        remark = f"{where}: taken by its unit: {', '.join(guesses)}; if not, say `columns`"
+        warnings.warn(one_line(remark), InputWarning, stacklevel=3)
 
 
 def _word(name: str) -> str:

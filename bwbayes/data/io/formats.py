@@ -7,7 +7,6 @@ The noise-free displacement of a simulated record travels with it: in a second t
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,12 +21,12 @@ from bwbayes.data.io.checks import (
     checked_reference,
     require_voltage_is,
 )
-from bwbayes.data.io.columns import Naming, by_unit
+from bwbayes.data.io.columns import Naming, say_guesses
 from bwbayes.data.io.hdf5 import read_hdf5, write_hdf5
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.data.io.text import read_csv, write_csv
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.errors import InputError
 
 __all__ = ["SUFFIXES", "read_record", "read_reference", "read_table", "write_record"]
 
@@ -86,7 +85,7 @@ def read_record(
         require_voltage_is(voltage_is)
     naming = Naming(columns or {}, units or {})
     table = read_table(path, naming)
-    _say_guesses(path, naming, table.naming)
+    say_guesses(str(path), naming, table.naming)
     record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() in _TEXT and truth_path.exists():
@@ -170,15 +169,6 @@ def _opened[T](path: Path, read: Callable[[], T]) -> T:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
-
-
-def _say_guesses(path: Path, given: Naming, used: Naming) -> None:
-    """Say which columns were recognised by nothing but their units."""
-    more = {q: name for q, name in used.columns.items() if q not in given.columns}
-    guesses = [f"{q} is {name!r}" for q, name in more.items() if by_unit(q, name)]
-    if guesses:
-        remark = f"{path}: taken by its unit: {', '.join(guesses)}; if not, say `columns`"
-        warnings.warn(one_line(remark), InputWarning, stacklevel=3)
 
 
 def _truth_path(path: Path) -> Path:

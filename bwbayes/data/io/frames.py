@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.data.io.checks import Column, Table
-from bwbayes.data.io.columns import Naming
+from bwbayes.data.io.columns import Naming, say_guesses
 from bwbayes.errors import InputError
 
 __all__ = ["frame_table"]
@@ -26,15 +26,22 @@ def frame_table(frame: Any, naming: Naming, origin: str) -> Table:
     InputError
         A column that is not there, comes twice, has no unit or holds no numbers; ``origin`` names
         the table.
+
+    Warns
+    -----
+    InputWarning
+        If a column is recognised by nothing but its unit.
     """
     if frame.index.name is not None or frame.index.dtype.kind in _MOMENTS:
         frame = frame.reset_index()
     names = [str(name) for name in frame.columns]
     columns: dict[str, Column] = {}
+    given = _with_moments(frame, naming)
     try:
-        naming = _with_moments(frame, naming).completed(names)
+        naming = given.completed(names)
     except ValueError as error:
         raise InputError(f"{origin}: {error}") from None
+    say_guesses(origin, given, naming)
     for name, label in zip(names, frame.columns, strict=True):
         try:
             quantity, power, sign = naming.of(name)
