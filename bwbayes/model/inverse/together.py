@@ -31,9 +31,9 @@ MANY = 50
 # Doublings of the first reach, V at least, for the voltage at which a record starts.
 DOUBLINGS, SHORTEST = 30, 1e-9
 
-# Creep that grows with the voltage is made to agree with it in rounds: for so many models at a time,
-# which fit into the cache; in so many rounds at most; until the growth moves by no more than this,
-# after which one more round would hardly move the displacement by its rounding.
+# Creep that grows with the voltage is made to agree with it in rounds: of so many models at a time,
+# which fit into the cache; of at most so many; until the growth moves by no more than this, after
+# which one more round would hardly move the displacement by its rounding.
 PART, ROUNDS, AGREED = 64, 30, 1e-11
 
 # Rates of a relaxation, for each direction and sign of the voltage and sign of h.
