@@ -31,12 +31,12 @@ MANY = 50
 # Doublings of the first reach, V at least, for the voltage at which a record starts.
 DOUBLINGS, SHORTEST = 30, 1e-9
 
-# Models that are in the cache together; rounds at most in which creep that grows with the voltage
-# and the voltage are made to agree, and how far the growth moves in the last one: what that leaves
-# is less again by the part of the displacement that creeps, twice.
+# Creep that grows with the voltage is made to agree with it in rounds: of so many models at a time,
+# which fit into the cache; of at most so many; until the growth moves by no more than this, after
+# which one more round would hardly move the displacement by its rounding.
 PART, ROUNDS, AGREED = 64, 30, 1e-11
 
-# Rates of a relaxation.
+# Rates of a relaxation, for each direction and sign of the voltage and sign of h.
 RATES = 8
 
 

@@ -73,7 +73,7 @@ def plain(name: str, gain: PolynomialGain | None) -> tuple[Actuator, FloatArray]
 
 @pytest.mark.parametrize("gain", [None, cases.GAIN], ids=["no gain", "gain"])
 @pytest.mark.parametrize("name", KINDS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(turns=paths, from_rest=st.booleans())
 def test_along_any_path_as_alone(
     name: str, gain: PolynomialGain | None, turns: list[tuple[float, int]], from_rest: bool

@@ -20,7 +20,7 @@ from numba import njit
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.inverse.compiled.slopes import flattest
 
-__all__ = ["RATES", "relaxed"]
+__all__ = ["relaxed"]
 
 # Models side by side, and samples of theirs that are in the cache together.
 LANES, PIECE = 32, 64
