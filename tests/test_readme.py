@@ -315,6 +315,11 @@ def agreement() -> str:
     )
 
 
+def inverse() -> str:
+    ratios = measured()["inverse over simulation"].values()
+    return f"{min(ratios):.1f} to {max(ratios):.1f} times"
+
+
 def compensation() -> str:
     every = measured()["compensation"]
     bands, rms = (
@@ -350,6 +355,7 @@ FINDINGS = [
     forecasts,
     campaign,
     agreement,
+    inverse,
     compensation,
     specimens,
     populations,
