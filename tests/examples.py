@@ -59,6 +59,7 @@ SHORTER = {
     "--replicates 1000": "--replicates 2",
     "; maxwell-slip + quadratic": "; maxwell-slip(thresholds=2)",
     "ess = 4000": "ess = 400",
+    "--frequency 1 --frequency 10": "--frequency 10",
 }
 
 # So are what a command does by default, and its options: pictures are blank, models and simulated

@@ -216,7 +216,8 @@ def test_request_to_stop_ends_in_order(
     tmp_path: Path, asked: signal.Signals, everyone: bool, moment: Moment
 ) -> None:
     """Ctrl-C reaches all processes of a terminal, the workers too."""
-    (tmp_path / "small.toml").write_text(small.TEXT)
+    # Long enough that it has not ended by itself before it is asked to.
+    (tmp_path / "small.toml").write_text(small.TEXT.replace("ess = 200", "ess = 20000"))
     folder = tmp_path / "a"
     command = ("run", "small.toml", "--out", "a", "--quiet", "--workers", "2")
     with started(tmp_path, *command) as process:

@@ -33,6 +33,7 @@ from bwbayes.model.operators.walls import (
     CONVERGED,
     FIRST,
     GROW,
+    NOTCHES,
     ROUNDS,
     SAFE,
     SATURATED,
@@ -116,6 +117,8 @@ def _move(
     step = FIRST * (own[3] - own[2] * own[5])
     k = np.empty(STAGES)
     while True:
+        notch = math.floor(NOTCHES * math.log2(step / own[1]))
+        step = own[1] * 2.0 ** (min(notch, 0) / NOTCHES)
         last = step >= end - u
         h = end - u if last else step
         slope, drift, down = _slopes(spins, own, u, p)
