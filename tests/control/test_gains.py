@@ -72,7 +72,7 @@ def test_at_its_gain_margin_a_loop_has_a_pole_on_the_circle(name: str) -> None:
 
 
 @every_actuator
-@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize("delay", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 3))])
 def test_a_design_keeps_its_margins_and_is_the_fastest(name: str, delay: int) -> None:
     draws = models(name)
     required = Robustness(2.5, 50.0)

@@ -41,9 +41,9 @@ GROW, SHRINK, SAFE = 5.0, 0.2, 0.9
 # The first step of walls that begin to move, as a part of the voltage that they lag behind.
 FIRST = 0.1
 
-# Steps are the field's scale, or shorter by so many notches an octave: from saturation to saturation
-# a longer one could jump over the bend of the curve, and on a grid what is rounding in an estimated
-# error does not grow from step to step.
+# Steps are the field's scale, or shorter by so many notches an octave: a longer one could jump over
+# the bend of the curve, from saturation to saturation, and on a grid what is rounding in an
+# estimated error does not grow from step to step.
 NOTCHES = 4
 
 # Closer to saturation than this the field at which P_an reaches P_irr is not sharp; walls are
