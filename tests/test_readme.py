@@ -370,10 +370,11 @@ def test_the_quoted_findings_are_those_of_the_last_full_run(finding: Callable[[]
 
 def test_the_quoted_campaign_is_that_of_the_last_benchmark() -> None:
     one = measured()["benchmark of a campaign"]
+    assert one["refused"] == one["not converged"] == 0
     text = (
-        f"A thousand records of 300 samples took {1000 / one['records a minute']:.0f} minutes on "
-        f"two cores, {one['core s a record']:.1f} core seconds each, and "
-        f"{one['KiB a record'] / 1000:.0f} GB"
+        f"{one['records']:,} records of 300 samples took {one['core s a record']:.1f} core seconds "
+        f"and {one['KiB a record'] / 1024:.0f} MB each, and {one['s to combine them'] / 60:.0f} "
+        "minute to put together"
     )
     assert text in " ".join(README.split())
 
