@@ -159,10 +159,10 @@ def added(
     plain = posterior.log_density(coordinates)
     best = -np.inf, 0.0, length, 0
     for decay in length * np.array(DECAYS):
-        more, less = (
-            without(size, decay).log_density(coordinates) - plain for size in (step, -step)
-        )
+        both = [without(size, decay).log_density(coordinates) for size in (step, -step)]
+        # Places that are not possible have no density with a transient either.
         with np.errstate(divide="ignore", invalid="ignore"):
+            more, less = both[0] - plain, both[1] - plain
             bend = more + less
             sizes = np.where(bend < 0, step * (less - more) / (2 * bend), 0.0)
             top = plain - np.where(bend < 0, (more - less) ** 2 / (8 * bend), 0.0)

@@ -104,3 +104,14 @@ def test_a_drift_all_along_is_no_bad_start() -> None:
         verdict = judged(bands_of(record, extra - np.mean(extra), training=True), PUSHED)
         assert verdict.cause is not None
         assert kind == verdict.cause.kind
+
+
+def test_places_that_are_not_possible_do_no_harm() -> None:
+    """Warnings are errors here, and the answer is that of the possible ones."""
+    posterior = fitted(1, 8.0)
+    one = posterior.prior.unconstrain(drawn(posterior)[:1])
+    nowhere = np.full_like(one, np.inf)
+    assert posterior.log_density(nowhere)[0] == -np.inf
+    expected = added(posterior, posterior.only.name, one, 2.4)
+    both = np.concatenate([one, nowhere])
+    assert added(posterior, posterior.only.name, both, 2.4) == expected
