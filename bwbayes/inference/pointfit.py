@@ -11,17 +11,20 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg, optimize, special
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["PointFit", "fit"]
+__all__ = ["PointFit", "fit", "peaks"]
 
 # Prior draws that are tried, and the best of them that least squares starts from.
 DRAWS = 128
 STARTS = 8
+
+# Rounds of draws of the noise parameters, and the best that the next round is drawn around.
+ROUNDS, BEST = 4, 8
 
 # Residuals that least squares looks at: more would not move an optimum it is only to find.
 RESIDUALS = 1000
@@ -68,7 +71,7 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
     valleys = _valleys(least_squares, [least_squares.optimum(start) for start in starts])
     noise = draws[:DRAWS, ~least_squares.physical]
-    places = [_with_noise(posterior, valley, noise) for valley in valleys]
+    places = [_with_noise(posterior, valley, noise, generator) for valley in valleys]
     # Least squares knows no constraints: a reversed record's optimum may be an impossible place.
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
@@ -81,12 +84,44 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     return PointFit(best.place, best.covariance, best.log_density, optima, spread)
 
 
-def _with_noise(posterior: Posterior, place: FloatArray, noise: FloatArray) -> FloatArray:
-    """Give a place (free,) the most probable of some noise parameters (draws, noise)."""
-    physical = place[: place.size - noise.shape[1]]
-    places = np.hstack([np.tile(physical, (len(noise), 1)), noise])
-    best: FloatArray = places[int(np.argmax(posterior.log_density(places)))]
-    return best
+def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
+    """Return covariances (modes, free, free) at a point fit's optima, and their shares (modes,).
+
+    A mode's share of the posterior is guessed from its height and width (Laplace's approximation).
+    """
+    if len(point.optima) == 1:
+        return point.covariance[np.newaxis], np.ones(1)
+    modes = [_mode(posterior, place, point.prior_covariance) for place in point.optima]
+    covariances = np.stack([mode.covariance for mode in modes])
+    log_evidence = np.array([mode.log_density for mode in modes])
+    log_evidence += np.linalg.slogdet(covariances)[1] / 2
+    return covariances, special.softmax(log_evidence)
+
+
+def _with_noise(
+    posterior: Posterior, place: FloatArray, noise: FloatArray, generator: np.random.Generator
+) -> FloatArray:
+    """Give a place (free,) the most probable noise parameters, from prior draws (draws, noise).
+
+    The best draw alone may lie next to a lesser mode, such as the one where all is the sensor's
+    noise: so draws around the best few are tried, closer and closer.
+    """
+    size = noise.shape[1]
+    physical = np.tile(place[: place.size - size], (len(noise), 1))
+    best = np.empty((0, place.size))
+    density = np.empty(0)
+    for _ in range(ROUNDS):
+        best = np.concatenate([best, np.hstack([physical, noise])])
+        density = np.concatenate([density, posterior.log_density(best[-len(noise) :])])
+        order = np.argsort(-density, kind="stable")[:BEST]
+        best, density = best[order], density[order]
+        if not size:
+            break
+        few = best[:, -size:]
+        chosen = few[generator.integers(BEST, size=len(noise))]
+        noise = chosen + np.std(few, axis=0) * generator.standard_normal(noise.shape)
+    most: FloatArray = best[0]
+    return most
 
 
 def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:

@@ -22,6 +22,9 @@ __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 CUTS = (0.5, 0.85)
 COMPONENTS = len(CUTS) + 1
 
+# Part of a first guess that goes to all components alike.
+LEAST_GUESS = 0.25
+
 # Rounds of the fit: first with so few of the draws that they cost little, then with all.
 ROUGH_ROUNDS = 25
 ROUGH_DRAWS = 1024
@@ -163,17 +166,23 @@ class StudentMixture:
         return mixture
 
     @classmethod
-    def around(cls, optima: FloatArray, covariance: FloatArray) -> StudentMixture:
-        """Take the places (modes, free) of a posterior's modes and the covariance of the best.
+    def around(
+        cls, optima: FloatArray, covariances: FloatArray, shares: FloatArray
+    ) -> StudentMixture:
+        """Take modes' places (modes, free), covariances (modes, free, free) and shares (modes,).
 
-        The first three modes; of fewer, the same ones again, twice and three times as wide.
+        The first three modes; of fewer, the same ones again, twice and three times as wide. No
+        component gets less than a twelfth: the shares of modes are a guess.
         """
-        factor = np.linalg.cholesky(covariance)
-        modes = len(optima)
+        modes = np.arange(COMPONENTS) % len(optima)
+        factors = np.linalg.cholesky(covariances)
         parts = (
-            StudentProposal(optima[i % modes], (1 + i // modes) * factor) for i in range(COMPONENTS)
+            StudentProposal(optima[mode], (1 + i // len(optima)) * factors[mode])
+            for i, mode in enumerate(modes)
         )
-        return cls(np.full(COMPONENTS, 1 / COMPONENTS), tuple(parts))
+        each = shares[modes] / np.bincount(modes)[modes]
+        weights = (1 - LEAST_GUESS) * each / np.sum(each) + LEAST_GUESS / COMPONENTS
+        return cls(weights, tuple(parts))
 
     @cached_property
     def _ends(self) -> FloatArray:

@@ -33,7 +33,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.pointfit import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain, Phase, thinning
 from bwbayes.sampling.diagnostics import (
@@ -171,7 +171,7 @@ def first_chain(
         )
     seeds = generator.spawn(plan.ensembles)
     chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
-    chain.freeze("pilot", StudentMixture.around(point.optima, point.covariance))
+    chain.freeze("pilot", StudentMixture.around(point.optima, *peaks(posterior, point)))
     return chain
 
 

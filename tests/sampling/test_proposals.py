@@ -193,15 +193,21 @@ def test_a_fitted_mixture_has_the_mean_and_covariance_of_the_draws(name: str) ->
     np.testing.assert_allclose(whole, within + between, rtol=1e-3, atol=1e-3)
 
 
-def test_a_mixture_around_modes_has_their_places_and_widths() -> None:
-    """The first three modes, or fewer, and these once more twice as wide."""
-    covariance = np.array([[2.0, 0.3], [0.3, 0.5]])
-    optima = np.arange(8.0).reshape(4, 2)
-    for modes, places, widths in ((4, [0, 1, 2], [1, 1, 1]), (2, [0, 1, 0], [1, 1, 2])):
-        mixture = StudentMixture.around(optima[:modes], covariance)
+def test_a_mixture_around_modes_has_their_places_widths_and_shares() -> None:
+    """The first three modes, or fewer, and these once more twice as wide, with half of a share."""
+    one = np.array([[2.0, 0.3], [0.3, 0.5]])
+    covariances = np.stack([one, 4 * one, 9 * one, 16 * one])
+    optima, shares = np.arange(8.0).reshape(4, 2), np.array([0.6, 0.2, 0.2, 0.0])
+    for modes, places, widths, weights in (
+        (4, [0, 1, 2], [1, 1, 1], [0.6, 0.2, 0.2]),
+        (2, [0, 1, 0], [1, 1, 2], [0.375, 0.25, 0.375]),
+    ):
+        mixture = StudentMixture.around(optima[:modes], covariances[:modes], shares[:modes])
+        np.testing.assert_allclose(0.75 * np.array(weights) + 0.25 / 3, mixture.weights)
         for part, place, width in zip(mixture.components, places, widths, strict=True):
             np.testing.assert_array_equal(optima[place], part.centre)
-            np.testing.assert_allclose(width**2 * covariance, part.factor @ part.factor.T)
+            expected = width**2 * covariances[place]
+            np.testing.assert_allclose(expected, part.factor @ part.factor.T)
 
 
 @pytest.mark.parametrize("kind", [StudentProposal, StudentMixture])

@@ -83,7 +83,7 @@ def test_a_proposal_is_fitted_to_the_phase_before(
 
 
 def test_the_pilots_proposal_is_the_point_fits_own_guess(finished: tuple[Chain, Outcome]) -> None:
-    guess = StudentMixture.around(POINT.optima, POINT.covariance)
+    guess = StudentMixture.around(POINT.optima, POINT.covariance[np.newaxis], np.ones(1))
     assert_same_proposal(guess, finished[0].proposals["pilot"])
 
 
