@@ -23,12 +23,15 @@ from bwbayes.inference.readings import Readings
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
 
-__all__ = ["Likelihood", "LinearStart", "Moments", "batches"]
+__all__ = ["Likelihood", "LinearStart", "Moments", "Score", "batches"]
 
 # Models simulated together: enough to share the loop over turns, few enough for the memory.
 BATCH = 64
 ELEMENTS = 1 << 23
 CACHED = 1 << 16
+
+# Beside numbers as large as this a one is next to lost to rounding.
+LOST = 1e12
 
 # What is below exp(-50) of its size adds nothing.
 FORGOTTEN = 50.0
@@ -64,6 +67,36 @@ class LinearStart(NamedTuple):
     squares: FloatArray
     mean: FloatArray
     covariance: FloatArray
+
+
+class Score(NamedTuple):
+    """What shapes in the readings would explain, beside an unknown start.
+
+    ``pull`` u (models, shapes) is the log density's slope in their sizes, where these are zero, and
+    ``information`` I (models, shapes, shapes) its bend.
+    """
+
+    pull: FloatArray
+    information: FloatArray
+
+    @property
+    def together(self) -> FloatArray:
+        """uᵀ I⁻¹ u (models,): χ² with a degree of freedom a shape, if the model is right."""
+        pull = self.pull[:, :, np.newaxis]
+        squares: FloatArray = np.sum(pull * np.linalg.solve(self.information, pull), axis=(1, 2))
+        return squares
+
+    @property
+    def sizes(self) -> FloatArray:
+        """The best size of each shape, if it is the only one, (models, shapes)."""
+        sizes: FloatArray = self.pull / np.einsum("mii->mi", self.information)
+        return sizes
+
+    @property
+    def nats(self) -> FloatArray:
+        """What each shape alone adds to the log density at its best size, (models, shapes)."""
+        nats: FloatArray = self.pull * self.sizes / 2
+        return nats
 
 
 @dataclass(frozen=True)
@@ -147,16 +180,14 @@ class Likelihood:
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         return LinearStart(density, squares, sd * mean, covariance)
 
-    def taken(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
-        """Squares (models,) that shapes (shapes, readings) in the readings would take away.
+    def score(self, theta: FloatArray, shapes: FloatArray) -> Score:
+        """Say what shapes (shapes, readings) in the readings, um, would explain at θ.
 
-        With the whitened shapes S, and as in :meth:`start`, U = Sᵀ (z₀ − Z μ):
+        With the whitened shapes S, and as in :meth:`start`:
 
-            taken = Uᵀ (Sᵀ S − Sᵀ Z C Zᵀ S)⁻¹ U
-
-        has a χ² distribution with a degree of freedom for each shape, if the model is right.
+            u = Sᵀ (z₀ − Z μ),   I = Sᵀ S − Sᵀ Z C Zᵀ S.
         """
-        parts = []
+        pulls, informations = [], []
         for piece in batches(len(theta), self.readings.rows.size, CACHED):
             series = self._whitened(theta[piece], shapes)
             products = np.einsum("mit,mjt->mij", series, series)
@@ -164,12 +195,12 @@ class Likelihood:
             first = 1 + sd.shape[1]
             prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
             precision = np.eye(sd.shape[1]) + prior * products[:, 1:first, 1:first]
-            covariance = np.linalg.inv(precision) * prior
-            pulls, rest = products[:, 1:first], products[:, first:]
-            left = rest - np.einsum("mui,muv,mvj->mij", pulls[:, :, first:], covariance, pulls)
-            score, information = left[:, :, :1], left[:, :, first:]
-            parts.append(np.sum(score * np.linalg.solve(information, score), axis=(1, 2)))
-        return np.concatenate(parts)
+            covariance = _inverse(precision)[0] * prior
+            others, rest = products[:, 1:first], products[:, first:]
+            left = rest - np.einsum("mui,muv,mvj->mij", others[:, :, first:], covariance, others)
+            pulls.append(left[:, :, 0])
+            informations.append(left[:, :, first:])
+        return Score(np.concatenate(pulls), np.concatenate(informations))
 
     def _whitened(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
         """Whiten residual, unknowns' responses and shapes: (models, series, readings)."""
@@ -278,11 +309,22 @@ class Likelihood:
 
 
 def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Invert (models, size, size), and give the logarithms of the determinants (models,)."""
+    """Invert 1 + S (models, size, size), S not negative; logarithms of the determinants too."""
     if matrices.shape[1] == 1:
         # Which is most records: the library would take longer over it than over all the readings.
         return 1 / matrices, np.log(matrices[:, 0, 0])
-    return np.linalg.inv(matrices), np.linalg.slogdet(matrices)[1]
+    lost = np.max(matrices, axis=(1, 2), initial=0.0) > LOST
+    if not lost.any():
+        return np.linalg.inv(matrices), np.linalg.slogdet(matrices)[1]
+    # Eigenvalues that are rounding beside the largest are taken for the one that was lost.
+    inverse, log_determinant = np.empty_like(matrices), np.empty(len(matrices))
+    inverse[~lost], log_determinant[~lost] = _inverse(matrices[~lost])
+    values, vectors = np.linalg.eigh(matrices[lost])
+    least = 4 * matrices.shape[1] * np.finfo(float).eps * values[:, -1:]
+    values = np.where(values < np.maximum(least, 1.0), 1.0, values)
+    inverse[lost] = (vectors / values[:, np.newaxis]) @ np.swapaxes(vectors, 1, 2)
+    log_determinant[lost] = np.sum(np.log(values), axis=1)
+    return inverse, log_determinant
 
 
 def _products(series: list[FloatArray], heard: int) -> FloatArray:

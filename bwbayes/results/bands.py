@@ -14,7 +14,7 @@ from typing import Literal
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn"]
+__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "Switched"]
 
 Kind = Literal["parameter", "displacement", "sensor"]
 KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
@@ -24,17 +24,31 @@ LEVELS = (50, 90, 95)
 
 
 @dataclass(frozen=True)
+class Switched:
+    """A transient A exp(−t/τ) at the start of a record, of which a lead-in alone may not tell.
+
+    ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density of all readings.
+    """
+
+    size: float
+    decay: float
+    nats: float
+
+
+@dataclass(frozen=True)
 class LeadIn:
     """The stretch that told a record's start, and how well it fits.
 
     It goes from ``start`` to ``stop`` in s and holds ``samples`` readings; ``p_value`` is that of
-    a test of its innovations, small where the model cannot have made them.
+    a test of its innovations, small where the model cannot have made them. ``transient`` is the one
+    that explains this stretch, and what comes after it, best.
     """
 
     start: float
     stop: float
     samples: int
     p_value: float
+    transient: Switched | None = None
 
 
 @dataclass(frozen=True)

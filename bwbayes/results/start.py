@@ -31,6 +31,7 @@ from bwbayes.model.operator import Span, narrower
 from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
+from bwbayes.results.transient import switched
 
 if TYPE_CHECKING:
     from bwbayes.inference.compiled.walk import Walk
@@ -202,8 +203,9 @@ def started(
     record: Record,
     start: Start,
     generator: np.random.Generator,
+    stop: int | None = None,
 ) -> Started:
-    """Give every draw θ (draws, parameters) a start of another record.
+    """Give every draw θ (draws, parameters) a start of another record, judged up to a sample.
 
     Raises
     ------
@@ -224,7 +226,7 @@ def started(
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
     histories, begun = chosen(likelihoods, theta, generator)
-    told = _informed(histories, begun, record, window, generator)
+    told = _informed(histories, begun, record, window, stop, generator)
     return going_on(told, likelihoods[0], theta, generator) if start.after else told
 
 
@@ -330,6 +332,7 @@ def _informed(
     theta: FloatArray,
     record: Record,
     window: slice,
+    stop: int | None,
     generator: np.random.Generator,
 ) -> Started:
     """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
@@ -352,6 +355,7 @@ def _informed(
         float(record.time[window.stop]),
         likelihood.readings.rows.size,
         _p_value(histories, theta, posterior.squares),
+        switched(histories, theta, record, slice(window.start, stop)),
     )
     model = likelihood.table.actuator(begun)
     actuators = tuple(one.actuator for one in histories.likelihoods)
@@ -373,7 +377,7 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
         place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
         shapes = np.polynomial.legendre.legvander(place, SLOW).T[1:]
         tested = replace(histories, which=histories.which[some])
-        (taken,) = tested.each(theta[some], lambda one, few: (one.taken(few, shapes),))
+        (taken,) = tested.each(theta[some], lambda one, few: (one.score(few, shapes).together,))
         slow = stats.chi2.sf(taken, SLOW)
         p = np.minimum(2 * np.minimum(p[some], slow), 1.0)
     return float(np.mean(p))

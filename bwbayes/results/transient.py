@@ -5,20 +5,29 @@ everywhere, so that neither bands nor innovations show it. So the same record is
 transient taken off its readings, A exp(−t/τ) from the first of them on: where parameters that fit
 the rest of the record, with a transient at its start, are far more probable than any without one,
 the fit belongs to the start.
+
+Of another record a transient may go into its offset: in the lead-in it looks like one. There too
+the readings are asked, those after the lead-in included.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
+from bwbayes.inference.likelihood import Likelihood, Score
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.readings import Readings
+from bwbayes.results.bands import Switched
+from bwbayes.results.histories import Histories, States
+from bwbayes.results.moved import Moved, moved
 
-__all__ = ["DECAYS", "Transient", "added", "swallowed"]
+__all__ = ["DECAYS", "LONGEST", "Transient", "added", "swallowed", "switched"]
 
 # Part of the readings that is left out to see what the rest says, and the time constants that are
 # tried, as parts of how long that is.
@@ -45,23 +54,33 @@ TRIED = 0.05
 # Fewer readings than this tell too little without their first part.
 FEWEST = 200
 
+# Of another record: draws that are asked, hysteretic states that each tries, and the samples that
+# matter, for a start is soon over.
+ASKED, STATES, LONGEST = 25, 9, 20_000
+
 
 @dataclass(frozen=True)
 class Transient:
     """A transient at a record's start, and the parameter that moves most without the start.
 
     ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density. ``until`` in s is where
-    the start ends; ``whole`` and ``rest`` are mean and sd of the parameter with it and without it.
+    the start ends.
     """
 
     size: float
     decay: float
     nats: float
-    name: str
-    unit: str
     until: float
-    whole: tuple[float, float]
-    rest: tuple[float, float]
+    parameter: Moved
+
+    @property
+    def line(self) -> str:
+        """What it is, and what it has done, in one line."""
+        return (
+            f"a transient of {self.size:.3g} um that decays within {self.decay:.2g} s explains its "
+            f"start better, by {self.nats:.3g} nats; "
+            f"without the start, up to {self.until:.4g} s, {self.parameter.line}"
+        )
 
 
 def swallowed(
@@ -111,31 +130,10 @@ def swallowed(
     nats, size, decay = added(posterior, name, np.concatenate([without, sampled]), length)
     if nats <= MOVED_ADDED:
         return None
-    free, density = posterior.prior.constrain(without)
-    free = free[np.isfinite(density)]
-    physical = [
-        i
-        for i, p in enumerate(posterior.prior.free)
-        if p.plain in one.actuator.parameters and p.plain not in one.table.of_scope("record")
-    ]
-    if not physical or len(free) < DRAWS // 4:
+    most = moved(posterior, one, draws, without)
+    if most is None or (most.sds <= MOVED and nats <= (SEEN_ADDED if seen else ADDED)):
         return None
-    (mean, sd), (other, its_sd) = (_middle(some[:, physical]) for some in (draws, free))
-    moved = np.abs(other - mean) / np.sqrt(sd**2 + its_sd**2 + np.finfo(float).tiny)
-    most = int(np.argmax(moved))
-    if moved[most] <= MOVED and nats <= (SEEN_ADDED if seen else ADDED):
-        return None
-    parameter = posterior.prior.free[physical[most]]
-    return Transient(
-        size,
-        decay,
-        nats,
-        parameter.name,
-        parameter.unit,
-        begin + one.actuator.interval * first,
-        (float(mean[most]), float(sd[most])),
-        (float(other[most]), float(its_sd[most])),
-    )
+    return Transient(size, decay, nats, begin + one.actuator.interval * first, most)
 
 
 def added(
@@ -174,7 +172,50 @@ def added(
     return float(reached[0] - np.max(plain)), size, decay
 
 
-def _middle(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Median and half the width of the middle 68 % of draws (draws, parameters)."""
-    low, middle, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
-    return middle, (high - low) / 2
+def switched(
+    histories: Histories, theta: FloatArray, record: Record, window: slice
+) -> Switched | None:
+    """Return the transient at another record's start that adds most to the log density.
+
+    The state of the hysteresis is not known either, and goes with the transient: a drive forgets
+    another state as a sensor forgets a transient.
+
+    Parameters
+    ----------
+    histories
+        The likelihoods of the lead-in.
+    theta
+        (draws, parameters).
+    record, window
+        The record, with readings, and what is asked of it, from the lead-in's first sample on.
+    """
+    assert record.displacement is not None
+    first, stop, _ = window.indices(record.samples)
+    readings = Readings.of(record.displacement, [slice(first, min(stop, first + LONGEST))])
+    rows = readings.rows
+    if rows.size < FEWEST:
+        return None
+    some = slice(None, None, -(-len(theta) // ASKED))
+    likelihoods = tuple(replace(one, readings=readings) for one in histories.likelihoods)
+    asked = Histories(likelihoods, histories.which[some])
+    time = record.interval * (rows - rows[0])
+    decays = time[round(PART * rows.size)] * np.array(DECAYS)
+    shapes = np.exp(-time / decays[:, np.newaxis])
+
+    def ask(one: Likelihood, few: FloatArray) -> tuple[FloatArray, ...]:
+        states = States(one, few, alone=len(likelihoods) == 1)
+        begun = [states.at(np.full(len(few), part)) for part in np.linspace(0, 1, STATES)]
+        scores = [one.score(each, shapes) for each in begun]
+        density = np.stack([one.log_density(each) for each in begun], axis=1)
+        nats, sizes = (np.stack(both, axis=1) for both in zip(*map(_alone, scores), strict=True))
+        return density, density[:, :, np.newaxis] + nats, sizes
+
+    without, with_one, sizes = asked.each(theta[some], ask)
+    best = np.unravel_index(int(np.argmax(with_one)), with_one.shape)
+    nats = float(with_one[best] - np.max(without))
+    return Switched(float(sizes[best]), float(decays[best[-1]]), nats)
+
+
+def _alone(score: Score) -> tuple[FloatArray, FloatArray]:
+    """Return what each shape alone adds at its best size, and that size."""
+    return score.nats, score.sizes

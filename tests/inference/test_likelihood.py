@@ -15,7 +15,7 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.likelihood import Likelihood, _inverse
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold, first_order_lag, second_order
@@ -133,7 +133,9 @@ def test_a_shape_takes_what_an_unknown_of_that_shape_would(
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 6))
     expected = without.start(theta).squares - free.start(theta).squares
     constant = np.ones((1, without.readings.rows.size))
-    np.testing.assert_allclose(expected, without.taken(theta, constant), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        expected, without.score(theta, constant).together, rtol=1e-4, atol=1e-4
+    )
 
 
 def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
@@ -144,7 +146,9 @@ def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
     others = np.array([[2.0, 0.0, 1.0], [0.0, -1.0, 1.0], [1.0, 1.0, 1.0]]) @ shapes
     likelihood = replace(posterior.likelihood, offset_sd=3.0)
     np.testing.assert_allclose(
-        likelihood.taken(theta, shapes), likelihood.taken(theta, others), rtol=1e-6
+        likelihood.score(theta, shapes).together,
+        likelihood.score(theta, others).together,
+        rtol=1e-6,
     )
 
 
@@ -254,3 +258,17 @@ def test_free_responses_are_those_of_the_differential_equation(dynamics: str) ->
     expected = [fade * (np.cos(ringing * time) + loss * sine), natural * fade * sine]
     np.testing.assert_allclose(recursion.free_responses(50)[0], expected, atol=1e-11)
     assert recursion.remembered[0] == pytest.approx(np.exp(-loss * INTERVAL))
+
+
+@pytest.mark.parametrize(("size", "error"), [(1e3, 1e-6), (1e7, 0.02), (1e12, 1e-6)])
+def test_unknowns_that_look_alike_are_integrated_out_however_little_is_known(
+    size: float, error: float
+) -> None:
+    """(1 + v vᵀ)⁻¹ = 1 - v vᵀ / (1 + |v|²); with a v of 1e7 and more the one is rounded away."""
+    v = size * np.array([[1.0, 1.0, 0.5], [1.0, -1.0, 0.5]])
+    squares = 1 + np.sum(v**2, axis=1)
+    products = v[:, :, np.newaxis] * v[:, np.newaxis, :]
+    inverse, log_determinant = _inverse(np.eye(3) + products)
+    np.testing.assert_allclose(np.log(squares), log_determinant, atol=error)
+    expected = np.eye(3) - products / squares[:, np.newaxis, np.newaxis]
+    np.testing.assert_allclose(expected, inverse, atol=error)

@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.predictions import Followed
 from bwbayes.app.running.run import assemble, judged, versions
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
@@ -26,12 +27,13 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
+from bwbayes.results.drift import drifted
 from bwbayes.results.innovations import innovations
 from bwbayes.results.prediction import predict_record, predict_windows
 from bwbayes.results.result import Result
 from bwbayes.results.transient import swallowed
 from bwbayes.results.verdict import Background, Verdict
-from bwbayes.sampling.proposals import StudentMixture, StudentProposal
+from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
@@ -129,8 +131,7 @@ def weighted_draws(
     """Fit, and return draws (draws, free) in the parameters' own units and weights (draws,)."""
     point = pointfit.fit(posterior, source)
     random = np.random.RandomState(source.bit_generator)
-    proposal: StudentProposal | StudentMixture
-    proposal = StudentProposal(point.mode, np.linalg.cholesky(point.covariance))
+    proposal = StudentMixture.around(point.optima, *pointfit.peaks(posterior, point))
     for _ in range(ROUNDS):
         places, ratio = _tried(posterior, proposal, random, PILOT)
         if not np.isfinite(ratio).any():
@@ -155,7 +156,7 @@ def weighted_draws(
 
 def _tried(
     posterior: Posterior,
-    proposal: StudentProposal | StudentMixture,
+    proposal: StudentMixture,
     random: np.random.RandomState,
     count: int,
 ) -> tuple[FloatArray, FloatArray]:
@@ -186,8 +187,10 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     odd = innovations(posterior, best, record.start)
     seen = any(one.kind == "switch-on transient" for one in problem.findings["record"])
     transient = swallowed(posterior, draws, source, record.start, seen=seen) if again else None
+    drift = drifted(posterior, draws, source) if again else None
+    background = Background.of(posterior, draws)
     verdicts = judged(
-        problem, bands, Background.of(posterior, draws), {"record": odd}, {"record": transient}
+        problem, bands, background, {"record": odd}, {"record": Followed(transient, drift)}
     )
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 

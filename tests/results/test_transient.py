@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,13 +11,16 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.bands import Bands
+from bwbayes.results.bands import Bands, LeadIn, Switched
+from bwbayes.results.moved import Moved
+from bwbayes.results.prediction import Start, predict_record
 from bwbayes.results.transient import DECAYS, Transient, added, swallowed
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.inference import problems
 from tests.results.records import bands_of, made
+from tests.results.runs import Stand
 
-PUSHED = Transient(24.0, 0.6, 31.2, "d", "um/V", 2.4, (0.91, 0.013), (0.699, 0.002))
+PUSHED = Transient(24.0, 0.6, 31.2, 2.4, Moved("d", "um/V", (0.91, 0.013), (0.699, 0.002), 16.0))
 
 
 def fitted(seed: int, transient: float = 0.0) -> Posterior:
@@ -72,6 +77,32 @@ def test_what_a_transient_adds_is_the_largest_of_all_sizes() -> None:
     assert plainly(size, decay) - plainly(0.0, 1.0) == pytest.approx(nats, abs=1e-6)
 
 
+def another(transient: float, seed: int) -> Switched:
+    """Predict another record, cut from a running drive, with a transient of so many sds."""
+    posterior = fitted(1)
+    record = Stand(lag=0.0, rate=50.0).measure(
+        90 * np.sin(2 * np.pi * 0.02 * np.arange(700)), np.random.default_rng(seed), cut=115
+    )
+    assert record.displacement is not None
+    faded = transient * np.exp(-0.02 * np.arange(record.samples) / 0.6)
+    record = replace(record, displacement=record.displacement + faded)
+    bands = predict_record(
+        posterior, drawn(posterior), record, Start(lead_in=1.0), np.random.default_rng(3)
+    )
+    assert bands.lead_in is not None
+    assert bands.lead_in.transient is not None
+    return bands.lead_in.transient
+
+
+def test_a_transient_of_another_record_is_told_by_all_its_readings() -> None:
+    for seed in range(3):
+        assert another(0.0, seed).nats < 4
+        told = another(15.0, seed)
+        assert told.nats > 20
+        assert told.size == pytest.approx(15.0, abs=4.0)
+        assert told.decay == pytest.approx(0.6, rel=0.2)
+
+
 def test_few_readings_tell_nothing() -> None:
     posterior = problems.short_posterior(samples=150)
     assert swallowed(posterior, drawn(posterior), np.random.default_rng(2)) is None
@@ -90,11 +121,28 @@ def test_a_fit_that_hangs_on_its_start_does_not_hold() -> None:
     assert verdict.holds is False
     assert verdict.reasons == (
         "a transient of 24 um that decays within 0.6 s explains its start better, by 31.2 nats; "
-        "without the readings before 2.4 s d is 0.699 +- 0.002 um/V, with them 0.91 +- 0.013",
+        "without the start, up to 2.4 s, d is 0.699 +- 0.002 um/V, with it 0.91 +- 0.013",
     )
     assert verdict.cause is not None
     assert "start" == verdict.cause.kind
     assert "exclude = [[0, 2.4]] in [record]" in verdict.cause.remedy
+
+
+def test_a_transient_of_another_record_is_said_where_it_is_large() -> None:
+    """Larger than three sds of the band, 1.05 um, and beyond chance."""
+    bands = replace(bands_of(made(np.random.default_rng(1), length=30)), scored_from=100)
+    for size, nats, holds in ((15.0, 9.0, False), (2.0, 9.0, True), (15.0, 4.0, True)):
+        lead = LeadIn(0.0, 1.0, 100, 0.5, Switched(size, 0.4, nats))
+        verdict = judged(replace(bands, lead_in=lead), None)
+        assert verdict.holds is holds
+    lead = LeadIn(0.0, 1.0, 100, 0.5, Switched(15.0, 0.4, 9.0))
+    verdict = judged(replace(bands, lead_in=lead), None)
+    assert verdict.reasons == (
+        "a transient of 15 um that decays within 0.4 s from 0 s on explains the readings better, "
+        "by 9 nats",
+    )
+    assert verdict.cause is not None
+    assert "lead-in" == verdict.cause.kind
 
 
 def test_a_drift_all_along_is_no_bad_start() -> None:

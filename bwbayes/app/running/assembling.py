@@ -10,9 +10,10 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.drawing import Beside
 from bwbayes.app.running.facts import facts_of, stepped
 from bwbayes.app.running.fingerprint import version_remarks, versions
-from bwbayes.app.running.predictions import judged, predictions, scoring
+from bwbayes.app.running.predictions import Followed, judged, predictions, scoring
 from bwbayes.inference import conflict
 from bwbayes.results import agreement, identifiability, innovations
+from bwbayes.results.drift import drifted
 from bwbayes.results.learned import learned
 from bwbayes.results.loops import measure_loops
 from bwbayes.results.prediction import thinned
@@ -73,17 +74,20 @@ def assemble(
         name: innovations.innovations(alone, one[0], problem.records[name].start)
         for name, alone, one in posterior.each(best[np.newaxis])
     }
-    # By a second point fit, without a record's start.
+    # By further point fits, without a record's start, and without its drift.
     source = generator(problem.config.seed, "without start")
     some = thinned(flat, source)
-    transients = {
-        name: swallowed(
-            posterior,
-            some,
-            source,
-            record.start,
-            record=name,
-            seen=any(one.kind == "switch-on transient" for one in problem.findings[name]),
+    followed = {
+        name: Followed(
+            swallowed(
+                posterior,
+                some,
+                source,
+                record.start,
+                record=name,
+                seen=any(one.kind == "switch-on transient" for one in problem.findings[name]),
+            ),
+            drifted(posterior, some, source, record=name),
         )
         for name, record in problem.records.items()
     }
@@ -97,7 +101,7 @@ def assemble(
         for name, one in series.items()
         for remark in innovations.remarks(one)
     ]
-    verdicts = judged(problem, bands, Background.of(posterior, flat), series, transients)
+    verdicts = judged(problem, bands, Background.of(posterior, flat), series, followed)
     return replace(
         result,
         bands=bands,

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from html import escape
 from io import StringIO
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +27,7 @@ from bwbayes.results import innovations
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
+from bwbayes.results.drift import Drift
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import (
@@ -44,7 +45,7 @@ from bwbayes.results.verdict import Background, Verdict, assess
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Prediction", "judged", "predict_another", "predictions", "scoring"]
+__all__ = ["Followed", "Prediction", "judged", "predict_another", "predictions", "scoring"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -245,27 +246,35 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
     return tuple(bands)
 
 
+class Followed(NamedTuple):
+    """What a fit has followed that the actuator did not do, if anything."""
+
+    transient: Transient | None
+    drift: Drift | None
+
+
 def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
     series: Mapping[str, Innovations],
-    transients: Mapping[str, Transient | None],
+    followed: Mapping[str, Followed],
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name.
 
-    ``series`` and ``transients`` are by the name of the training record.
+    ``series`` and ``followed`` are by the name of the training record.
     """
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for one in bands:
         far = beyond_training(problem.posterior, one.voltage, one.interval)
         record = records.get(one.name) if one.training else None
-        start, transient = None, None
+        start, transient, drift = None, None, None
         # Of several training windows the first one holds the start.
         if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
-            start, transient = innovations.odd_start(series[record]), transients[record]
-        verdict = assess(one, background, start=start, transient=transient, beyond=far)
+            start = innovations.odd_start(series[record])
+            transient, drift = followed[record]
+        verdict = assess(one, background, start=start, transient=transient, drift=drift, beyond=far)
         if verdict is not None:
             verdicts[one.name] = verdict
     return verdicts

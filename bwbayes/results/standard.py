@@ -1,0 +1,94 @@
+"""Residuals against their bands, and how many independent readings they are worth.
+
+What luck alone may do to a mean of many readings depends on how many independent ones they are
+worth, and that is far fewer than there are: a discrepancy forgets slowly, and the parameters' error
+is one and the same all along. The bands themselves say how large each part is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.results.bands import Bands, Kind
+
+__all__ = ["Z_90", "Standard", "standardised"]
+
+# Half the width of a 90 % band, in sds.
+Z_90 = float(stats.norm.ppf(0.95))
+
+# Sds of the noise, as a fit allows them, over which a chance is averaged.
+SCALES = 200
+
+
+@dataclass(frozen=True)
+class Standard:
+    """Readings of the judged part against their bands, and what they are worth.
+
+    ``z`` (readings,) residuals over the sensor band's sd; ``for_mean`` and ``for_size``
+    independent readings that the record is worth to the mean of z and to that of z²; ``unsure``
+    is the sd of the logarithm of the noise's sd.
+    """
+
+    z: FloatArray
+    for_mean: float
+    for_size: float
+    unsure: float
+
+    @property
+    def known(self) -> float:
+        """Independent readings that would tell the noise's sd as well as the fit has done."""
+        return 1 / max(2 * self.unsure**2, 1e-9)
+
+    @property
+    def worth(self) -> float:
+        """Independent readings that both together are worth."""
+        return 1 / (1 / self.for_size + 1 / self.known)
+
+    @property
+    def scales(self) -> FloatArray:
+        """Factors on the noise's sd, evenly probable, that the fit allows."""
+        chance = (np.arange(SCALES) + 0.5) / SCALES
+        factors: FloatArray = np.sqrt(self.known / stats.chi2.ppf(chance, self.known))
+        return factors
+
+
+def _sd(bands: Bands, kind: Kind, judged: BoolArray) -> FloatArray:
+    """Sd of a band's quantity, um, from its 90 % edges."""
+    width = bands.upper[kind, 90][judged] - bands.lower[kind, 90][judged]
+    sd: FloatArray = width / (2 * Z_90)
+    return sd
+
+
+def standardised(bands: Bands, judged: BoolArray, memory: float, unsure: float) -> Standard:
+    """Take the residuals over their sd, and work out how many independent ones they are worth.
+
+    With p, q and w the shares of parameters, discrepancy and sensor in the variance, z at two
+    samples t apart has the correlation p + q exp(-t/τ), and z² that squared.
+    """
+    assert bands.measured is not None
+    sensor = np.maximum(_sd(bands, "sensor", judged), np.finfo(float).tiny)
+    z = (bands.measured - bands.mean)[judged] / sensor
+    total = float(np.mean(sensor**2))
+    p = min(float(np.mean(_sd(bands, "parameter", judged) ** 2)) / total, 1.0)
+    q = min(float(np.mean(_sd(bands, "displacement", judged) ** 2)) / total, 1.0) - p
+    q = max(q, 0.0) if memory > 0 else 0.0
+    time = bands.time[judged]
+    length = float(time[-1] - time[0] + bands.interval)
+    once, twice = (_mean_correlation(length, memory / power, z.size) for power in (1, 2))
+    alone = 1 / z.size
+    mean = p + q * once + (1 - p - q) * alone
+    size = p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * alone
+    return Standard(z, 1 / mean, 1 / size, unsure)
+
+
+def _mean_correlation(length: float, memory: float, readings: int) -> float:
+    """Mean correlation of all pairs of a process that forgets by exp(-t/memory)."""
+    x = length / memory if memory > 0 else np.inf
+    if not np.isfinite(x):
+        return 1 / readings
+    mean = 1.0 - x / 3 if x < 1e-4 else 2 * (x - 1 + np.exp(-x)) / x**2
+    return max(float(mean), 1 / readings)
