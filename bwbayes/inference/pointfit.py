@@ -1,8 +1,9 @@
 """The point fit: where the posterior is, how wide it is, and what the data leave open.
 
-Least squares from several prior draws finds the optima of the physical parameters; from the best
-ones the posterior's own mode follows by Newton steps, with all noise parameters. The curvature
-there is the Gaussian approximation: it starts the sampler and is never the answer itself.
+Least squares from several prior draws finds the optima of the physical parameters, of residuals and
+of their steps; from the best ones the posterior's own modes follow by Newton steps, with all noise
+parameters. The curvature there is the Gaussian approximation: it starts the sampler and is never
+the answer itself.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, optimize, special
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["PointFit", "fit", "peaks"]
+__all__ = ["PointFit", "approximated", "fit", "peaks"]
 
-# Prior draws that are tried, and the best of them that least squares starts from.
+# Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS = 128
-STARTS = 8
+STARTS = 5
 
 # Rounds of draws of the noise parameters, and the best that the next round is drawn around.
 ROUNDS, BEST = 4, 8
@@ -67,16 +68,21 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     density = posterior.log_density(draws[:DRAWS])
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
-    least_squares = _LeastSquares(posterior, centre, np.sqrt(np.diag(spread)))
-    starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
-    valleys = _valleys(least_squares, [least_squares.optimum(start) for start in starts])
+    valleys = []
+    for steps in (False, True):
+        least_squares = _LeastSquares(posterior, centre, np.sqrt(np.diag(spread)), steps=steps)
+        starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
+        valleys += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, valley, noise, generator) for valley in valleys]
     # Least squares knows no constraints: a reversed record's optimum may be an impossible place.
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
     climbed = [place for place, is_so in zip(places, possible, strict=True) if is_so]
-    modes = [_mode(posterior, place, spread) for place in climbed or [likeliest]]
+    modes: list[_Mode] = []
+    for place in climbed or [likeliest]:
+        if not any(_near(mode, place, least_squares.physical) for mode in modes):
+            modes.append(_mode(posterior, place, spread))
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
     worth = [m.place for m in modes if m.log_density > best.log_density - HOPELESS]
@@ -96,6 +102,19 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     log_evidence = np.array([mode.log_density for mode in modes])
     log_evidence += np.linalg.slogdet(covariances)[1] / 2
     return covariances, special.softmax(log_evidence)
+
+
+def approximated(
+    posterior: Posterior, point: PointFit, generator: np.random.Generator, count: int
+) -> FloatArray:
+    """Draw (count, free) from normal distributions at a point fit's optima, by their shares."""
+    covariances, shares = peaks(posterior, point)
+    each = generator.multinomial(count, shares)
+    draws = [
+        generator.multivariate_normal(place, covariance, size=some)
+        for place, covariance, some in zip(point.optima, covariances, each, strict=True)
+    ]
+    return np.concatenate(draws)
 
 
 def _with_noise(
@@ -142,11 +161,15 @@ def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[Flo
 class _LeastSquares:
     """Least squares in the coordinates of the physical parameters, with a weak pull to the prior.
 
-    The noise parameters do not enter; they stay at the prior's median.
+    The noise parameters do not enter; they stay at the prior's median. Squares are those of the
+    residuals, or of their ``steps`` from row to row: with a discrepancy that forgets slowly these
+    are the ones that are independent, and where the first have one optimum they may have two.
     """
 
-    def __init__(self, posterior: Posterior, centre: FloatArray, spread: FloatArray) -> None:
-        self.posterior, self.centre, self.spread = posterior, centre, spread
+    def __init__(
+        self, posterior: Posterior, centre: FloatArray, spread: FloatArray, *, steps: bool
+    ) -> None:
+        self.posterior, self.centre, self.spread, self.steps = posterior, centre, spread, steps
         self.physical = np.array([n in posterior.table.physical for n in posterior.names])
         most = RESIDUALS // len(posterior.datasets)
         every = [one.readings.rows for one in posterior.datasets]
@@ -169,6 +192,8 @@ class _LeastSquares:
                 self.posterior.datasets, self.rows, self.targets, self.scales, strict=True
             )
         ]
+        if self.steps:
+            missed = [np.diff(residual, axis=1, prepend=0.0) for residual in missed]
         return np.concatenate([*missed, 1e-2 * pull], axis=1)
 
     def costs(self, coordinates: FloatArray) -> FloatArray:
@@ -241,6 +266,17 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     return _Mode(
         place, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(place)))
     )
+
+
+def _near(mode: _Mode, place: FloatArray, physical: BoolArray) -> bool:
+    """Tell whether a place lies within a mode, by its physical coordinates."""
+    away = (place - mode.place)[physical]
+    if not away.size:
+        return True
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", linalg.LinAlgWarning)
+        squares = away @ linalg.solve(mode.covariance[np.ix_(physical, physical)], away)
+    return bool(squares < away.size)
 
 
 def _units(posterior: Posterior, place: FloatArray, spread: FloatArray) -> FloatArray:

@@ -34,6 +34,14 @@ class Switched:
     decay: float
     nats: float
 
+    def line(self, start: float, *, sure: bool) -> str:
+        """Say what it is, of a record whose lead-in begins at ``start``, s."""
+        return (
+            f"a transient of {self.size:.3g} um that decays within {self.decay:.2g} s from "
+            f"{start:.4g} s on explains the readings better, by {self.nats:.3g} nats"
+            f"{'' if sure else ', which may be chance'}"
+        )
+
 
 @dataclass(frozen=True)
 class LeadIn:

@@ -45,6 +45,9 @@ ADDED = 9.0
 SEEN_ADDED = 4.0
 MOVED_ADDED, MOVED = 3.0, 3.0
 
+# Log density, nats, that is enough for a doubt: odds of twenty to one, and more.
+DOUBTED = 3.0
+
 # Draws of the posterior, and of the Gaussian approximation without the start, that are compared.
 COMPARED, DRAWS = 1000, 400
 
@@ -64,7 +67,7 @@ class Transient:
     """A transient at a record's start, and the parameter that moves most without the start.
 
     ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density. ``until`` in s is where
-    the start ends.
+    the start ends. Where these are few it is not ``sure``.
     """
 
     size: float
@@ -72,13 +75,15 @@ class Transient:
     nats: float
     until: float
     parameter: Moved
+    sure: bool = True
 
     @property
     def line(self) -> str:
         """What it is, and what it has done, in one line."""
+        chance = "" if self.sure else ", which may be chance"
         return (
             f"a transient of {self.size:.3g} um that decays within {self.decay:.2g} s explains its "
-            f"start better, by {self.nats:.3g} nats; "
+            f"start better, by {self.nats:.3g} nats{chance}; "
             f"without the start, up to {self.until:.4g} s, {self.parameter.line}"
         )
 
@@ -120,20 +125,22 @@ def swallowed(
     first = int(rows[round(PART * rows.size)])
     later = tuple(slice(max(w.start, first), w.stop) for w in one.training if w.stop > first)
     windows = {other.name: other.training for other in posterior.datasets}
+    rest = posterior.trained(windows | {name: later})
     try:
-        point = pointfit.fit(posterior.trained(windows | {name: later}), generator)
+        point = pointfit.fit(rest, generator)
     except InputError:
         return None
-    without = generator.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    without = pointfit.approximated(rest, point, generator, DRAWS)
     sampled = posterior.prior.unconstrain(draws[:COMPARED])
     length = one.actuator.interval * (first - int(rows[0]))
     nats, size, decay = added(posterior, name, np.concatenate([without, sampled]), length)
-    if nats <= MOVED_ADDED:
+    if nats <= DOUBTED:
         return None
     most = moved(posterior, one, draws, without)
-    if most is None or (most.sds <= MOVED and nats <= (SEEN_ADDED if seen else ADDED)):
+    if most is None:
         return None
-    return Transient(size, decay, nats, begin + one.actuator.interval * first, most)
+    sure = nats > (SEEN_ADDED if seen else ADDED) or (most.sds > MOVED and nats > MOVED_ADDED)
+    return Transient(size, decay, nats, begin + one.actuator.interval * first, most, sure)
 
 
 def added(

@@ -22,12 +22,12 @@ from scipy import special, stats
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.bands import LEVELS, Bands
+from bwbayes.results.bands import LEVELS, Bands, Switched
 from bwbayes.results.causes import Cause, Residuals, cause, drifts, likeliest
 from bwbayes.results.drift import Drift
 from bwbayes.results.innovations import OddStart
 from bwbayes.results.standard import Z_90, Standard, standardised
-from bwbayes.results.transient import Transient
+from bwbayes.results.transient import DOUBTED, Transient
 
 __all__ = ["Background", "Verdict", "assess"]
 
@@ -62,10 +62,10 @@ LONG = 0.9
 # A lead-in whose test says less than this does not fit.
 LEAD_IN_ALARM = 0.002
 
-# A transient at another record's start must add so many nats, and be so many times as large as the
-# sensor band's sd: smaller ones hardly move the offset by more than the band allows. In 200 good
-# runs two added more than five, and were smaller, or moved the offset for all to see.
-SWITCHED, SIZE = 5.0, 3.0
+# Nats that a transient at another record's start must add, as at that of a fit's. It must be so
+# many times as large as the sensor band's sd: smaller ones hardly move the offset by more than the
+# band allows.
+SWITCHED, SIZE = 9.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,8 @@ class Verdict:
     name, training
         Those of the bands.
     holds
-        False if the bands fail one of the tests; None if the record is too short to tell.
+        False if the bands fail one of the tests; None if the record is too short to tell, or may
+        start with a transient.
     reasons
         What is off and by how much, one line each; of None, why nothing can be told.
     cause
@@ -193,7 +194,8 @@ def assess(
         *residuals.reversed,
         *_lead_in(bands),
         *_odd(start),
-        *(one.line for one in (transient, drift) if one is not None),
+        *([transient.line] if transient and transient.sure else []),
+        *([drift.line] if drift else []),
         *_coverage(bands, judged, standard),
         *_size(standard),
         *_leaning(bands, judged, standard),
@@ -206,8 +208,9 @@ def assess(
         why = likeliest(residuals) if reasons else cause("noise", residuals)
         if _lead_in(bands) and why.kind in ("start", "offset", "noise", "unknown"):
             why = cause("lead-in", residuals)
-        if (start or transient) and why.kind not in ("sign", "outliers"):
-            until = max(one.until for one in (start, transient) if one is not None)
+        sure = transient if transient and transient.sure else None
+        if (start or sure) and why.kind not in ("sign", "outliers"):
+            until = max(one.until for one in (start, sure) if one is not None)
             # A start that is off bends the fit, and looks like a drift that ends soon.
             if why.kind != "drift" or not drifts(residuals, until):
                 why = cause("start", residuals, until)
@@ -220,9 +223,12 @@ def assess(
                 "fit a record that is driven as far and as fast",
             )
         return Verdict(bands.name, bands.training, False, (*reasons, *wide), why)
+    doubts = _doubts(bands, transient)
     if standard.worth < FEWEST:
         few = f"the record is worth {standard.worth:.1f} independent readings: too few to tell"
-        return Verdict(bands.name, bands.training, None, (few,))
+        doubts.insert(0, few)
+    if doubts:
+        return Verdict(bands.name, bands.training, None, tuple(doubts))
     return Verdict(bands.name, bands.training, True)
 
 
@@ -334,13 +340,30 @@ def _lead_in(bands: Bands) -> list[str]:
             f"the lead-in of {lead.start:.4g} to {lead.stop:.4g} s does not fit the model "
             f"(p = {lead.p_value:.1g})"
         ]
-    transient = lead.transient
-    sd = float(np.mean(bands.upper["sensor", 90] - bands.lower["sensor", 90])) / (2 * Z_90)
-    if transient and transient.nats > SWITCHED and abs(transient.size) > SIZE * sd:
-        lines.append(
-            f"a transient of {transient.size:.3g} um that decays within {transient.decay:.2g} s "
-            f"from {lead.start:.4g} s on explains the readings better, by {transient.nats:.3g} nats"
-        )
+    if lead.transient and lead.transient.nats > SWITCHED and _matters(bands, lead.transient):
+        lines.append(lead.transient.line(lead.start, sure=True))
+    return lines
+
+
+def _matters(bands: Bands, transient: Transient | Switched) -> bool:
+    """Tell whether a transient is so large that an offset or a parameter might follow it."""
+    width = bands.upper["sensor", 90] - bands.lower["sensor", 90]
+    return abs(transient.size) > SIZE * float(np.mean(width)) / (2 * Z_90)
+
+
+def _doubts(bands: Bands, transient: Transient | None) -> list[str]:
+    """Say what may be a transient, and may be chance."""
+    lines = []
+    if transient is not None and not transient.sure and _matters(bands, transient):
+        lines.append(transient.line)
+    lead = bands.lead_in
+    if (
+        lead
+        and lead.transient
+        and lead.transient.nats > DOUBTED
+        and _matters(bands, lead.transient)
+    ):
+        lines.append(lead.transient.line(lead.start, sure=False))
     return lines
 
 

@@ -237,7 +237,8 @@ def test_modes_have_shares_by_height_and_width() -> None:
         logs = [
             np.log(w / sd**2) - one / 2 for w, sd, one in zip(weights, sds, squares, strict=True)
         ]
-        return np.logaddexp(*logs)
+        density: FloatArray = np.logaddexp(*logs)
+        return density
 
     point = PointFit(places[1], np.eye(2), 0.0, places, np.eye(2))
     covariances, shares = peaks(target(log_density, 2), point)

@@ -131,18 +131,33 @@ def test_a_fit_that_hangs_on_its_start_does_not_hold() -> None:
 def test_a_transient_of_another_record_is_said_where_it_is_large() -> None:
     """Larger than three sds of the band, 1.05 um, and beyond chance."""
     bands = replace(bands_of(made(np.random.default_rng(1), length=30)), scored_from=100)
-    for size, nats, holds in ((15.0, 9.0, False), (2.0, 9.0, True), (15.0, 4.0, True)):
+    for size, nats, holds in (
+        (15.0, 9.5, False),
+        (2.0, 9.5, True),
+        (15.0, 5.0, None),
+        (15.0, 2.9, True),
+    ):
         lead = LeadIn(0.0, 1.0, 100, 0.5, Switched(size, 0.4, nats))
         verdict = judged(replace(bands, lead_in=lead), None)
         assert verdict.holds is holds
-    lead = LeadIn(0.0, 1.0, 100, 0.5, Switched(15.0, 0.4, 9.0))
+    lead = LeadIn(0.0, 1.0, 100, 0.5, Switched(15.0, 0.4, 9.5))
     verdict = judged(replace(bands, lead_in=lead), None)
     assert verdict.reasons == (
         "a transient of 15 um that decays within 0.4 s from 0 s on explains the readings better, "
-        "by 9 nats",
+        "by 9.5 nats",
     )
     assert verdict.cause is not None
     assert "lead-in" == verdict.cause.kind
+
+
+def test_a_transient_that_may_be_chance_leaves_it_open() -> None:
+    bands = bands_of(made(np.random.default_rng(1), length=30), training=True)
+    for size, holds in ((12.0, None), (2.0, True)):
+        verdict = judged(bands, replace(PUSHED, size=size, nats=3.7, sure=False))
+        assert verdict.holds is holds
+    verdict = judged(bands, replace(PUSHED, nats=3.7, sure=False))
+    assert "by 3.7 nats, which may be chance" in verdict.line
+    assert verdict.cause is None
 
 
 def test_a_drift_all_along_is_no_bad_start() -> None:
