@@ -33,6 +33,9 @@ CACHED = 1 << 16
 # Beside numbers as large as this a one is next to lost to rounding.
 LOST = 1e12
 
+# Part of a sum of squares that rounding may take away.
+ROUNDING = 1e-15
+
 # What is below exp(-50) of its size adds nothing.
 FORGOTTEN = 50.0
 
@@ -175,6 +178,9 @@ class Likelihood:
         covariance, log_volume = _inverse(precision)
         mean = np.einsum("mij,mj->mi", covariance, pull)
         squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
+        # Less cannot be told of a difference: where noise is next to none and an unknown without
+        # bounds, what rounding left was a place more probable than any that is possible.
+        squares = np.maximum(squares, ROUNDING * products[:, 0, 0])
         logs = log_determinant + log_volume
         density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]

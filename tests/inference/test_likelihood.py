@@ -11,6 +11,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
@@ -272,3 +274,23 @@ def test_unknowns_that_look_alike_are_integrated_out_however_little_is_known(
     np.testing.assert_allclose(np.log(squares), log_determinant, atol=error)
     expected = np.eye(3) - products / squares[:, np.newaxis, np.newaxis]
     np.testing.assert_allclose(expected, inverse, atol=error)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    exponents=st.tuples(st.floats(0, 15), st.floats(0, 18), st.floats(-15, -3), st.floats(-26, -3))
+)
+def test_no_absurd_place_is_more_probable_than_a_possible_one(
+    exponents: tuple[float, float, float, float],
+) -> None:
+    """Gains of 1e15 um/V, lags of 1e18 s, next to no noise: there rounding is all that is left."""
+    posterior = moving("discrepancy", "lag", {}, missing=0.1)
+    likelihood = replace(posterior.likelihood, offset_sd=100.0)
+    usual = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 50))
+    size, lag, sensor, discrepancy = 10.0 ** np.array(exponents)
+    absurd = {"d": size, "alpha": size / 2, "lag": lag}
+    absurd |= {"sensor_sd": sensor, "discrepancy_sd": discrepancy}
+    theta = usual[:1]
+    for name, value in absurd.items():
+        theta = likelihood.table.replaced(theta, name, np.array([value]))
+    assert likelihood.log_density(theta)[0] < np.max(likelihood.log_density(usual))
