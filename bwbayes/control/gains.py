@@ -183,18 +183,30 @@ def margins(
     loop = controller * frequency_response(draws.sections, turns)
     least, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
     size = np.abs(loop)
+    log_size = np.log(size)
+    angle = np.angle(-loop)
+    turned = np.angle(loop[:, 1:] / loop[:, :-1])
     # Where the loop is real and negative; at the end it is real but for rounding.
-    turned = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
-    worst = np.max(np.where(turned, np.maximum(size[:, :-1], size[:, 1:]), 0.0), axis=1)
+    real = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.clip(-angle[:, :-1] / turned, 0.0, 1.0)
+        log_real = log_size[:, :-1] + part * np.diff(log_size, axis=1)
+    worst = np.max(np.where(real, np.exp(log_real), 0.0), axis=1)
     worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, size[:, -1], 0.0))
     with np.errstate(divide="ignore"):
         gain = 1 / (largest[:, 0] * worst)
-    # Where it has the size one at some slope: the lag is least at one of these frequencies.
-    one = (size * largest >= 1) & (size * least <= 1)
-    ends = [np.diff(size * k >= 1, axis=1, append=False) for k in (least, largest)]
-    looked = one | ends[0] | ends[1]
-    away = np.abs(np.angle(-loop))
-    phase = np.degrees(np.min(np.where(looked, away, np.pi), axis=1))
+    # Where it has the size one at some slope: the lag is least at one of these frequencies, which
+    # are those in between and, on straight lines from angle to angle, the two ends.
+    between = (size * largest >= 1) & (size * least <= 1)
+    lag = np.min(np.where(between, np.abs(angle), np.pi), axis=1)
+    for slope in (least, largest):
+        level = log_size + np.log(slope)
+        crossed = (level[:, :-1] >= 0) != (level[:, 1:] >= 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = level[:, :-1] / (level[:, :-1] - level[:, 1:])
+        at_one = np.abs(angle[:, :-1] + part * turned)
+        lag = np.minimum(lag, np.min(np.where(crossed, at_one, np.pi), axis=1))
+    phase = np.degrees(lag)
     phase = np.where(gain < 1, -phase, phase)
     circle = np.min(((1 + largest * loop) * np.conj(1 + least * loop)).real, axis=1)
     above = size * largest >= 1
