@@ -140,6 +140,20 @@ def test_a_shape_takes_what_an_unknown_of_that_shape_would(
     )
 
 
+def test_a_shape_adds_half_of_what_it_takes() -> None:
+    """At its best size: by the log densities of readings with and without it."""
+    posterior = moving()
+    likelihood = replace(posterior.likelihood, offset_sd=3.0)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 1))
+    readings = likelihood.readings
+    shape = np.exp(-np.arange(readings.rows.size) / 50)[np.newaxis]
+    score = likelihood.score(theta, shape)
+    less = replace(readings, values=readings.values - score.sizes[0, 0] * shape[0])
+    gained = replace(likelihood, readings=less).log_density(theta) - likelihood.log_density(theta)
+    np.testing.assert_allclose(gained, score.nats[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(score.together / 2, score.nats[:, 0], rtol=1e-9)
+
+
 def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
     posterior = moving()
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 70))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.distributions import Distribution
 from tests.inference.problems import posterior_of, short_posterior, target, truth
 from tests.results.runs import Stand
+from tests.results.test_verdicts_end_to_end import made
 
 CASES = ("white", "discrepancy", "lag")
 
@@ -245,3 +247,16 @@ def test_modes_have_shares_by_height_and_width() -> None:
     np.testing.assert_allclose([0.2, 0.8], shares, atol=1e-3)
     expected = [sd**2 * np.eye(2) for sd in sds]
     np.testing.assert_allclose(expected, covariances, atol=1e-3)
+
+
+@pytest.mark.parametrize(("number", "least"), [(97, 0.05), (106, 0.3)])
+def test_both_modes_of_a_record_of_one_amplitude_are_seen(
+    tmp_path: Path, number: int, least: float
+) -> None:
+    """Whatever the seed. Of the second, least squares sees one optimum between the two."""
+    problem, _ = made((7, number), tmp_path)
+    for seed in range(4):
+        point = fit(problem.posterior, np.random.default_rng(seed))
+        free, _ = problem.posterior.prior.constrain(point.optima)
+        np.testing.assert_allclose([0.71, 0.95], np.sort(free[:, 0]), atol=0.02)
+        assert least < min(peaks(problem.posterior, point)[1])

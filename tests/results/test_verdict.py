@@ -57,6 +57,26 @@ def test_bands_of_many_good_records_hold() -> None:
     assert false_alarms(2, 10_000)[0] <= 20
 
 
+def unsure_alarms(known: float, believed: float) -> int:
+    """Count false alarms of 400 records whose noise the fit knows like so many readings would."""
+    generator = np.random.default_rng(5)
+    background = Background(0.2, np.sqrt(1 / (2 * believed)), FITTED)
+    count = 0
+    for _ in range(400):
+        record = made(generator, 20.0, 0.02, 0.2, parameters=0.05)
+        scale = np.sqrt(known / generator.chisquare(known))
+        verdict = assess(bands_of(record, (scale - 1) * record.error), background)
+        assert verdict is not None
+        count += verdict.holds is False
+    return count
+
+
+def test_a_noise_that_is_hardly_known_may_be_larger() -> None:
+    """Its sd is off by a sixth, and by two fifths now and then. The twin believes to know it."""
+    assert unsure_alarms(20.0, 20.0) <= 4
+    assert unsure_alarms(20.0, 1e6) > 8
+
+
 def outliers(generator: np.random.Generator, record: Made, _: float) -> FloatArray:
     spoilt = np.zeros(record.time.size)
     at = generator.choice(record.time.size, 10, replace=False)

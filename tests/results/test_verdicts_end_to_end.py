@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from tests.measured import keep, measured
@@ -107,6 +108,15 @@ SPOILT_KINDS = {
 
 def run(seed: tuple[int, int], folder: Path, kind: str = "good") -> Judged:
     """Simulate a record and another one, fit the first half of the first, and judge all."""
+    problem, generator = made(seed, folder, kind)
+    again = SPOILT_KINDS[kind][0] == "training" if kind in SPOILT_KINDS else True
+    return judge(problem, generator, again=again)
+
+
+def made(
+    seed: tuple[int, int], folder: Path, kind: str = "good"
+) -> tuple[Problem, np.random.Generator]:
+    """Simulate a record and another one; return what is to be fitted, and the generator."""
     generator = np.random.default_rng(seed)
     stand = Stand(
         lag=float(generator.choice([0.004, 0.02])),
@@ -136,8 +146,7 @@ def run(seed: tuple[int, int], folder: Path, kind: str = "good") -> Judged:
         [validation.other]
         file = "another.h5"
     """
-    again = SPOILT_KINDS[kind][0] == "training" if kind in SPOILT_KINDS else True
-    return judge(problem_of(text, folder), generator, again=again)
+    return problem_of(text, folder), generator
 
 
 def right(told: Judged, where: str) -> bool:
