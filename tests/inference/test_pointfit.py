@@ -213,9 +213,9 @@ def test_without_a_finite_density_there_is_no_fit() -> None:
 
 
 def test_the_noise_is_not_taken_for_the_sensors_alone() -> None:
-    """Where it is, whatever the seed: a lesser mode has all of it in the sensor.
+    """Whatever the seed: a lesser mode has all of it in the sensor.
 
-    One in five of these fits ended there when each began from the best of its draws.
+    The best of the first draws is next to that mode one time in five, and tens of nats worse.
     """
     generator = np.random.default_rng(97)
     time = 0.01 * np.arange(800)
@@ -226,8 +226,13 @@ def test_the_noise_is_not_taken_for_the_sensors_alone() -> None:
     posterior = posterior_of(
         record.voltage, record.displacement, Actuator("lag", "first", 0.01), "discrepancy"
     )
-    density = [fit(posterior, np.random.default_rng(seed)).log_density for seed in range(12)]
-    assert max(density) - min(density) < 0.1
+    point = fit(posterior, np.random.default_rng(1))
+    noise = ~np.array([name in posterior.table.physical for name in posterior.names])
+    for seed in range(12):
+        source = np.random.default_rng(seed)
+        draws = posterior.prior.unconstrain(posterior.prior.draw(source, 128))[:, noise]
+        place = pointfit._with_noise(posterior, point.mode, draws, source)
+        assert posterior.log_density(place[np.newaxis])[0] > point.log_density - 4
 
 
 def test_modes_have_shares_by_height_and_width() -> None:

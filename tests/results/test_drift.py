@@ -41,10 +41,15 @@ def test_good_fits_follow_no_drift() -> None:
 
 @pytest.mark.parametrize("size", [30.0, -30.0])
 def test_a_drift_is_told_with_its_size(size: float) -> None:
-    posterior = drifting(1, size)
-    told = drifted(posterior, followed(posterior), np.random.default_rng(2))
+    """And what is left without it is as probable as the record was before."""
+    posterior, clean = drifting(1, size), fitted(1)
+    draws = followed(posterior)
+    told = drifted(posterior, draws, np.random.default_rng(2))
     assert told is not None
     assert told.size == pytest.approx(size, abs=2.0)
+    best = pointfit.fit(clean, np.random.default_rng(1)).log_density
+    plain = np.max(posterior.log_density(posterior.prior.unconstrain(draws)))
+    assert told.nats == pytest.approx(best - plain, abs=3.0)
     assert "beta" == told.parameter.name
     assert told.parameter.rest[0] == pytest.approx(0.0272, rel=0.1)
 
