@@ -223,7 +223,7 @@ def test_a_good_run_holds_and_a_spoilt_one_does_not(
 @pytest.mark.slow
 def test_good_runs_hold(tmp_path: Path) -> None:
     """At most 1 % of the verdicts of 400 good runs, three each, say no."""
-    counts, lines = good_runs(20261123, GOOD, tmp_path)
+    counts, lines = good_runs(20261125, GOOD, tmp_path)
     keep("good runs hold", {"runs": GOOD, **counts, "said no": lines})
     assert len(lines) <= 0.01 * 3 * GOOD
 
@@ -232,7 +232,7 @@ def test_good_runs_hold(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", SPOILT_KINDS)
 def test_no_spoilt_run_holds(tmp_path: Path, kind: str) -> None:
     """Of 50 of each kind none is missed; the cause is right in nine of ten of those seen."""
-    counts = spoilt_runs(kind, 20261124, SPOILT, tmp_path)
+    counts = spoilt_runs(kind, 20261126, SPOILT, tmp_path)
     every = measured().get("spoilt runs do not hold", {})
     keep("spoilt runs do not hold", every | {kind: dict(counts)})
     assert not counts["missed"]
