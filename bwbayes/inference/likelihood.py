@@ -180,7 +180,9 @@ class Likelihood:
         squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
         # Less cannot be told of a difference: where noise is next to none and an unknown without
         # bounds, what rounding left was a place more probable than any that is possible.
-        squares = np.maximum(squares, ROUNDING * products[:, 0, 0])
+        size = np.abs(pull)
+        terms = np.einsum("mi,mij,mj->m", size, np.abs(covariance), size)
+        squares = np.maximum(squares, ROUNDING * (products[:, 0, 0] + terms))
         logs = log_determinant + log_volume
         density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]

@@ -16,6 +16,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from scipy import ndimage
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -57,16 +58,20 @@ def outliers(posterior: Posterior, generator: np.random.Generator) -> dict[str, 
         for name, place in places.items():
             alone = posterior.alone(name)
             rows, away = alone.only.readings.rows, np.abs(surprise(alone, place))
-            # Many spikes make the fit's noise larger than that of most readings: theirs counts.
+            # Many spikes make the fit's noise larger than that of most readings: theirs counts, and
+            # leaves a doubt.
             far = away > LIMIT * min(1.0, float(np.median(away)) / MEDIAN)
             quiet = quiet and not far.any()
             aside[name] = np.union1d(aside[name], rows[far])
-            doubtful[name] = np.union1d(doubtful[name], rows[far & (away <= LIMIT)])
+            # So does lying beside a larger one, which a discrepancy would have carried on.
+            beside = away < ndimage.maximum_filter1d(away, 3)
+            doubt = far & (beside | (away <= LIMIT))
+            doubtful[name] = np.union1d(doubtful[name], rows[doubt])
             _require_few(aside[name].size, everything.alone(name).only.readings.rows.size)
         if quiet:
             break
         posterior = _without(everything, aside)
-    # The last fit tells which of those that most readings' noise made suspect are outliers.
+    # The last fit tells which of those that were suspect are outliers.
     for name, place in places.items():
         one = everything.alone(name)
         good = [row for row in doubtful[name].tolist() if _is_good(one, aside[name], row, place)]

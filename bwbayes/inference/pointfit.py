@@ -106,15 +106,20 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
 
 def approximated(
     posterior: Posterior, point: PointFit, generator: np.random.Generator, count: int
-) -> FloatArray:
-    """Draw (count, free) from normal distributions at a point fit's optima, by their shares."""
+) -> tuple[FloatArray, FloatArray]:
+    """Draw from normal distributions at a point fit's optima.
+
+    Returns (modes count, free), as many at every optimum, and (count, free), by their shares.
+    """
     covariances, shares = peaks(posterior, point)
-    each = generator.multinomial(count, shares)
-    draws = [
-        generator.multivariate_normal(place, covariance, size=some)
-        for place, covariance, some in zip(point.optima, covariances, each, strict=True)
-    ]
-    return np.concatenate(draws)
+    each = np.stack(
+        [
+            generator.multivariate_normal(place, covariance, size=count)
+            for place, covariance in zip(point.optima, covariances, strict=True)
+        ]
+    )
+    which = generator.choice(len(shares), size=count, p=shares)
+    return np.concatenate(each), each[which, np.arange(count)]
 
 
 def _with_noise(

@@ -86,7 +86,7 @@ def drifted(
     nats = point.log_density - float(np.max(plain))
     if nats <= ADDED:
         return None
-    places = pointfit.approximated(without, point, generator, DRAWS)
+    _, places = pointfit.approximated(without, point, generator, DRAWS)
     most = moved(posterior, one, draws, places)
     if most is None or most.sds <= MOVED:
         return None

@@ -130,10 +130,10 @@ def swallowed(
         point = pointfit.fit(rest, generator)
     except InputError:
         return None
-    without = pointfit.approximated(rest, point, generator, DRAWS)
+    everywhere, without = pointfit.approximated(rest, point, generator, DRAWS)
     sampled = posterior.prior.unconstrain(draws[:COMPARED])
     length = one.actuator.interval * (first - int(rows[0]))
-    nats, size, decay = added(posterior, name, np.concatenate([without, sampled]), length)
+    nats, size, decay = added(posterior, name, np.concatenate([everywhere, sampled]), length)
     if nats <= DOUBTED:
         return None
     most = moved(posterior, one, draws, without)
