@@ -183,13 +183,14 @@ def margins(
     loop = controller * frequency_response(draws.sections, turns)
     least, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
     size = np.abs(loop)
-    log_size = np.log(size)
+    with np.errstate(divide="ignore"):
+        log_size = np.log(size)
     angle = np.angle(-loop)
     turned = np.angle(loop[:, 1:] / loop[:, :-1])
     # Where the loop is real and negative; at the end it is real but for rounding.
     real = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        part = np.clip(-angle[:, :-1] / turned, 0.0, 1.0)
+        part = np.clip(np.nan_to_num(-angle[:, :-1] / turned), 0.0, 1.0)
         log_real = log_size[:, :-1] + part * np.diff(log_size, axis=1)
     worst = np.max(np.where(real, np.exp(log_real), 0.0), axis=1)
     worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, size[:, -1], 0.0))

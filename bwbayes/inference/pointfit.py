@@ -97,6 +97,7 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     """
     if len(point.optima) == 1:
         return point.covariance[np.newaxis], np.ones(1)
+    # Climbed to once more: a chain's file keeps the covariance of the best alone.
     modes = [_mode(posterior, place, point.prior_covariance) for place in point.optima]
     covariances = np.stack([mode.covariance for mode in modes])
     log_evidence = np.array([mode.log_density for mode in modes])

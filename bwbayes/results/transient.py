@@ -20,14 +20,14 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
-from bwbayes.inference.likelihood import Likelihood, Score
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.results.bands import Switched
 from bwbayes.results.histories import Histories, States
 from bwbayes.results.moved import Moved, moved
 
-__all__ = ["DECAYS", "LONGEST", "Transient", "added", "swallowed", "switched"]
+__all__ = ["DECAYS", "Transient", "added", "swallowed", "switched"]
 
 # Part of the readings that is left out to see what the rest says, and the time constants that are
 # tried, as parts of how long that is.
@@ -66,8 +66,8 @@ ASKED, STATES, LONGEST = 25, 9, 20_000
 class Transient:
     """A transient at a record's start, and the parameter that moves most without the start.
 
-    ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density. ``until`` in s is where
-    the start ends. Where these are few it is not ``sure``.
+    ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density, and is not ``sure`` if
+    these are few. ``until`` in s is where the start ends.
     """
 
     size: float
@@ -214,15 +214,11 @@ def switched(
         begun = [states.at(np.full(len(few), part)) for part in np.linspace(0, 1, STATES)]
         scores = [one.score(each, shapes) for each in begun]
         density = np.stack([one.log_density(each) for each in begun], axis=1)
-        nats, sizes = (np.stack(both, axis=1) for both in zip(*map(_alone, scores), strict=True))
+        nats = np.stack([score.nats for score in scores], axis=1)
+        sizes = np.stack([score.sizes for score in scores], axis=1)
         return density, density[:, :, np.newaxis] + nats, sizes
 
     without, with_one, sizes = asked.each(theta[some], ask)
     best = np.unravel_index(int(np.argmax(with_one)), with_one.shape)
     nats = float(with_one[best] - np.max(without))
     return Switched(float(sizes[best]), float(decays[best[-1]]), nats)
-
-
-def _alone(score: Score) -> tuple[FloatArray, FloatArray]:
-    """Return what each shape alone adds at its best size, and that size."""
-    return score.nats, score.sizes

@@ -190,18 +190,19 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
     return counts
 
 
+# Two of the transients add less than six nats, which may be chance: those are left open.
 HARDEST = [
-    ((2, 1), "sign"),
-    ((20261122, 4), "transient"),
-    ((20261122, 27), "transient"),
-    ((20261122, 37), "drift"),
-    ((20261122, 47), "other transient"),
+    ((2, 1), "sign", False),
+    ((20261122, 4), "transient", None),
+    ((20261122, 27), "transient", False),
+    ((20261122, 37), "drift", False),
+    ((20261122, 47), "other transient", None),
 ]
 
 
-@pytest.mark.parametrize(("seed", "kind"), HARDEST)
+@pytest.mark.parametrize(("seed", "kind", "holds"), HARDEST)
 def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
-    tmp_path: Path, seed: tuple[int, int], kind: str
+    tmp_path: Path, seed: tuple[int, int], kind: str, holds: bool | None
 ) -> None:
     """Five of the hardest: all were called good before.
 
@@ -215,9 +216,8 @@ def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
     assert all(one.holds is not False for one in run(seed, tmp_path).verdicts.values())
     where, causes = SPOILT_KINDS[kind]
     verdict = run(seed, tmp_path, kind).verdicts[where]
-    # Two of the transients add less than six nats, which may be chance.
-    assert verdict.holds is not True
-    if verdict.holds is False:
+    assert verdict.holds is holds
+    if holds is False:
         assert verdict.cause is not None
         assert verdict.cause.kind in causes
 
