@@ -13,7 +13,7 @@ simulated calibrations of nine parameters). Twins plant both on the draws. Means
 held to the spread between replicates (Bonferroni's bound: one false alarm in 100 for each model).
 
 ``-m slow`` makes 150 replicates of each part with default priors, and asks what a calibration asks;
-those of four parts may take twice as many steps.
+they may take twice as many steps, for posteriors from four seconds may be long and curved.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ THREE = {
 EVERY = {name: f'hysteresis = "{name}"\n' for name in HYSTERESIS} | {"gain": GAIN, "creep": CREEP}
 
 
-# Steps of a replicate at most; of models whose posteriors from four seconds are long and curved.
+# Steps of a replicate at most, with priors that know the hysteresis and with default ones.
 STEPS = 3000
-LONG_STEPS = {"creep": 6000, "duhem": 6000, "maxwell-slip": 6000, "plays": 6000}
+LONG_STEPS = 6000
 
 
 def resolved(model: str, parameters: str, folder: Path, steps: int = STEPS) -> Experiment:
@@ -127,7 +127,7 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("part", EVERY)
 def test_every_part_is_calibrated(part: str, tmp_path: Path) -> None:
-    common = resolved(EVERY[part], "", tmp_path, LONG_STEPS.get(part, STEPS))
+    common = resolved(EVERY[part], "", tmp_path, LONG_STEPS)
     every = made(common, REPLICATES)
     result = figures(common, every)
     keep(f"calibrated part, {part}", result)
