@@ -9,12 +9,13 @@ the answer itself.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, optimize, special
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 
@@ -36,6 +37,11 @@ HOPELESS = 30.0
 
 # Optima whose sums of squares and coordinates agree to this part are one.
 SAME = 1e-2
+
+# A place from which the density falls by less than this, nats, at so many points on the straight
+# way to a mode belongs to that mode.
+DIP = 0.5
+WAY = 33
 
 
 @dataclass(frozen=True)
@@ -75,14 +81,15 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
         valleys += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, valley, noise, generator) for valley in valleys]
-    # Least squares knows no constraints: a reversed record's optimum may be an impossible place.
+    # A place that least squares allows may still have no density: the noise is another one there.
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
     climbed = [place for place, is_so in zip(places, possible, strict=True) if is_so]
     modes: list[_Mode] = []
     for place in climbed or [likeliest]:
-        if not any(_near(mode, place, least_squares.physical) for mode in modes):
-            modes.append(_mode(posterior, place, spread))
+        mode = _mode(posterior, place, spread, modes)
+        if mode is not None:
+            modes.append(mode)
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
     worth = [m.place for m in modes if m.log_density > best.log_density - HOPELESS]
@@ -98,7 +105,8 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     if len(point.optima) == 1:
         return point.covariance[np.newaxis], np.ones(1)
     # Climbed to once more: a chain's file keeps the covariance of the best alone.
-    modes = [_mode(posterior, place, point.prior_covariance) for place in point.optima]
+    climbs = (_mode(posterior, place, point.prior_covariance) for place in point.optima)
+    modes = [mode for mode in climbs if mode is not None]
     covariances = np.stack([mode.covariance for mode in modes])
     log_evidence = np.array([mode.log_density for mode in modes])
     log_evidence += np.linalg.slogdet(covariances)[1] / 2
@@ -167,9 +175,10 @@ def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[Flo
 class _LeastSquares:
     """Least squares in the coordinates of the physical parameters, with a weak pull to the prior.
 
-    The noise parameters do not enter; they stay at the prior's median. Squares are those of the
-    residuals, or of their ``steps`` from row to row: with a discrepancy that forgets slowly these
-    are the ones that are independent, and where the first have one optimum they may have two.
+    An impossible place has no residuals, and no step leads there. The noise parameters do not
+    enter; they stay at the prior's median. Squares are those of the residuals, or of their
+    ``steps`` from row to row: with a discrepancy that forgets slowly these are the ones that are
+    independent, and where the first have one optimum they may have two.
     """
 
     def __init__(
@@ -181,6 +190,7 @@ class _LeastSquares:
         every = [one.readings.rows for one in posterior.datasets]
         self.rows = [rows[:: max(rows.size // most, 1)] for rows in every]
         total = sum(rows.size for rows in self.rows)
+        self.size = total + np.count_nonzero(self.physical)
         self.targets, self.scales = [], []
         for one, rows in zip(posterior.datasets, self.rows, strict=True):
             self.targets.append(one.displacement[rows])
@@ -188,8 +198,14 @@ class _LeastSquares:
             self.scales.append(0.01 * float(np.ptp(self.targets[-1])) * np.sqrt(total))
 
     def residuals(self, coordinates: FloatArray) -> FloatArray:
-        """Residuals (models, rows + physical) at coordinates (models, free)."""
-        free, _ = self.posterior.prior.constrain(coordinates)
+        """Residuals (models, rows + physical) at coordinates (models, free); nan if impossible."""
+        free, density = self.posterior.prior.constrain(coordinates)
+        possible = np.isfinite(density)
+        if not possible.all():
+            residuals = np.full((len(free), self.size), np.nan)
+            if possible.any():
+                residuals[possible] = self.residuals(coordinates[possible])
+            return residuals
         theta = self.posterior.prior.theta(free)
         pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
         missed = [
@@ -223,7 +239,7 @@ class _LeastSquares:
         def residuals(values: FloatArray) -> FloatArray:
             # With what the slopes need, in one call: they are asked for at most of these places.
             here, plus, minus = np.split(self.residuals(place(values + star)), [1, 1 + steps.size])
-            last[:] = here[0], values.copy(), ((plus - minus) / (2 * steps[:, np.newaxis])).T
+            last[:] = here[0], values.copy(), _slopes(here, plus, minus, steps[:, np.newaxis]).T
             return last[0]
 
         def jacobian(values: FloatArray) -> FloatArray:
@@ -242,6 +258,16 @@ class _LeastSquares:
         return optimum
 
 
+def _slopes(here: FloatArray, plus: FloatArray, minus: FloatArray, steps: FloatArray) -> FloatArray:
+    """Slopes (parameters, residuals) from a step either way, or from one if the other has none."""
+    sides = np.stack([plus - minus, plus - here, here - minus])
+    sides /= np.stack([2 * steps, steps, steps])
+    known = np.isfinite(sides[:, :, :1])
+    first = np.argmax(known, axis=0)[np.newaxis]
+    slopes: FloatArray = np.take_along_axis(sides, first, axis=0)[0]
+    return np.where(known.any(axis=0), slopes, 0.0)
+
+
 @dataclass(frozen=True)
 class _Mode:
     place: FloatArray
@@ -249,11 +275,18 @@ class _Mode:
     log_density: float
 
 
-def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
-    """Climb from a start (free,) to the mode it leads to, by Newton steps within a trust region."""
+def _mode(
+    posterior: Posterior, start: FloatArray, spread: FloatArray, known: Sequence[_Mode] = ()
+) -> _Mode | None:
+    """Climb from a start (free,) to the mode it leads to, by Newton steps within a trust region.
+
+    None as soon as it is seen to lead to one that is known.
+    """
     surface = _Surface(posterior, start, _units(posterior, start, np.sqrt(np.diag(spread))))
     place, curvature = start, None
     for _ in range(4):
+        if any(_leads_to(posterior, place, mode) for mode in known):
+            return None
         # Each round measures in the units of the last curvature: finite differences need them.
         solution = optimize.minimize(
             surface.value,
@@ -274,15 +307,11 @@ def _mode(posterior: Posterior, start: FloatArray, spread: FloatArray) -> _Mode:
     )
 
 
-def _near(mode: _Mode, place: FloatArray, physical: BoolArray) -> bool:
-    """Tell whether a place lies within a mode, by its physical coordinates."""
-    away = (place - mode.place)[physical]
-    if not away.size:
-        return True
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", linalg.LinAlgWarning)
-        squares = away @ linalg.solve(mode.covariance[np.ix_(physical, physical)], away)
-    return bool(squares < away.size)
+def _leads_to(posterior: Posterior, place: FloatArray, mode: _Mode) -> bool:
+    """Tell whether the density rises, but for a dip, all the way from a place (free,) to a mode."""
+    way = np.linspace(0.0, 1.0, WAY)[:, np.newaxis]
+    density = posterior.log_density(place + way * (mode.place - place))
+    return bool(np.all(density > np.maximum.accumulate(density) - DIP))
 
 
 def _units(posterior: Posterior, place: FloatArray, spread: FloatArray) -> FloatArray:

@@ -2,12 +2,14 @@
 
 A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian. A
 skewed one, with a long tail along some ridge, takes a few of them: a mixture fitted by expectation
-maximisation. Heavy tails on every component keep the ratio of posterior to proposal bounded.
+maximisation, in coordinates that straighten the ridge if it is curved
+(:class:`~bwbayes.sampling.bends.Bend`). Heavy tails on every component keep the ratio of posterior
+to proposal bounded.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
@@ -15,6 +17,7 @@ import numpy as np
 from scipy.stats import skew
 
 from bwbayes.arrays import FloatArray
+from bwbayes.sampling.bends import Bend
 
 __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 
@@ -141,10 +144,13 @@ class StudentMixture:
         wⱼ, (components,), adding up to one.
     components
         The distributions, of one number of degrees of freedom.
+    bend
+        What makes the coordinates in which they are straight; None for the coordinates themselves.
     """
 
     weights: FloatArray
     components: tuple[StudentProposal, ...]
+    bend: Bend | None = None
 
     @classmethod
     def fitted(cls, draws: FloatArray) -> StudentMixture:
@@ -156,6 +162,9 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
+        bend = Bend.fitted(draws)
+        if bend is not None:
+            draws = bend.straight(draws)
         # An odd stride, or the same few walkers might be taken at every step.
         some = draws[:: -(-len(draws) // ROUGH_DRAWS) | 1]
         mixture = _first_cut(some)
@@ -163,7 +172,7 @@ class StudentMixture:
             mixture = mixture._fitted_on(some)
         for _ in range(ROUNDS):
             mixture = mixture._fitted_on(draws)
-        return mixture
+        return replace(mixture, bend=bend)
 
     @classmethod
     def around(
@@ -205,9 +214,12 @@ class StudentMixture:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free), up to a constant."""
+        lost = 0.0
+        if self.bend is not None:
+            coordinates, lost = self.bend.straight(coordinates), self.bend.log_volume
         parts = [component.log_density(coordinates) for component in self.components]
         logs = np.stack([log + part for log, part in zip(np.log(self.weights), parts, strict=True)])
-        density: FloatArray = np.logaddexp.reduce(logs)
+        density: FloatArray = np.logaddexp.reduce(logs) - lost
         return density
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
@@ -220,7 +232,7 @@ class StudentMixture:
         spread = np.sqrt(freedom / random.chisquare(freedom, count))
         away = (factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
         drawn: FloatArray = centres[chosen] + away
-        return drawn
+        return drawn if self.bend is None else self.bend.bent(drawn)
 
     def __call__(
         self, coordinates: FloatArray, random: np.random.RandomState

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.conflict import conflicts
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
@@ -23,9 +25,15 @@ from tests.inference.problems import decaying_sine, posterior_of
 every_operator = pytest.mark.parametrize("name", HYSTERESIS)
 
 
-def posterior(name: str, *, from_rest: bool = False, parts: bool = False) -> Posterior:
+def posterior(
+    name: str,
+    options: Mapping[str, Any] | None = None,
+    *,
+    from_rest: bool = False,
+    parts: bool = False,
+) -> Posterior:
     """Return a posterior of a short record with an operator."""
-    operator = made("hysteresis", name, HYSTERESIS, {})
+    operator = made("hysteresis", name, HYSTERESIS, options or {})
     voltage = decaying_sine(300)[60:]
     gain = PolynomialGain() if parts else None
     creep = Creep((0.1, 1.0), growing=True) if parts else None
@@ -119,6 +127,30 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
         *of.only.actuator.hysteresis.remarks(column, of.names),
     ]
     assert all(isinstance(text, str) and text for text in remarks)
+
+
+def assert_fitted(of: Posterior) -> None:
+    """Fit a simulated record: the mode is at least as probable as the truth."""
+    generator = np.random.default_rng(4)
+    free = of.prior.draw(generator, 1)
+    clean = of.only.actuator.displacement(
+        of.only.table.actuator(of.prior.theta(free)), of.only.voltage
+    )[0]
+    noise = 0.01 * np.ptp(clean) * generator.standard_normal(clean.size)
+    record = of.altered(displacement=clean + noise)
+    truth = record.log_density(of.prior.unconstrain(free))[0]
+    assert fit(record, generator).log_density >= truth
+
+
+def test_a_point_fit_asks_for_no_impossible_loop() -> None:
+    """Bounds of single parameters do not say which shape terms may go together."""
+    assert_fitted(posterior("bouc-wen-asymmetric", {"terms": ["b2", "b5"]}))
+
+
+@pytest.mark.slow
+@every_operator
+def test_every_operator_is_fitted(name: str) -> None:
+    assert_fitted(posterior(name))
 
 
 def assert_finite(name: str, draws: int) -> None:
