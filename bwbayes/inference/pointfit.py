@@ -38,8 +38,7 @@ HOPELESS = 30.0
 # Optima whose sums of squares and coordinates agree to this part are one.
 SAME = 1e-2
 
-# A place from which the density falls by less than this, nats, at so many points on the straight
-# way to a mode belongs to that mode.
+# A place is a mode's if the density falls by less, nats, at so many points on the straight way.
 DIP = 0.5
 WAY = 33
 

@@ -7,7 +7,7 @@ that was cut or changed on the disk the blocks before the damage are read. Going
 first copies what counts into a fresh one. This module alone knows the layout:
 
     /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
-    /proposal/PHASE, /proposal/second    weights, centres, factors of the proposals
+    /proposal/PHASE, /proposal/second    weights, centres, factors of the proposals; bend
     /point                               the point fit
     /committed                           blocks of each phase; proposals of each phase (0 or 1);
                                          blocks of the sampling that were set aside, and those
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from bwbayes.arrays import IntArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.pointfit import PointFit
+from bwbayes.sampling.bends import Bend, rows_of
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
 from bwbayes.sampling.hdf5 import DAMAGE, Image, either, put, reserve
@@ -233,6 +234,7 @@ class ChainFile(Chain):
         group["weights"][:] = proposal.weights
         group["centres"][:] = np.stack([c.centre for c in proposal.components])
         group["factors"][:] = np.stack([c.factor for c in proposal.components])
+        group["bend"][:] = 0.0 if proposal.bend is None else proposal.bend.numbers
 
     def _open(self) -> None:
         self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
@@ -318,6 +320,7 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
         whole[f"proposal/{name}/weights"] = np.zeros(COMPONENTS)
         whole[f"proposal/{name}/centres"] = np.zeros((COMPONENTS, free))
         whole[f"proposal/{name}/factors"] = np.zeros((COMPONENTS, free, free))
+        whole[f"proposal/{name}/bend"] = np.zeros((rows_of(free), free))
     whole["committed"] = np.zeros(REFITTED + 1, dtype=np.int64)
     for name, values in whole.items():
         # Twice, since nothing else could stand in for it; only chunks carry checksums.
@@ -352,7 +355,9 @@ def _padded(counts: IntArray) -> IntArray:
 def _proposal(group: Any) -> StudentMixture:
     """Read a frozen proposal."""
     pairs = zip(either(group["centres"]), either(group["factors"]), strict=True)
-    return StudentMixture(either(group["weights"]), tuple(StudentProposal(*pair) for pair in pairs))
+    parts = tuple(StudentProposal(*pair) for pair in pairs)
+    bend = Bend.of(either(group["bend"])) if "bend" in group else None  # older files have none
+    return StudentMixture(either(group["weights"]), parts, bend)
 
 
 def _blocks(group: Any, number: int, block: int) -> list[Block]:

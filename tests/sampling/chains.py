@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.pointfit import PointFit
+from bwbayes.sampling.bends import Bend, pairs
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
 from bwbayes.sampling.moves import MOVES
@@ -68,7 +69,10 @@ def proposal(phase: Phase) -> StudentMixture:
     factors = np.tril(generator.standard_normal((COMPONENTS, FREE, FREE)))
     centres = generator.standard_normal((COMPONENTS, FREE))
     parts = tuple(StudentProposal(*pair) for pair in zip(centres, factors, strict=True))
-    return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts)
+    bends = np.zeros((pairs(FREE), FREE))
+    bends[0, 1] = generator.standard_normal()
+    bend = Bend(centres[0], factors[0], bends)
+    return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts, bend)
 
 
 def new(path: Path, blocks_before: int = 0, steps: int = STEPS) -> ChainFile:

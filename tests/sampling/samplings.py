@@ -76,6 +76,11 @@ def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None)
         assert mine.freedom == yours.freedom
         np.testing.assert_array_equal(mine.centre, yours.centre)
         np.testing.assert_array_equal(mine.factor, yours.factor)
+    if one.bend is None or two.bend is None:
+        assert one.bend is two.bend
+        return
+    for name in ("centre", "factor", "bends"):
+        np.testing.assert_array_equal(getattr(one.bend, name), getattr(two.bend, name))
 
 
 def assert_same_chain(one: Chain, two: Chain) -> None:

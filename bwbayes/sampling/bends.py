@@ -1,0 +1,148 @@
+"""Coordinates in which a curved posterior is straight.
+
+Along a ridge that a record hardly tells, other parameters follow the one that is free, and seldom
+in a straight line: the ridge is a hundred times as long as wide, and bent by many times its width.
+No few ellipsoids cover it. A :class:`Bend` takes the draws' principal coordinates, longest first,
+and lets each bend quadratically with those before it. That changes no volume, so a distribution of
+the straight coordinates is one of the bent ones, density and all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+
+__all__ = ["Bend", "pairs", "rows_of"]
+
+# A coordinate bends if that explains so much of its variance.
+LEAST_EXPLAINED = 0.1
+
+# Only the longest coordinates bend others: so many, and fewer if a coefficient has fewer draws.
+LONGEST = 12
+DRAWS_EACH = 50
+
+# Added to the coefficients' information, in units of that of all draws: few draws tell little.
+RIDGE = 1e-3
+
+# A bend goes on straight beyond so many sds, where no draws have shown it.
+FARTHEST = 5.0
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The map from straight coordinates z to bent ones x.
+
+    With c = clip(z) to five sds, over coordinates in the order of their lengths,
+
+        yⱼ = zⱼ + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
+
+    Parameters
+    ----------
+    centre
+        μ, (free,).
+    factor
+        F, (free, free): its columns are the principal axes of the draws, as long as their sds.
+    bends
+        bᵢₖⱼ, (pairs, free), zero unless i ≤ k < j; the pairs (0, 0), (0, 1), (1, 1), (0, 2), … of
+        the first twelve coordinates.
+    """
+
+    centre: FloatArray
+    factor: FloatArray
+    bends: FloatArray
+
+    @classmethod
+    def fitted(cls, draws: FloatArray) -> Bend | None:
+        """Fit to draws (count, free) by least squares; None where they are not bent.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            The decomposition of the draws does not converge.
+        """
+        count, free = draws.shape
+        centre = np.mean(draws, axis=0)
+        # Singular values keep the digits of directions that variances would lose.
+        _, lengths, axes = np.linalg.svd(np.linalg.qr(draws - centre, mode="r"))
+        factor = axes.T * (lengths / np.sqrt(count))
+        z = np.linalg.solve(factor, (draws - centre).T).T
+        bends = np.zeros((pairs(free), free))
+        products = np.empty((count, 0))
+        for j in range(1, free):
+            if j <= LONGEST and (products.shape[1] + j) * DRAWS_EACH <= count:
+                products = np.concatenate([products, _products(z, j - 1)], axis=1)
+            terms = products.shape[1]
+            information = products.T @ products / count + RIDGE * np.eye(terms)
+            told = np.linalg.solve(information, products.T @ z[:, j] / count)
+            straight = z[:, j] - products @ told
+            if np.var(straight) < (1 - LEAST_EXPLAINED) * np.var(z[:, j]):
+                z[:, j], bends[:terms, j] = straight, told
+        return cls(centre, factor, bends) if bends.any() else None
+
+    @classmethod
+    def of(cls, numbers: FloatArray) -> Bend | None:
+        """Return the bend of ``numbers``; None if they are zero."""
+        free = numbers.shape[1]
+        return cls(numbers[0], *np.split(numbers[1:], [free])) if numbers.any() else None
+
+    @property
+    def numbers(self) -> FloatArray:
+        """μ, F and b as one table, (1 + free + pairs, free)."""
+        return np.vstack([self.centre, self.factor, self.bends])
+
+    @cached_property
+    def log_volume(self) -> float:
+        """Log |det F|: what a density loses on the way to x."""
+        return float(np.linalg.slogdet(self.factor)[1])
+
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        return np.ascontiguousarray(np.linalg.inv(self.factor).T)
+
+    @cached_property
+    def _curved(self) -> tuple[tuple[int, int], ...]:
+        """The coordinates that bend, and how many pairs bend them."""
+        ends = [int(np.flatnonzero(one)[-1]) + 1 if one.any() else 0 for one in self.bends.T]
+        return tuple((j, end) for j, end in enumerate(ends) if end)
+
+    def bent(self, straight: FloatArray) -> FloatArray:
+        """Return x (..., free) of z (..., free)."""
+        longest = min(straight.shape[-1], LONGEST)
+        products = np.concatenate([_products(straight, k) for k in range(longest)], axis=-1)
+        x: FloatArray = self.centre + (straight + products @ self.bends) @ self.factor.T
+        return x
+
+    def straight(self, bent: FloatArray) -> FloatArray:
+        """Return z (..., free) of x (..., free): one coordinate after the other."""
+        z: FloatArray = (bent - self.centre) @ self._inverse
+        products = np.empty((*z.shape[:-1], 0))
+        known = 0
+        for j, end in self._curved:
+            while products.shape[-1] < end:
+                products = np.concatenate([products, _products(z, known)], axis=-1)
+                known += 1
+            z[..., j] -= products[..., :end] @ self.bends[:end, j]
+        return z
+
+
+def pairs(free: int) -> int:
+    """Return how many pairs of so many coordinates may bend others."""
+    longest = min(free, LONGEST)
+    return longest * (longest + 1) // 2
+
+
+def rows_of(free: int) -> int:
+    """Return how many rows the numbers of a bend have."""
+    return 1 + free + pairs(free)
+
+
+def _products(z: FloatArray, last: int) -> FloatArray:
+    """Return cᵢ cₖ − δᵢₖ (..., k + 1) of one k, the ``last``, and every i up to it."""
+    near = np.clip(z[..., : last + 1], -FARTHEST, FARTHEST)
+    products: FloatArray = near * near[..., -1:]
+    products[..., -1] -= 1.0
+    return products
