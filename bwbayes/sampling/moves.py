@@ -4,9 +4,9 @@ Differential evolution steps along the difference of two other walkers, so it fo
 ensemble lies on; a snooker step now and then helps between modes. Neither needs tuning, and they
 bring the pilot to the posterior, where half of its steps try places of the point fit's own guess.
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws, and bent as they
-are, proposes places independently of where a walker is, which mixes about ten times faster. The fit is frozen before
-the draws that count, and a seventh of the steps remain differential evolution and snooker, so
-that whatever the fit does not cover is reached, and left again.
+are, proposes places independently of where a walker is, which mixes about ten times faster. The fit
+is frozen before the draws that count, and a seventh of the steps remain differential evolution and
+snooker, so that whatever the fit does not cover is reached, and left again.
 """
 
 from __future__ import annotations
