@@ -11,16 +11,16 @@ Default priors are so wide that some truths have next to no hysteresis; their po
 and curved, and take more steps than the budget has. There a replicate ends, and is ranked as it is;
 at most one in ten may.
 
-The default suite makes 30 replicates with the lag, and with priors of someone who knows the kind of
-actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are tested
-together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a wrong width
-and a bias on the draws (sds three tenths too small are seen nearly always, sds a fifth too small 87
-times in 100, a bias of 0.3 sd 96 times). Coverages of the 18 bands are held to the spread between
-replicates: by chance one in 100 sound calibrations has one that is off by more (Bonferroni's
-bound). ``-m slow`` makes 150 replicates of this, and with default priors for all with the lag, the
-second order, and the lag with little noise; and 50, each of 6,000 steps at most, with a free
-exponent beside known hysteresis: four seconds of a record do not tell an exponent, a loop and its
-shape of which nothing is known, and each takes most of a minute.
+The default suite makes 150 replicates with the lag, and with priors of someone who knows the kind
+of actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are
+tested together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a
+wrong width and a bias on the draws (sds a fifth too small, or a bias of 0.3 sd, are seen nearly
+always). Coverages of the 18 bands are held to the spread between replicates: by chance one in 100
+sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` keeps the figures
+of this, and makes 150 with default priors for all with the lag, the second order, and the lag with
+little noise; and 50, each of 6,000 steps at most, with a free exponent beside known hysteresis:
+four seconds of a record do not tell an exponent, a loop and its shape of which nothing is known,
+and each takes most of a minute.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.workers import one_thread
-from bwbayes.arrays import FloatArray
 from bwbayes.data.io.formats import write_record
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
@@ -47,10 +46,9 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.results.calibration import Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.measured import keep
-from tests.together import LEVEL, Plant, shifted, together_test
+from tests.together import LEVEL, Plant, narrowed, shifted, together_test
 
 SEED = 1
-QUICK = 30
 
 # Part of the replicates that may end before they have converged.
 MOST_UNCONVERGED = 0.1
@@ -196,7 +194,8 @@ def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Experiment, list[Replicate]]:
-    return made("known hysteresis", tmp_path_factory.mktemp("typical"), QUICK)
+    count = VARIANTS["known hysteresis"].replicates
+    return made("known hysteresis", tmp_path_factory.mktemp("typical"), count)
 
 
 Sound = tuple[Experiment, list[Replicate]]
@@ -206,20 +205,16 @@ def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> No
     common, every = sound
     outcome = judge([one.entry() for one in every], np.random.default_rng(SEED))
     assert [] == remarks(outcome)
-    assert len(outcome.unconverged) <= MOST_UNCONVERGED * QUICK
+    assert len(outcome.unconverged) <= MOST_UNCONVERGED * len(every)
     assert together_test(every, common.posterior.prior) > LEVEL
 
 
 def test_bands_of_the_record_and_of_another_one_hold(sound: Sound) -> None:
     outcome = off(sound[1])
     assert 18 == len(outcome)
-    assert {} == {name: t for name, t in outcome.items() if not abs(t) < band_limit(18, QUICK)}
-
-
-def narrowed(draws: FloatArray) -> FloatArray:
-    """Make the sds of draws (draws, free) three tenths smaller."""
-    middle = np.mean(draws, axis=0)
-    return middle + 0.7 * (draws - middle)
+    assert {} == {
+        name: t for name, t in outcome.items() if not abs(t) < band_limit(18, len(sound[1]))
+    }
 
 
 @pytest.mark.parametrize("defect", [narrowed, shifted])

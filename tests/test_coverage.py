@@ -13,7 +13,8 @@ the whole record: most seeds then cover nearly all samples and some few only hal
 without any of those show hardly a spread. Over 40 seeds the sd of a coverage p was 0.35 of
 √(p (1 − p)); so there a spread below 0.3 of that is not believed.
 
-The default runs at 100 Hz to be affordable; ``-m slow`` runs 40 seeds at 1000 Hz.
+These run at 100 Hz, and 40 seeds at 1000 Hz, all of them slow: that posteriors and bands are
+calibrated at all is for the calibrations, in the default suite.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ from bwbayes.sampling.sampler import draws, first_chain, sample
 from tests.measured import keep
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"
+pytestmark = pytest.mark.slow
+
 LIMIT = 5.0
 LEAST_SPREAD = 0.3
 
@@ -142,7 +145,6 @@ def test_twin_bands_that_are_too_narrow_are_found(replicates: list[Replicate], k
     assert min(off.values()) < -LIMIT, off
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("discrepancy", ["process", "none"])
 def test_forty_seeds_at_the_full_rate(discrepancy: str) -> None:
     """Three standard errors, with 40 seeds, at 1000 Hz."""

@@ -45,6 +45,9 @@ __all__ = [
 # Draws that a truth is ranked among.
 RANKED = 199
 
+# Draws in the mixture of a replicate's bands: fewer than in a run, for it takes most of the time.
+MIXED = 400
+
 # What is ranked besides the free parameters.
 EXTRA = ("log_likelihood", "opening", "range")
 
@@ -277,7 +280,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     ended = outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
     if len(free) < RANKED:
         return Replicate(number, *ended, names, truth, nothing, {})
-    flat = thinned(chained.reshape(-1, free.shape[1]), predicting)
+    flat = thinned(chained.reshape(-1, free.shape[1]), predicting, MIXED)
     inside = _held_out(experiment, posterior, flat, made, predicting)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
     inside |= _others(experiment, posterior, flat, theta, made, others)

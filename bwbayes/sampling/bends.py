@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 
 __all__ = ["Bend", "pairs", "rows_of"]
 
@@ -104,6 +104,13 @@ class Bend:
         return np.ascontiguousarray(np.linalg.inv(self.factor).T)
 
     @cached_property
+    def _pairs(self) -> tuple[IntArray, IntArray]:
+        """Every i and k of the rows of ``bends``."""
+        longest = np.arange(min(self.centre.size, LONGEST))
+        k = np.repeat(longest, longest + 1)
+        return np.concatenate([longest[: last + 1] for last in longest]), k
+
+    @cached_property
     def _curved(self) -> tuple[tuple[int, int], ...]:
         """The coordinates that bend, and how many pairs bend them."""
         ends = [int(np.flatnonzero(one)[-1]) + 1 if one.any() else 0 for one in self.bends.T]
@@ -111,8 +118,9 @@ class Bend:
 
     def bent(self, straight: FloatArray) -> FloatArray:
         """Return x (..., free) of z (..., free)."""
-        longest = min(straight.shape[-1], LONGEST)
-        products = np.concatenate([_products(straight, k) for k in range(longest)], axis=-1)
+        i, k = self._pairs
+        near = np.clip(straight, -FARTHEST, FARTHEST)
+        products = near[..., i] * near[..., k] - (i == k)
         x: FloatArray = self.centre + (straight + products @ self.bends) @ self.factor.T
         return x
 
