@@ -21,7 +21,7 @@ from bwbayes.results.bands import LEVELS
 from tests.examples import README, ROOT, blocks
 from tests.measured import measured
 from tests.test_calibration_moving import MOST_UNCONVERGED
-from tests.test_calibration_parts import REPLICATES
+from tests.test_calibration_parts import EVERY, REPLICATES
 
 
 def block(name: str) -> str:
@@ -171,11 +171,14 @@ def parts() -> str:
     missed = {name: one["unconverged"] for name, one in every.items()}
     many = {name: count for name, count in missed.items() if count > MOST_UNCONVERGED * REPLICATES}
     told = ", ".join(f"{name} {count}" for name, count in sorted(many.items()))
+    most = max(set(missed.values()) - set(many.values()))
+    late = ", ".join(sorted(set(EVERY) - set(every)))
     return (
         f"{', '.join(sorted(every))}, {REPLICATES} replicates each: no test of ranks failed, none "
         f"of {18 * len(every)} bands is off by more than {worst:.1f} standard errors; not "
-        f"converged in their budget at most {max(set(missed.values()) - set(many.values()))}, but "
-        f"more than the tenth that is allowed of {told}; the others have not run to the end"
+        f"converged in their budget at most {most}"
+        + (f", but more than the tenth that is allowed of {told}" if many else "")
+        + (f"; {late} have not run to the end" if late else "")
     )
 
 
