@@ -6,8 +6,8 @@ record that starts in a state and a history of its own.
 
 The default suite makes 150 replicates of backlash-like hysteresis beside a gain, with priors of
 someone who knows the kind of actuator for the hysteresis; with Bouc-Wen in
-:mod:`tests.test_calibration_moving` these are three parts. The slow one does it with Prandtl-
-Ishlinskii too, whose memory is a stack of extrema. All parameters of a replicate are tested
+:mod:`tests.test_calibration_moving` these are three parts. The slow one does it with
+Prandtl-Ishlinskii too, whose memory is a stack of extrema. All parameters of a replicate are tested
 together (:mod:`tests.together`) at a level of 0.01. That raises a false alarm in one of 100; sds a
 fifth too small, or a bias of 0.3 sd, it finds nearly always, and twins plant both on the draws.
 Means of coverages are held to the spread between replicates (Bonferroni's bound: one false alarm in
