@@ -25,6 +25,10 @@ LEAST_EXPLAINED = 0.1
 LONGEST = 12
 DRAWS_EACH = 50
 
+# Draws that a bend is fitted to, and places that are straightened at once: products take memory.
+FITTED = 20_000
+AT_ONCE = 4096
+
 # Added to the coefficients' information, in units of that of all draws: few draws tell little.
 RIDGE = 1e-3
 
@@ -57,13 +61,15 @@ class Bend:
 
     @classmethod
     def fitted(cls, draws: FloatArray) -> Bend | None:
-        """Fit to draws (count, free) by least squares; None where they are not bent.
+        """Fit to draws (count, free), or some of many, by least squares; None if not bent.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             The decomposition of the draws does not converge.
         """
+        # An odd stride, or the same few walkers might be taken at every step.
+        draws = draws[:: -(-len(draws) // FITTED) | 1]
         count, free = draws.shape
         centre = np.mean(draws, axis=0)
         # Singular values keep the digits of directions that variances would lose.
@@ -125,15 +131,22 @@ class Bend:
         return x
 
     def straight(self, bent: FloatArray) -> FloatArray:
-        """Return z (..., free) of x (..., free): one coordinate after the other."""
+        """Return z (..., free) of x (..., free)."""
+        places = bent.reshape(-1, bent.shape[-1])
+        parts = [places[i : i + AT_ONCE] for i in range(0, len(places), AT_ONCE)]
+        z = np.concatenate([self._straight(part) for part in parts]) if parts else places
+        return z.reshape(bent.shape)
+
+    def _straight(self, bent: FloatArray) -> FloatArray:
+        """Do it for places (count, free), one coordinate after the other."""
         z: FloatArray = (bent - self.centre) @ self._inverse
-        products = np.empty((*z.shape[:-1], 0))
+        products = np.empty((len(z), 0))
         known = 0
         for j, end in self._curved:
-            while products.shape[-1] < end:
-                products = np.concatenate([products, _products(z, known)], axis=-1)
+            while products.shape[1] < end:
+                products = np.concatenate([products, _products(z, known)], axis=1)
                 known += 1
-            z[..., j] -= products[..., :end] @ self.bends[:end, j]
+            z[:, j] -= products[:, :end] @ self.bends[:end, j]
         return z
 
 
@@ -149,8 +162,8 @@ def rows_of(free: int) -> int:
 
 
 def _products(z: FloatArray, last: int) -> FloatArray:
-    """Return cᵢ cₖ − δᵢₖ (..., k + 1) of one k, the ``last``, and every i up to it."""
-    near = np.clip(z[..., : last + 1], -FARTHEST, FARTHEST)
-    products: FloatArray = near * near[..., -1:]
-    products[..., -1] -= 1.0
+    """Return cᵢ cₖ − δᵢₖ (count, k + 1) of one k, the ``last``, and every i up to it."""
+    near = np.clip(z[:, : last + 1], -FARTHEST, FARTHEST)
+    products: FloatArray = near * near[:, -1:]
+    products[:, -1] -= 1.0
     return products

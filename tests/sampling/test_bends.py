@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import gammaln
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.bends import LONGEST, Bend, pairs
+from bwbayes.sampling.bends import AT_ONCE, LONGEST, Bend, pairs
 from bwbayes.sampling.proposals import StudentMixture
 
 # A ridge a hundred times as long as wide, whose ends lie some twenty widths off its middle.
@@ -58,6 +58,13 @@ def test_a_bend_changes_no_volume_but_by_its_factor(free: int, seed: int) -> Non
     slopes = [(bend.bent(z + h) - bend.bent(z - h)) / (2 * step) for h in step * np.eye(free)]
     determinant = np.linalg.slogdet(np.stack(slopes))[1]
     assert determinant == pytest.approx(bend.log_volume, abs=1e-4)
+
+
+def test_many_places_are_straightened_as_few() -> None:
+    bend = any_bend(4, 1)
+    x = bend.bent(np.random.default_rng(2).standard_normal((2 * AT_ONCE + 7, 4)))
+    parts = np.concatenate([bend.straight(part) for part in np.array_split(x, 9)])
+    np.testing.assert_allclose(bend.straight(x), parts, rtol=1e-12, atol=1e-9)
 
 
 def slowly_bent(bend: Bend, z: FloatArray) -> FloatArray:
