@@ -230,7 +230,7 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     problem, chain, _ = finished(RunFolder.open(parts_folder))
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     # So many draws are enough: most of their band is the discrepancy.
-    drawn = thinned(flat, np.random.default_rng(1), 400)
+    drawn = thinned(flat, np.random.default_rng(1), 250)
     record = read_record(RECORD)
     results = []
     for transient in (0.0, 20.0):

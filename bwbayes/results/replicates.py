@@ -42,11 +42,8 @@ __all__ = [
     "replicates",
 ]
 
-# Draws that a truth is ranked among.
-RANKED = 199
-
-# Draws in the mixture of a replicate's bands: fewer than in a run, for it takes most of the time.
-MIXED = 400
+# Draws that a truth is ranked among, and those in the bands: fewer than a run's, to save time.
+RANKED, MIXED = 199, 400
 
 # What is ranked besides the free parameters.
 EXTRA = ("log_likelihood", "opening", "range")

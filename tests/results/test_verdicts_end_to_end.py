@@ -190,7 +190,7 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
     return counts
 
 
-# Two of the transients add less than six nats, which may be chance: those are left open.
+# Two of the transients add less than six nats, which may be chance: those may be left open (None).
 HARDEST = [
     ((2, 1), "sign", False),
     ((20261122, 4), "transient", None),
@@ -216,8 +216,8 @@ def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
     assert all(one.holds is not False for one in run(seed, tmp_path).verdicts.values())
     where, causes = SPOILT_KINDS[kind]
     verdict = run(seed, tmp_path, kind).verdicts[where]
-    assert verdict.holds is holds
-    if holds is False:
+    assert verdict.holds in (holds, False)
+    if verdict.holds is False:
         assert verdict.cause is not None
         assert verdict.cause.kind in causes
 
