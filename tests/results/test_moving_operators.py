@@ -40,7 +40,8 @@ from tests.results.moving import (
 
 QUICK = 40
 QUICK_LIMIT = 4.0
-THREE = ("prandtl-ishlinskii", "preisach", "duhem")
+# Of those that remember extrema the quicker one.
+FEW = ("preisach", "duhem")
 
 RECORDS = 200
 LEAST, MOST = 0.93, 0.97
@@ -61,7 +62,7 @@ def alarms(every: list[Bands]) -> int:
     return int(np.sum(np.array(p) < LEAD_IN_ALARM))
 
 
-@pytest.mark.parametrize("name", THREE)
+@pytest.mark.parametrize("name", FEW)
 def test_bands_cover_records_cut_from_a_running_drive(name: str) -> None:
     every = studied(Case(hysteresis=name), QUICK, seed=1)
     t = {level: off for level, (_, off) in coverages(every).items()}
@@ -94,7 +95,7 @@ def widening(case: Case, records: int) -> float:
     return float(np.max(np.mean(ratios, axis=0)))
 
 
-@pytest.mark.parametrize("name", THREE)
+@pytest.mark.parametrize("name", FEW)
 def test_not_knowing_that_a_record_starts_from_rest_costs_little(name: str) -> None:
     assert widening(Case(hysteresis=name, discrepancy=1.5), 5) < 1.1
 
