@@ -16,7 +16,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 
-__all__ = ["Bend", "pairs", "rows_of"]
+__all__ = ["Bend", "pairs", "rows_of", "some_of"]
 
 # A coordinate bends if that explains so much of its variance.
 LEAST_EXPLAINED = 0.1
@@ -68,8 +68,7 @@ class Bend:
         numpy.linalg.LinAlgError
             The decomposition of the draws does not converge.
         """
-        # An odd stride, or the same few walkers might be taken at every step.
-        draws = draws[:: -(-len(draws) // FITTED) | 1]
+        draws = some_of(draws, FITTED)
         count, free = draws.shape
         centre = np.mean(draws, axis=0)
         # Singular values keep the digits of directions that variances would lose.
@@ -148,6 +147,12 @@ class Bend:
                 known += 1
             z[:, j] -= products[:, :end] @ self.bends[:end, j]
         return z
+
+
+def some_of(draws: FloatArray, most: int) -> FloatArray:
+    """Return so many of draws (count, free) at most, evenly from first to last."""
+    # An odd stride, or the same few walkers might be taken at every step.
+    return draws[:: -(-len(draws) // most) | 1]
 
 
 def pairs(free: int) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import skew
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.bends import Bend
+from bwbayes.sampling.bends import Bend, some_of
 
 __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 
@@ -165,8 +165,7 @@ class StudentMixture:
         bend = Bend.fitted(draws)
         if bend is not None:
             draws = bend.straight(draws)
-        # An odd stride, or the same few walkers might be taken at every step.
-        some = draws[:: -(-len(draws) // ROUGH_DRAWS) | 1]
+        some = some_of(draws, ROUGH_DRAWS)
         mixture = _first_cut(some)
         for _ in range(ROUGH_ROUNDS):
             mixture = mixture._fitted_on(some)
