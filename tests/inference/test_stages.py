@@ -89,7 +89,11 @@ def test_drives_agree_with_their_operators(operator: Pinned, path: str) -> None:
     """The steps of the integrator are the same, so its error is; what is left is rounding."""
     column, voltage = models(operator, 3), paths()[path]
     memory = operator.begin(column, float(voltage[0]), SPAN, from_rest=False)
-    expected = operator.advance(column, voltage, memory)[0]
-    got = DRIVES[type(operator)](operator, column, voltage, memory)
+    expected, expected_memory = operator.advance(column, voltage, memory)
+    before = memory.state.copy()
+    got, after = DRIVES[type(operator)](operator, column, voltage, memory)
+    np.testing.assert_array_equal(memory.state, before)
     size = np.abs(expected).max(axis=1, keepdims=True)
     assert (np.abs(got - expected) <= 1e-10 * size).all()
+    assert after.voltage == expected_memory.voltage
+    assert (np.abs(after.state - expected_memory.state) <= 1e-9 * size[:, 0]).all()

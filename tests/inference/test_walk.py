@@ -16,6 +16,9 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.domain_wall import DomainWall
+from bwbayes.model.operators.jiles_atherton import JilesAtherton
+from bwbayes.model.operators.pinned import Pinned
 from tests.inference.test_compiled_extrema import COMPILED
 from tests.inference.test_gain_and_creep import GAIN, PARTS
 from tests.inference.test_likelihood import moving
@@ -56,7 +59,8 @@ def test_bouc_wen_walks_as_with_numpy(dynamics: str, hold: Hold, gain: Any, coun
 
 def as_theta(actuator: Actuator, column: dict[str, FloatArray]) -> FloatArray:
     """Return θ (models, parameters) of an operator's columns, with a lag and an offset."""
-    known = {"lag": np.array(0.01), "offset": np.array(3.0)} | column
+    known = {"lag": np.array(0.01), "offset": np.array(3.0)}
+    known |= {"quadratic": np.array(0.4), "cubic": np.array(-0.3)} | column
     return np.stack([np.resize(known[name], LANES) for name in actuator.parameters], axis=1)
 
 
@@ -66,6 +70,21 @@ def test_operators_of_one_state_walk_as_with_numpy(name: str, path: str) -> None
     actuator = Actuator("lag", "first", 1e-3, OPERATORS[name], span=SPAN)
     column = models(OPERATORS[name], 2)
     assert_walks_as(actuator, as_theta(actuator, column), paths()[path], 1)
+
+
+@pytest.mark.parametrize("operator", [JilesAtherton(), DomainWall()])
+@pytest.mark.parametrize("path", paths())
+@pytest.mark.parametrize("gain", [None, GAIN])
+def test_pinned_walls_walk_as_with_numpy(operator: Pinned, path: str, gain: Any) -> None:
+    """NumPy takes the same pieces: an integrator's steps end where a piece does."""
+    actuator = Actuator("lag", "first", 1e-3, operator, gain, span=SPAN)
+    theta, voltage = as_theta(actuator, models(operator, 3)), paths()[path]
+    begun, state = walk(actuator, theta, voltage), None
+    assert begun is not None
+    for first, last in pairwise([*(cut for cut in CUTS if cut < voltage.size), voltage.size]):
+        expected, state = actuator.advance(theta, voltage[first:last], state)
+        size = np.abs(expected).max(axis=1, keepdims=True)
+        assert (np.abs(begun.to(last) - expected) <= 1e-9 * size).all()
 
 
 @pytest.mark.parametrize("name", COMPILED)

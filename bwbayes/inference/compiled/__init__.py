@@ -12,7 +12,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import kernels, lanes
-from bwbayes.inference.compiled.stages import DRIVES, GIVEN, STAGES
+from bwbayes.inference.compiled.stages import DRIVES, STAGES, given
 from bwbayes.inference.noise import Noise, SteadyState
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
@@ -80,8 +80,9 @@ def moments(
         rest = np.zeros(len(theta))
         rest[rows] = drive[:, 0]
         models = _models(actuator, column, rest, steady, voltage)[rows]
-        own = np.stack([np.arange(rows.size), drive[:, 0]], axis=1)
-        sums[:, rows] = kernels.sums(*record, models, GIVEN, own, drive, *parts, *unknowns)
+        stage = given(drive[:, 0], drive)
+        mine = stage.kind, stage.own, stage.plan
+        sums[:, rows] = kernels.sums(*record, models, *mine, *parts, *unknowns)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):
@@ -101,7 +102,7 @@ def _drive(
         return actuator.hysteretic(theta, voltage, from_rest=from_rest)
     column = actuator.columns(theta)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
-    return compiled(actuator.hysteresis, column, voltage, memory)
+    return compiled(actuator.hysteresis, column, voltage, memory)[0]
 
 
 def _parts(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

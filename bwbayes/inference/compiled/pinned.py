@@ -44,16 +44,19 @@ from bwbayes.model.operators.walls import (
 __all__ = ["drive"]
 
 
-def drive(operator: Pinned, column: Values, voltage: FloatArray, memory: Memory) -> FloatArray:
-    """Return w (models, samples), um, as ``operator.advance`` does."""
+def drive(
+    operator: Pinned, column: Values, voltage: FloatArray, memory: Memory
+) -> tuple[FloatArray, Memory]:
+    """Return w (models, samples), um, and the memory after it, as ``operator.advance`` does."""
     joined = np.concatenate([[memory.voltage], voltage])
     stretches = list(monotone_stretches(joined, LONGEST))
     ends = np.array([[one.first, one.last] for one in stretches], dtype=np.int64)
     directions = np.array([one.direction for one in stretches])
     walls = np.stack(operator.walls(column), axis=1)
     spins = isinstance(operator, DomainWall)
-    state = np.ascontiguousarray(memory.state)
-    return _follow(spins, walls, joined, ends, directions, state)[:, 1:]
+    state = np.array(memory.state)
+    w = _follow(spins, walls, joined, ends, directions, state)[:, 1:]
+    return w, Memory(float(joined[-1]), state)
 
 
 @njit(nogil=True, cache=True)
@@ -65,7 +68,7 @@ def _follow(
     directions: FloatArray,
     state: FloatArray,
 ) -> FloatArray:
-    """Return w (models, samples) along stretches from the irreversible displacements ``state``."""
+    """Return w (models, samples) along stretches, and move irreversible displacements on."""
     result = np.empty((state.size, voltage.size))
     for model in range(state.size):
         own, fixed = walls[model], state[model]
@@ -75,6 +78,7 @@ def _follow(
             first, last = ends[stretch]
             s = directions[stretch]
             fixed = s * _rise(spins, own, s * fixed, s, voltage[first : last + 1], out[first:])
+        state[model] = fixed
     return result
 
 

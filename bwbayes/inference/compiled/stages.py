@@ -3,7 +3,7 @@
 A stage writes the drive's distance from that of the first sample, w − w₀, of a piece of a record
 for ``LANES`` models side by side. What a model is and remembers stands in rows of ``LANES`` numbers
 of one flat array, ``own``; what the stage may know of the voltage beforehand is its ``plan``. An
-operator without a stage is worked out with NumPy, and its drive is the plan.
+operator without a stage is worked out beforehand, and its drive is the plan.
 
 A new stage is a file of its own, a line in ``KINDS`` and one in :func:`drive_of`.
 """
@@ -40,7 +40,7 @@ from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 
-__all__ = ["DRIVES", "GIVEN", "STAGES", "Stage", "drive_of"]
+__all__ = ["DRIVES", "GIVEN", "STAGES", "Stage", "drive_of", "given"]
 
 GIVEN, BOUC_WEN, BOUC_WEN_ASYMMETRIC, DUHEM, EXPONENTIAL, LINES, BELLS = range(7)
 
@@ -132,11 +132,19 @@ STAGES: Mapping[type[Operator], Callable[[Operator, Values, FloatArray, Any], St
     Duhem: _duhem,
 }
 
-# What makes the drive of a whole record at once, (models, samples), as the operator does.
-DRIVES: Mapping[type[Operator], Callable[[Any, Values, FloatArray, Any], FloatArray]] = {
+# What makes the drive of a whole piece at once, (models, samples), as the operator's ``advance``.
+DRIVES: Mapping[
+    type[Operator], Callable[[Any, Values, FloatArray, Any], tuple[FloatArray, Any]]
+] = {
     JilesAtherton: pinned.drive,
     DomainWall: pinned.drive,
 }
+
+
+def given(rest: FloatArray, drive: FloatArray) -> Stage:
+    """Take a drive (models, samples), um, that is known, and at the first sample was ``rest``."""
+    own = np.stack([np.arange(rest.size), rest], axis=1)
+    return Stage(GIVEN, np.ones(rest.size, dtype=bool), rest, own, drive)
 
 
 @njit(nogil=True, cache=True)

@@ -6,6 +6,8 @@ for ``LANES`` models side by side.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -25,8 +27,10 @@ from bwbayes.inference.compiled.lanes import (
     X2,
 )
 from bwbayes.inference.compiled.parts import polynomial
-from bwbayes.inference.compiled.stages import STAGES, Stage, drive_of
+from bwbayes.inference.compiled.stages import DRIVES, STAGES, Stage, drive_of, given
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
+from bwbayes.model.operator import Operator
 
 __all__ = ["Walk", "walk"]
 
@@ -35,12 +39,21 @@ PIECE = 64
 
 
 class Walk:
-    """Models on their way along a voltage; see :func:`walk`."""
+    """Models on their way along a voltage; see :func:`walk`.
+
+    ``drive`` makes the next piece of the operator's drive, where that has no stage of its own.
+    """
 
     def __init__(
-        self, stage: Stage, curve: FloatArray, state: FloatArray, voltage: FloatArray
+        self,
+        stage: Stage,
+        curve: FloatArray,
+        state: FloatArray,
+        voltage: FloatArray,
+        drive: _Drive | None,
     ) -> None:
         self.stage, self.curve, self.state, self.voltage = stage, curve, state, voltage
+        self.drive = drive
         groups = np.reshape(stage.own[_lanes(len(stage.own))], (len(state), LANES, -1))
         self.own = np.ascontiguousarray(groups.swapaxes(1, 2)).reshape(len(state), -1)
         self.now = 0
@@ -48,12 +61,28 @@ class Walk:
     def to(self, last: int) -> FloatArray:
         """Displacement (models, samples), um, from where the models are to before a sample."""
         displacement = np.empty((len(self.stage.own), last - self.now))
-        _walk(
-            self.stage.kind, self.own, self.stage.plan, self.curve, self.state, self.voltage,
-            self.now, last, displacement,
-        )  # fmt: skip
+        known, begin, end = (self.stage.plan, self.curve, self.voltage), self.now, last
+        if self.drive is not None:
+            piece = slice(begin, end)
+            known = self.drive.along(self.voltage[piece]), self.curve[piece], self.voltage[piece]
+            begin, end = 0, last - self.now
+        plan, curve, voltage = known
+        _walk(self.stage.kind, self.own, plan, curve, self.state, voltage, begin, end, displacement)
         self.now = last
         return displacement
+
+
+class _Drive:
+    """What an operator without a stage makes of a voltage, piece by piece."""
+
+    def __init__(self, operator: Operator, column: Values, memory: Any) -> None:
+        self.operator, self.column, self.memory = operator, column, memory
+        self.make = DRIVES[type(operator)]
+
+    def along(self, voltage: FloatArray) -> FloatArray:
+        """Return the drive (models, samples), um, along the next piece."""
+        drive, self.memory = self.make(self.operator, self.column, voltage, self.memory)
+        return drive
 
 
 def walk(
@@ -66,17 +95,23 @@ def walk(
 ) -> Walk | None:
     """Put models to a voltage's first sample; None if they are left to NumPy.
 
-    That is so with creep, for an operator without a stage, and where a stage cannot do a model.
+    That is so with creep, for an operator that is not compiled, and where a stage cannot do a
+    model.
     Parameters and errors as of :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the
     ``voltage`` (samples,) is known up to the end.
     """
-    prepare = STAGES.get(type(actuator.hysteresis))
-    if prepare is None or actuator.creep is not None:
+    operator, drive = actuator.hysteresis, None
+    compiled = STAGES.keys() | DRIVES.keys()
+    if actuator.creep is not None or type(operator) not in compiled:
         return None
     column = actuator.columns(theta)
     actuator.check(column)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
-    stage = prepare(actuator.hysteresis, column, voltage, memory)
+    if type(operator) in DRIVES:
+        drive = _Drive(operator, column, memory)
+        stage = given(drive.along(voltage[:1])[:, 0], np.empty((0, 0)))
+    else:
+        stage = STAGES[type(operator)](operator, column, voltage, memory)
     if not stage.able.all():
         return None
     nothing, rest, curve = np.zeros(len(theta)), stage.rest, np.empty((0, 2))
@@ -96,7 +131,7 @@ def walk(
     state = np.zeros((at.size // LANES, STATE))
     for row, values in rows.items():
         state[:, row : row + LANES] = values[at].reshape(-1, LANES)
-    return Walk(stage, curve, state, voltage)
+    return Walk(stage, curve, state, voltage, drive)
 
 
 def _lanes(models: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
