@@ -6,7 +6,8 @@ bring the pilot to the posterior, where half of its steps try places of the poin
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws, and bent as they
 are, proposes places independently of where a walker is, which mixes about ten times faster. The fit
 is frozen before the draws that count, and a seventh of the steps remain differential evolution and
-snooker, so that whatever the fit does not cover is reached, and left again.
+snooker, so that whatever the fit does not cover is reached, and left again. While a fit is still
+poor, half of the steps go only part of the way to its places (:mod:`bwbayes.sampling.nearby`).
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import numpy as np
 from emcee import moves
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.proposals import Proposal
+from bwbayes.sampling.nearby import Nearby
+from bwbayes.sampling.proposals import Proposal, StudentMixture
 
-__all__ = ["MOVES", "SnookerMove", "pilot_moves", "sampling_moves"]
+__all__ = ["MOVES", "SnookerMove", "pilot_moves", "sampling_moves", "spreading_moves"]
 
 # Names of the moves, in the order in which the functions below return them.
-MOVES = ("differential evolution", "snooker", "mixture")
+MOVES = ("differential evolution", "snooker", "mixture", "nearby")
 
 Weighted = list[tuple[moves.Move, float]]
 
@@ -72,3 +74,15 @@ def sampling_moves(proposal: Proposal | None) -> Weighted:
     if proposal is None:
         return pilot_moves()
     return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (moves.MHMove(proposal), 0.85)]
+
+
+def spreading_moves(proposal: StudentMixture | None) -> Weighted:
+    """Return moves and weights for tuning with a poor fit; as the pilot's without a proposal."""
+    if proposal is None:
+        return pilot_moves()
+    return [
+        (moves.DEMove(), 0.12),
+        (SnookerMove(), 0.03),
+        (moves.MHMove(proposal), 0.35),
+        (moves.MHMove(Nearby(proposal)), 0.5),
+    ]

@@ -3,8 +3,9 @@
 The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
 by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
 draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on,
-each time with a new fit and twice as long: a long, curved posterior needs more draws to be seen
-whole. Pilot and tuning are thrown away. Then draws count, and the chain is judged
+each time with a new fit and twice as long, and with steps that go part of the way to such places: a
+long, curved posterior needs more draws to be seen whole, and walkers that spread. Pilot and tuning
+are thrown away. Then draws count, and the chain is judged
 (:mod:`bwbayes.sampling.diagnostics`), until two judgements in a row find nothing wrong, the first
 on half the draws that are to be reached, the second on all of them and a fifth more than the first
 at least; or the budget of steps is used up.
@@ -45,7 +46,7 @@ from bwbayes.sampling.diagnostics import (
 )
 from bwbayes.sampling.ensemble import Block, advance_together, start
 from bwbayes.sampling.judge import Judge, constrained
-from bwbayes.sampling.moves import pilot_moves, sampling_moves
+from bwbayes.sampling.moves import MOVES, pilot_moves, sampling_moves, spreading_moves
 from bwbayes.sampling.proposals import StudentMixture
 
 __all__ = [
@@ -66,10 +67,11 @@ PILOT_RHAT = 1.1
 APART_STEPS = 500
 
 # Blocks of the tuning, and how many it may become while walkers take less than this part of the
-# places that are proposed to them.
+# places that are proposed to them: four times as many where they hardly take any.
 TUNING_BLOCKS = 2
 MOST_TUNING_BLOCKS = 16
 TAKEN = 0.5
+HARDLY_TAKEN = 0.25
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing.
@@ -322,10 +324,11 @@ def _extend(
 ) -> None:
     """Advance every ensemble by a block, wherever the executor likes."""
     proposal, ends = chain.proposal_in_use(phase), chain.ends
+    spreads = phase == "tuning" and chain.blocks(phase) >= TUNING_BLOCKS
+    make = pilot_moves if phase == "pilot" else spreading_moves if spreads else sampling_moves
     futures = []
     for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
         # Moves of its own for each: some of emcee's write to themselves.
-        make = pilot_moves if phase == "pilot" else sampling_moves
         moves = [make(proposal) for _ in group]
         futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
     blocks: list[Block] = []
@@ -362,7 +365,7 @@ def _tune(
     """
     proposal = _fitted(chain.coordinates("pilot")[chain.steps("pilot") // 2 :])
     begin, end, rate = 0, TUNING_BLOCKS, 0.0
-    while rate < TAKEN and end <= MOST_TUNING_BLOCKS:
+    while rate < TAKEN and end <= (1 if rate > HARDLY_TAKEN else 4) * MOST_TUNING_BLOCKS:
         if chain.blocks("tuning") < end:
             chain.freeze("tuning", proposal)
         while chain.blocks("tuning") < end:
@@ -376,7 +379,9 @@ def _tune(
 def _taken(blocks: Sequence[Sequence[Block]]) -> float:
     """Return which part of the places that the proposal proposed was taken; 1 without one."""
     moves = np.sum([block.moves for each in blocks for block in each], axis=0)
-    proposed, accepted = np.sum(moves[len(pilot_moves()) :], axis=0)
+    # Without a proposal there are none but the pilot's moves.
+    independent = MOVES.index("mixture")
+    proposed, accepted = moves[independent] if len(moves) > independent else (0, 0)
     return float(accepted / proposed) if proposed else 1.0
 
 
