@@ -31,6 +31,7 @@ from bwbayes.model.operators.rosenbrock import (
 )
 from bwbayes.model.operators.walls import (
     CONVERGED,
+    FARTHEST,
     FIRST,
     GROW,
     NOTCHES,
@@ -121,8 +122,10 @@ def _move(
     step = FIRST * (own[3] - own[2] * own[5])
     k = np.empty(STAGES)
     while True:
-        notch = math.floor(NOTCHES * math.log2(step / own[1]))
-        step = own[1] * 2.0 ** (min(notch, 0) / NOTCHES)
+        away = abs(u + own[2] * p) / (1 + own[2] * own[6])
+        most = max(FARTHEST * away / own[1], 1.0)
+        notch = math.floor(NOTCHES * math.log2(min(step / own[1], most)))
+        step = own[1] * 2.0 ** (notch / NOTCHES)
         last = step >= end - u
         h = end - u if last else step
         slope, drift, down = _slopes(spins, own, u, p)

@@ -41,10 +41,11 @@ GROW, SHRINK, SAFE = 5.0, 0.2, 0.9
 # The first step of walls that begin to move, as a part of the voltage that they lag behind.
 FIRST = 0.1
 
-# Steps are the field's scale, or shorter by so many notches an octave: a longer one could jump over
-# the bend of the curve, from saturation to saturation, and on a grid what is rounding in an
-# estimated error does not grow from step to step.
+# Steps are at most the field's scale, or this part of the way to its zero: a longer one could jump
+# over the bend of the curve, from saturation to saturation. They are so many notches to an octave:
+# on a grid what is rounding in an estimated error does not grow from step to step.
 NOTCHES = 4
+FARTHEST = 0.25
 
 # Closer to saturation than this the field at which P_an reaches P_irr is not sharp; walls are
 # followed from a smaller one on, and do not move before it.
@@ -201,8 +202,10 @@ class Solver(ABC):
         while rows.size:
             some = walls.rows(rows)
             at, now = u[rows], p[rows]
-            notch = np.floor(NOTCHES * np.log2(step[rows] / some.field))
-            best = some.field * np.exp2(np.minimum(notch, 0.0) / NOTCHES)
+            away = np.abs(at + some.coupling * now) / (1 + some.coupling * some.slope)
+            most = np.maximum(FARTHEST * away / some.field, 1.0)
+            notch = np.floor(NOTCHES * np.log2(np.minimum(step[rows] / some.field, most)))
+            best = some.field * np.exp2(notch / NOTCHES)
             last = best >= end - at
             h = np.where(last, end - at, best)
             slope, drift, own = self._slopes(some, at, now)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ MODELS = {
     "strong coupling": {**MODEL, "coupling": 0.9, "reversible": 0.7, "initial": 0.3},
     "far from saturation": {**MODEL, "saturation": 5000.0},
     "deep in saturation": {**MODEL, "saturation": 15.0},
+    "saturated at once": {**MODEL, "saturation": 0.3, "initial": 0.01},
 }
 PATHS = ("walk", "plateaus", "steps of all sizes", "unipolar")
 
@@ -134,6 +136,23 @@ def test_without_pinning_there_is_next_to_no_loop(operator: Pinned) -> None:
     curve = [float(operator.anhysteretic(column, u)[0]) for u in voltage]
     np.testing.assert_allclose(got, curve, rtol=0, atol=1e-3 * field * 0.62)
     assert np.abs(got - curve).max() > 1e-4 * field * 0.62
+
+
+@pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
+def test_saturation_is_crossed_in_few_steps(
+    operator: Pinned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Prior draws may saturate at next to nothing; steps of that field took a minute each."""
+    steps, slopes = [], Pinned._slopes
+
+    def counted(*arguments: Any) -> Any:
+        steps.append(arguments)
+        return slopes(*arguments)
+
+    monkeypatch.setattr(Pinned, "_slopes", counted)
+    voltage = 60 * np.sin(np.linspace(0, 4, 30))
+    w_of(operator, single(**{**MODEL, "saturation": 5e-3, "initial": 0.0}), voltage)
+    assert 20 < len(steps) < 400
 
 
 @pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
