@@ -64,7 +64,14 @@ KNOWN = {
     "backlash-like and gain": (f'hysteresis = "backlash-like"\n{GAIN}', BACKLASH_KNOWN),
 }
 QUICKEST = "backlash-like and gain"
-EVERY = {name: f'hysteresis = "{name}"\n' for name in HYSTERESIS} | {"gain": GAIN, "creep": CREEP}
+# Ten plays, or five shape terms, have 15 to 17 parameters, of which four seconds tell few.
+OPTIONS = {
+    "plays": "thresholds = 4\n",
+    "maxwell-slip": "thresholds = 4\n",
+    "bouc-wen-asymmetric": 'terms = ["b3", "b5", "b6"]\n',
+}
+EVERY = {name: f'hysteresis = "{name}"\n{OPTIONS.get(name, "")}' for name in HYSTERESIS}
+EVERY |= {"gain": GAIN, "creep": CREEP}
 
 
 # Steps of a replicate at most, with priors that know the hysteresis and with default ones.
