@@ -84,8 +84,8 @@ def start(
     """Start an ensemble as a tight cluster at its own far point.
 
     The optima of the point fit take turns; from there the point lies ten posterior sds off in a
-    random direction (nearer where the density is zero), so that ensembles agree only after they
-    have reached the same posterior.
+    random direction (nearer where the density is zero, and at last tighter), so that ensembles
+    agree only after they have reached the same posterior.
 
     Raises
     ------
@@ -97,7 +97,8 @@ def start(
     direction = generator.standard_normal(optimum.size)
     direction *= FAR / np.linalg.norm(direction)
     for _ in range(TRIALS):
-        cluster = direction + TIGHT * generator.standard_normal((walkers, optimum.size))
+        tight = min(TIGHT, float(np.linalg.norm(direction)))
+        cluster = direction + tight * generator.standard_normal((walkers, optimum.size))
         coordinates = optimum + cluster @ axes.T
         log_density = posterior.log_density(coordinates)
         if np.isfinite(log_density).all():

@@ -206,6 +206,18 @@ def test_a_start_comes_nearer_where_the_density_is_zero() -> None:
     assert np.max(np.abs(state.coordinates)) < 2
 
 
+def test_a_start_is_tighter_where_the_optimum_lies_next_to_what_is_impossible() -> None:
+    """Of 40 walkers as tight as usual one is impossible nearly always."""
+
+    def bounded(x: FloatArray) -> FloatArray:
+        return np.where(x[:, 0] > -0.02, -0.5 * np.sum(x**2, axis=1), -np.inf)
+
+    for seed in range(5):
+        state = start(target(bounded, FREE), POINT, 0, 40, np.random.default_rng(seed))
+        assert np.isfinite(state.log_density).all()
+        assert (state.coordinates.std(axis=0) > 1e-4).all()
+
+
 def test_the_autocorrelation_time_is_that_of_a_known_process() -> None:
     """(1 + φ)/(1 − φ) for an AR(1) series, within a tenth."""
     generator = np.random.default_rng(5)

@@ -19,6 +19,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.diagnostics import pareto_k
+from bwbayes.sampling.moves import MOVES
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import (
     FIRST_CHECK,
@@ -101,6 +102,33 @@ def test_the_tuning_goes_on_while_few_places_are_taken(
     monkeypatch.setattr(sampler, "MOST_TUNING_BLOCKS", 2 * TUNING_BLOCKS)
     chain, _ = run()
     assert blocks == chain.blocks("tuning")
+
+
+def test_walkers_spread_by_nearby_steps_while_a_tuning_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not in its first round, nor in the draws that count; those come from one kernel."""
+    monkeypatch.setattr(sampler, "TAKEN", 1.1)
+    chain, _ = run()
+    nearby = MOVES.index("nearby")
+    blocks = [block for each in chain.history("tuning") for block in each]
+    rows = [len(block.moves) for block in blocks]
+    first = TUNING_BLOCKS * PLAN.ensembles
+    assert {nearby} == set(rows[:first])
+    assert {nearby + 1} == set(rows[first:])
+    assert sum(block.moves[nearby, 1] for block in blocks[first:]) > 0
+    assert "nearby" not in chain.moves("sampling")
+
+
+@pytest.mark.parametrize(("hardly", "times"), [(0.0, 1), (1.0, 4)])
+def test_the_tuning_may_be_longer_where_hardly_any_place_is_taken(
+    monkeypatch: pytest.MonkeyPatch, hardly: float, times: int
+) -> None:
+    monkeypatch.setattr(sampler, "TAKEN", 1.1)
+    monkeypatch.setattr(sampler, "HARDLY_TAKEN", hardly)
+    monkeypatch.setattr(sampler, "MOST_TUNING_BLOCKS", 2 * TUNING_BLOCKS)
+    chain, _ = run()
+    assert times * 2 * TUNING_BLOCKS == chain.blocks("tuning")
 
 
 @pytest.mark.parametrize("blocks", [3, 5, MOST_TUNING_BLOCKS])
