@@ -21,7 +21,7 @@ from bwbayes.results.bands import LEVELS
 from tests.examples import README, ROOT, blocks
 from tests.measured import measured
 from tests.test_calibration_moving import MOST_UNCONVERGED
-from tests.test_calibration_parts import EVERY, REPLICATES
+from tests.test_calibration_parts import EVERY, OPTIONS, REPLICATES
 
 
 def block(name: str) -> str:
@@ -173,8 +173,9 @@ def parts() -> str:
     told = ", ".join(f"{name} {count}" for name, count in sorted(many.items()))
     most = max(set(missed.values()) - set(many.values()))
     late = ", ".join(sorted(set(EVERY) - set(every)))
+    run = (f"{name} (`{OPTIONS[name].strip()}`)" if name in OPTIONS else name for name in every)
     return (
-        f"{', '.join(sorted(every))}, {REPLICATES} replicates each: no test of ranks failed, none "
+        f"{', '.join(sorted(run))}, {REPLICATES} replicates each: no test of ranks failed, none "
         f"of {18 * len(every)} bands is off by more than {worst:.1f} standard errors; not "
         f"converged in their budget at most {most}"
         + (f", but more than the tenth that is allowed of {told}" if many else "")
