@@ -378,10 +378,10 @@ def _tune(
 
 def _taken(blocks: Sequence[Sequence[Block]]) -> float:
     """Return which part of the places that the proposal proposed was taken; 1 without one."""
-    moves = np.sum([block.moves for each in blocks for block in each], axis=0)
-    # Without a proposal there are none but the pilot's moves.
     independent = MOVES.index("mixture")
-    proposed, accepted = moves[independent] if len(moves) > independent else (0, 0)
+    # Blocks count the moves that were offered to them, and blocks from a file all that there are.
+    counts = [one.moves[independent:][:1] for each in blocks for one in each]
+    proposed, accepted = np.sum(np.concatenate(counts), axis=0)
     return float(accepted / proposed) if proposed else 1.0
 
 

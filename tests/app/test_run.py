@@ -117,8 +117,8 @@ def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> No
 def test_acceptance_of_each_phase_is_in_the_facts(run: Path) -> None:
     page = (run / "report.html").read_text()
     each = r"differential evolution \d+%, snooker \d+%, mixture \d+%"
-    phases = "; ".join(f"{phase}: {each}" for phase in ("pilot", "tuning", "sampling"))
-    assert re.search(phases, page)
+    # A tuning that goes on has nearby steps too.
+    assert re.search(f"pilot: {each}; tuning: {each}(, nearby \\d+%)?; sampling: {each}", page)
 
 
 def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
