@@ -179,7 +179,7 @@ def parts() -> str:
         f"of {18 * len(every)} bands is off by more than {worst:.1f} standard errors; not "
         f"converged in their budget at most {most}"
         + (f", but more than the tenth that is allowed of {told}" if many else "")
-        + (f"; {late} have not run to the end" if late else "")
+        + (f"; not run to the end: {late}" if late else "")
     )
 
 
