@@ -85,7 +85,7 @@ def resolved(model: str, parameters: str, folder: Path, steps: int = STEPS) -> E
     write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
     write_record(typical(0.025, 4.0, 0.7, generator), folder / "other.csv")
     text = CONFIG.format(dynamics="lag", steps=steps).replace("[model]\n", f"[model]\n{model}")
-    # Ten plays have more parameters than 32 walkers could span.
+    # More walkers than usual: of 13 parameters, 32 would barely span the space.
     return experiment(resolve(parse(text.replace("= 32", "= 40") + parameters, "typical"), folder))
 
 

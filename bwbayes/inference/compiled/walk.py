@@ -96,9 +96,8 @@ def walk(
     """Put models to a voltage's first sample; None if they are left to NumPy.
 
     That is so with creep, for an operator that is not compiled, and where a stage cannot do a
-    model.
-    Parameters and errors as of :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the
-    ``voltage`` (samples,) is known up to the end.
+    model. Parameters and errors are those of :meth:`~bwbayes.model.actuator.Actuator.advance`, but
+    that the ``voltage`` (samples,) is known up to the end.
     """
     operator, drive = actuator.hysteresis, None
     compiled = STAGES.keys() | DRIVES.keys()
