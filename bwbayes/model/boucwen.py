@@ -73,7 +73,7 @@ def hysteresis(
 
     and its solution g₀ exp(−c v) + α (1 − exp(−c v)) / c is used as it stands. For n > 1 the
     equation is separable and :class:`~bwbayes.model.exponent.ExponentFlow` solves it with a
-    relative error below 1e-8 of the largest |h|.
+    relative error below 1e-9 of the largest |h|.
 
     Parameters
     ----------

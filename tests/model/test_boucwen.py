@@ -38,9 +38,8 @@ def starts(parameters: Model) -> tuple[float, ...]:
     return inside if parameters.gamma > parameters.beta else (*inside, 2 * highest, -2 * highest)
 
 
-def bound(exponent: float) -> float:
-    """Largest error that is promised, in units of the largest |h|."""
-    return 1e-9 if exponent in (1.0, 2.0) else 1e-8
+# Largest error that is promised, in units of the largest |h|.
+BOUND = 1e-9
 
 
 def signals() -> dict[str, FloatArray]:
@@ -61,7 +60,7 @@ def test_agrees_with_an_integrator(name: str, exponent: float) -> None:
         initial = starts(parameters)[index % 3]
         expected = by_integration(voltage, parameters, initial)
         got = hysteresis(voltage, *parameters, initial=initial)[0]
-        assert_close(expected, got, bound(exponent))
+        assert_close(expected, got, BOUND)
 
 
 @pytest.mark.parametrize("exponent", EXPONENTS)
@@ -71,7 +70,7 @@ def test_agrees_with_an_integrator_from_beyond_the_ceiling(exponent: float) -> N
     for initial in starts(parameters)[3:]:
         expected = by_integration(voltage, parameters, initial)
         got = hysteresis(voltage, *parameters, initial=initial)[0]
-        assert_close(expected, got, bound(exponent))
+        assert_close(expected, got, BOUND)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.0])

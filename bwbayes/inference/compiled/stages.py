@@ -5,7 +5,7 @@ for ``LANES`` models side by side. What a model is and remembers stands in rows 
 of one flat array, ``own``; what the stage may know of the voltage beforehand is its ``plan``. An
 operator without a stage is worked out beforehand, and its drive is the plan.
 
-A new stage is a file of its own, a line in ``KINDS`` and one in :func:`drive_of`.
+A new stage is a file of its own, a line in ``STAGES`` or ``DRIVES`` and one in :func:`drive_of`.
 """
 
 from __future__ import annotations

@@ -64,9 +64,9 @@ class BoucWenAsymmetric(OneState):
 
         β' = β (1 + s b₅ + s x b₃),   γ' = γ + β (s b₄ + s x b₂ + x b₆).
 
-    It takes no energy from nowhere where |γ'| ≤ β' for all four pairs of signs, and that is asked
-    for. A voltage that never changes its sign cannot tell b₂ from b₄, b₃ from b₅, and b₆ from γ:
-    give two ``terms`` then.
+    It is passive, never giving out more energy than it has taken in, where |γ'| ≤ β' for all four
+    pairs of signs; this is enforced. A voltage that never changes its sign cannot tell b₂ from b₄,
+    b₃ from b₅, and b₆ from γ: give two ``terms`` then.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class BoucWenAsymmetric(OneState):
                 f"hysteresis loop shape, by {signs}",
                 lambda _: normal(0.0, 0.3),
                 bounds=partial(_bounds, name),
-                stated_bounds="the loop shape takes no energy from nowhere",
+                stated_bounds="the loop shape is passive",
                 loop=True,
             )
             for name, signs in TERMS.items()
@@ -132,7 +132,7 @@ class BoucWenAsymmetric(OneState):
             refuse(column, declared.name, wrong, "must be finite")
         refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
         refuse(column, "beta", column["beta"] < 0, "must not be negative")
-        demand = "with beta and b2 to b6 it must not let the loop take energy from nowhere"
+        demand = "with beta and b2 to b6 the loop must be passive, |gamma'| <= beta'"
         refuse(column, "gamma", ~_passive(column), demand)
 
     def holds(self, column: Values) -> BoolArray:

@@ -53,7 +53,7 @@ class Duhem(OneState):
 
     with d, α in um/V, d₂, α₁ in um/V², d₃, α₂ in um/V³ and β in 1/V. It takes no energy from
     nowhere where 2 β α(u) ≥ |α′(u)| at any voltage, which is β² (4 α α₂ − α₁²) ≥ α₂² (all of
-    them zero is allowed); that is asked for. The initial curve rises where f′(u) ≥ α(u): at zero
+    them zero is allowed); this is enforced. The initial curve rises where f′(u) ≥ α(u): at zero
     volts (α < d), and at any voltage if besides 3 d₃ ≥ α₂, without the even terms.
 
     Parameters
@@ -118,7 +118,7 @@ class Duhem(OneState):
         refuse(column, "alpha2", ~_passive(column), demand)
 
     def holds(self, column: Values) -> BoolArray:
-        """Tell where α < d and the hysteresis takes no energy from nowhere at any voltage."""
+        """Tell where α < d and the hysteresis is passive at any voltage."""
         inside = below_d(column)
         if not {"alpha", "beta", "alpha2"} <= set(column):
             return inside

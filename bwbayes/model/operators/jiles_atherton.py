@@ -36,7 +36,11 @@ class JilesAtherton(Pinned):
         P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
         dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
 
-    as in :class:`~bwbayes.model.operators.pinned.Pinned`, which names the parameters.
+    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
+    s. P_s in um is the displacement at saturation, E₀ in V the scale of the field, a P in V the
+    field that the displacement itself makes (a in V/um), k in V the pinning, and c the reversible
+    part. In place of E₀ and a, the parameters are the slope d = P_s L′(0) / (E₀ (1 − η)) in um/V
+    and the coupling η = a P_s L′(0) / E₀, with L′(0) = 1/3.
 
     Notes
     -----

@@ -40,8 +40,8 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
     """Relays with ramps of width a, and a reversible part d u.
 
     The density of the ramps' middles is that of :class:`Preisach
-    <bwbayes.model.operators.preisach.Preisach>`, which this is for a = 0. A branch from an extremum
-    (u_r, w_r) is
+    <bwbayes.model.operators.preisach.Preisach>`, and for a = 0 the two models are the same. A
+    branch from an extremum (u_r, w_r) is
 
         w = w_r ± E(u_r, u),
         E = d |u − u_r| + (α_R / 2a) ∫ (F(u − t) − F(u_r − t))² dt,   |t| ≤ a / 2,
@@ -54,9 +54,9 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
         C = cosh σ + cosh δ cosh ω,   v = sinh δ sinh ω / C,   ρ(v) = artanh(v) / v − 1,
         D = (cosh 2x + cosh ω) (cosh 2y + cosh ω).
 
-    Sources: M. A. Krasnosel'skii and A. V. Pokrovskii, Systems with Hysteresis (Springer, 1989);
-    that a ramp is a mean of relays makes it I. D. Mayergoyz, Mathematical Models of Hysteresis
-    (Springer, 1991).
+    Sources: M. A. Krasnosel'skii and A. V. Pokrovskii, Systems with Hysteresis (Springer, 1989),
+    and for ramps as means of relays I. D. Mayergoyz, Mathematical Models of Hysteresis (Springer,
+    1991).
     """
 
     @property

@@ -31,7 +31,7 @@ class NoHysteresis(OneState):
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
-        """d, and the initial state that there is not."""
+        """d, and a placeholder for the initial state."""
         slope = replace(
             d(),
             label="d",

@@ -42,8 +42,9 @@ class Pinned(OneState, Solver):
         P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
         dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
 
-    with s the voltage's direction; where P_an − P_irr has not the sign of s, P_irr stays. L is the
-    anhysteretic curve, L(±∞) = ±1. Parameters are
+    with s the voltage's direction; where P_an − P_irr does not have the sign of s, P_irr is
+    constant. L is the anhysteretic curve, L(±∞) = ±1; E₀ in V is the scale of the field, and a P in
+    V the field that the displacement itself makes, a in V/um. Parameters are
 
     - d = P_s L′(0) / (E₀ (1 − η)), the slope of the anhysteretic displacement at zero, um/V,
     - P_s, the displacement at saturation, um,

@@ -106,7 +106,7 @@ def test_models_beyond_the_constraint_are_refused() -> None:
     model = {**PLAIN, **NO_TERMS, "b5": -0.9, "initial": -7.0}
     operator, column = BoucWenAsymmetric(), single(**model)
     assert not operator.holds(column).any()
-    with pytest.raises(InputError, match=r"gamma: .* energy from nowhere"):
+    with pytest.raises(InputError, match=r"gamma: .* must be passive"):
         operator.check(column)
 
 
