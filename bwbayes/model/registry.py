@@ -26,7 +26,7 @@ from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 
-__all__ = ["DYNAMICS", "HYSTERESIS", "choose", "made"]
+__all__ = ["DYNAMICS", "HYSTERESIS", "OPTIONS", "choose", "made"]
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
@@ -42,6 +42,13 @@ HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "domain-wall": DomainWall,
     "linear": NoHysteresis,
 }
+
+# What may be said of a hysteresis operator beside its name: what any of them takes.
+OPTIONS = tuple(
+    dict.fromkeys(
+        name for maker in HYSTERESIS.values() for name in inspect.signature(maker).parameters
+    )
+)
 
 DYNAMICS: Mapping[str, Callable[..., Filter]] = {
     "none": NoDynamics,

@@ -6,6 +6,7 @@ is missing from them, and that every example is a config.
 
 from __future__ import annotations
 
+import inspect
 import re
 import tomllib
 
@@ -26,7 +27,7 @@ from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 
 EVERY = {key.path: key for key in keys(Config)}
 LEAVES = {path: key for path, key in EVERY.items() if key.table is None}
@@ -159,6 +160,21 @@ def test_a_part_has_a_line_and_a_page_with_its_parameters(name: str) -> None:
 @pytest.mark.parametrize("name", [*HYSTERESIS, "discrepancy"])
 def test_the_page_of_an_equation_of_others_names_its_source(name: str) -> None:
     assert re.search(r"\(((Springer|.*), )?(19|20)\d\d\)", parts_reference(name))
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_an_option_names_the_operators_that_take_it_and_its_default(option: str) -> None:
+    taken = {
+        name: inspect.signature(maker).parameters[option].default
+        for name, maker in HYSTERESIS.items()
+        if option in inspect.signature(maker).parameters
+    }
+    description = EVERY[f"model.{option}"].description
+    assert description.startswith(f"For {' and '.join(taken)}: ")
+    stated = re.search(r"\(default: (\w+)\)", description)
+    assert stated is not None
+    for default in taken.values():
+        assert stated[1] == ("all" if isinstance(default, tuple) else str(default).lower())
 
 
 def test_a_part_that_does_not_exist_is_one_line_with_the_nearest() -> None:

@@ -45,7 +45,7 @@ class ActuatorConfig(Table):
     passive: Annotated[
         bool | None,
         described(
-            "For bouc-wen: whether |gamma| <= beta (the default), not only beta + gamma >= 0.",
+            "For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true).",
             example="false",
         ),
     ] = None
@@ -59,7 +59,7 @@ class ActuatorConfig(Table):
     ] = None
     odd: Annotated[
         bool | None,
-        described("For duhem: whether there are no even terms (default: false).", example="true"),
+        described("For duhem: whether there are no even terms (default: true).", example="false"),
     ] = None
     terms: Annotated[
         list[str] | None,

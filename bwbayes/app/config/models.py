@@ -19,12 +19,9 @@ from bwbayes.app.config.keys import one_line
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 
-__all__ = ["OPTIONS", "models_of", "slug"]
-
-# What may stand in an operator's brackets.
-OPTIONS = ("passive", "thresholds", "odd", "terms")
+__all__ = ["models_of", "slug"]
 
 OPERATOR = re.compile(r"\s*([^\s()+]+)\s*(?:\((.*)\))?\s*")
 

@@ -15,12 +15,9 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, OPTIONS, made
 
 __all__ = ["actuator_of", "explicit_model", "in_words"]
-
-# What a config may say of a hysteresis operator beside its name.
-OPTIONS = ("passive", "thresholds", "odd", "terms")
 
 
 def actuator_of(
