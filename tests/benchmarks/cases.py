@@ -22,13 +22,12 @@ from tests.inference.problems import posterior_of, truth
 
 __all__ = [
     "BATCHES",
-    "DYNAMICS",
+    "CREEPING",
     "ENGINES",
     "ESS",
     "FULL",
     "LENGTHS",
     "MODELS",
-    "NOISES",
     "QUICK",
     "ROOT",
     "Effort",
@@ -43,9 +42,12 @@ __all__ = [
 ROOT = Path(__file__).resolve().parents[2]
 ENGINES: tuple[Engine, ...] = ("numba", "numpy")
 BATCHES = (1, 8, 16, 32, 64, 256)
-DYNAMICS: tuple[str, ...] = ("none", "lag", "second-order")
-NOISES: tuple[str, ...] = ("white", "discrepancy")
 LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
+
+# The model whose exponent is not fixed at 1, and the times of four creep lags, s.
+FREE_EXPONENT = "bouc-wen, free exponent"
+CREEPING = "bouc-wen, gain, four creep lags"
+LAGS = (0.1, 1.0, 10.0, 100.0)
 
 # Models of a batch where nothing else is said.
 MODELS = 64
@@ -102,7 +104,7 @@ def variant(
 
 
 def with_parts(posterior: Posterior, *, from_rest: bool) -> dict[str, Posterior]:
-    """Return posteriors of the same record with a lag and each operator, and all that adds to one.
+    """Return posteriors of the same record with a lag: each operator, and what adds to it.
 
     Without a start from rest the state of everything at the first sample is unknown.
     """
@@ -116,14 +118,26 @@ def with_parts(posterior: Posterior, *, from_rest: bool) -> dict[str, Posterior]
         name: replace(plain, hysteresis=made("hysteresis", name, HYSTERESIS, {}))
         for name in HYSTERESIS
     }
-    actuators["bouc-wen, gain"] = replace(plain, gain=gain)
-    actuators["bouc-wen, gain, four creep lags"] = replace(
-        plain, gain=gain, creep=Creep((0.1, 1.0, 10.0, 100.0), reference=span)
-    )
-    fixed = {"exponent": 1.0} | ({"initial": 0.0} if from_rest else {})
+    even = made("hysteresis", "duhem", HYSTERESIS, {"odd": False})
+    creep = Creep(LAGS, reference=span)
+    actuators |= {
+        FREE_EXPONENT: plain,
+        "duhem, even terms": replace(plain, hysteresis=even),
+        "bouc-wen, gain": replace(plain, gain=gain),
+        CREEPING: replace(plain, gain=gain, creep=creep),
+        "bouc-wen, creep that grows": replace(plain, creep=replace(creep, growing=True)),
+    }
+    rest = {"initial": 0.0} if from_rest else {}
     return {
         name: replace(
-            posterior_of(voltage, displacement, one, "discrepancy", fixed, from_rest=from_rest),
+            posterior_of(
+                voltage,
+                displacement,
+                one,
+                "discrepancy",
+                rest if name == FREE_EXPONENT else rest | {"exponent": 1.0},
+                from_rest=from_rest,
+            ),
             engine="numba",
         )
         for name, one in actuators.items()

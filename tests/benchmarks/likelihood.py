@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.noise import NOISES
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.registry import DYNAMICS
 from tests.benchmarks.cases import (
     BATCHES,
-    DYNAMICS,
     ENGINES,
     LENGTHS,
     MODELS,
-    NOISES,
     Effort,
     on_engine,
     trial,
@@ -29,6 +29,7 @@ from tests.benchmarks.tables import Cell, Table
 from tests.benchmarks.timing import interleaved
 
 __all__ = [
+    "STARTS",
     "Call",
     "batches",
     "hysteresis_alone",
@@ -42,6 +43,9 @@ __all__ = [
 ]
 
 Call = Callable[[], object]
+
+# Where a record may start, and whether that is rest.
+STARTS = {"from rest": True, "in motion": False}
 
 CONTESTANTS = (*ENGINES, "stock")
 
@@ -86,7 +90,7 @@ def parts(posterior: Posterior, effort: Effort) -> Table:
     Models are draws of the default priors. In motion, the start is unknown.
     """
     calls: dict[str, Call] = {}
-    for start, from_rest in (("from rest", True), ("in motion", False)):
+    for start, from_rest in STARTS.items():
         for name, one in with_parts(posterior, from_rest=from_rest).items():
             theta = one.prior.theta(one.prior.draw(np.random.default_rng(1), MODELS))
             one.log_likelihood(theta[:1])

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from bwbayes.inference.noise import NOISES
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.boucwen import hysteresis
-from tests.benchmarks.cases import BATCHES, DYNAMICS, ENGINES, LENGTHS, MODELS, NOISES, variant
+from bwbayes.model.registry import DYNAMICS
+from tests.benchmarks.cases import BATCHES, ENGINES, LENGTHS, MODELS, variant
 from tests.benchmarks.likelihood import Call, likelihood_of, shape_of
 from tests.benchmarks.stock import hysteresis_loop
 
