@@ -97,7 +97,7 @@ def test_answers_come_back_in_the_order_of_the_draws() -> None:
 def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     """As often as 4,001 states of each say, within four standard errors."""
     record = record_after(60.0)
-    start = Start(lead_in=0.15)
+    start = Start(lead_in=0.05)
     draws = POSTERIOR.prior.theta(np.empty((2000, 0)))
     spans = [Span(-40.0, 40.0), Span(-60.0, 60.0), Span(-95.0, 95.0)]
     window = start.window(record)
@@ -108,7 +108,10 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     )
     every = tuple(
         replace(
-            posterior.likelihood, offset_sd=50.0, actuator=replace(posterior.only.actuator, span=s)
+            posterior.likelihood,
+            from_rest=False,
+            offset_sd=50.0,
+            actuator=replace(posterior.only.actuator, span=s),
         )
         for s in spans
     )
@@ -123,4 +126,5 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     got = np.bincount(histories.which, minlength=3) / len(draws)
     error = np.sqrt(expected * (1 - expected) / len(draws)) + 1e-3
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
+    assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
