@@ -45,15 +45,18 @@ class Span(NamedTuple):
 UNIT = Span(-1.0, 1.0)
 
 
-def narrower(span: Span) -> tuple[Span, ...]:
-    """Return ranges about a span's middle, evenly from next to nothing to all of it."""
+def narrower(span: Span, further: tuple[float, ...] = FURTHER) -> tuple[Span, ...]:
+    """Return ranges about a span's middle, evenly from next to nothing to all of it.
+
+    ``further`` is how far up they go, as parts of how far down.
+    """
     low, middle, half = span.low, span.middle, span.half
     if not half > 0:
         return (span,)
     ends = [
-        (down / REACHES, min(further * down / REACHES, 1.0))
+        (down / REACHES, min(up * down / REACHES, 1.0))
         for down in range(1, REACHES + 1)
-        for further in FURTHER
+        for up in further
     ]
     return tuple(
         dict.fromkeys(Span(max(middle - down * half, low), middle + up * half) for down, up in ends)
@@ -116,6 +119,13 @@ class Operator(ABC):
         self, column: Values, voltage: float, span: Span
     ) -> tuple[FloatArray, FloatArray]:
         """Return the lowest and highest ``initial`` (models,) that earlier drives could leave."""
+
+    def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
+        """Return the ``initial`` (any, models) that drives to and fro through the span leave.
+
+        On either branch of the loop; by default the lowest and the highest that are reachable.
+        """
+        return np.stack(self.reachable(column, voltage, span))
 
     def earlier(self, span: Span) -> tuple[Span, ...]:
         """Return the ranges of earlier drives within a span that leave states of their own.

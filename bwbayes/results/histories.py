@@ -17,6 +17,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
+from bwbayes.model.operator import narrower
 
 __all__ = ["Histories", "States", "chosen", "uniform"]
 
@@ -33,7 +34,7 @@ FINE = 1.5
 # Draws that say which histories are possible at all: asking every draw about each takes long.
 FEW = 50
 
-# Points between two nodes that a state is chosen from.
+# Cells between two nodes that a state is chosen from.
 BETWEEN = 8
 
 
@@ -74,46 +75,84 @@ def edged(part: FloatArray) -> FloatArray:
 
 
 class States:
-    """Hysteretic states at a record's first sample, by how far from the lowest to the highest.
+    """Hysteretic states at a record's first sample, and how probable they are beforehand.
 
-    The highest and the lowest are those that an earlier drive within the range of voltages leaves.
+    Of one of many histories these are the states between the lowest and the highest that drives of
+    its range leave (:func:`edged`). Where one number holds all states, and a history is ``alone``,
+    they are what drives of any amplitude leave that were running when the record began: the
+    branches of loops, no hysteresis at all, and straight lines from one to the next.
     """
 
     def __init__(self, likelihood: Likelihood, theta: FloatArray, *, alone: bool) -> None:
         self.table, self.theta, self.alone = likelihood.table, theta, alone
         if likelihood.from_rest:
-            self.low = self.high = np.zeros(len(theta))
+            self.ordered = np.zeros((2, len(theta)))
             return
         actuator = likelihood.actuator
         assert actuator.span is not None
-        self.low, self.high = actuator.hysteresis.reachable(
-            self.table.columns(theta), float(likelihood.voltage[0]), actuator.span
-        )
-
-    @property
-    def ends(self) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest state, (draws,)."""
-        return self.low, self.high
+        column, voltage = self.table.columns(theta), float(likelihood.voltage[0])
+        operator = actuator.hysteresis
+        if alone:
+            ranges = narrower(actuator.span, further=(1.0,))
+            ends = [operator.left(column, voltage, one) for one in ranges]
+            none = np.zeros((1, len(theta)))
+            self.ordered = np.sort(np.concatenate([*ends, none]), axis=0)
+        else:
+            self.ordered = np.stack(operator.reachable(column, voltage, actuator.span))
 
     @property
     def open(self) -> bool:
         """Whether any draw has more than one."""
-        return bool(np.any(self.high > self.low))
+        return bool(np.any(self.ordered[-1] > self.ordered[0]))
 
-    def at(self, part: FloatArray) -> FloatArray:
-        """Return θ (draws, parameters) with the states at ``part`` (draws,) of the way."""
-        way = part if self.alone else edged(part)
-        return self.table.replaced(self.theta, "initial", self.low + way * (self.high - self.low))
+    def at(self, place: FloatArray) -> FloatArray:
+        """Return θ (draws, parameters) with the states at a place (draws,) from 0 to 1.
+
+        That is how far they are on the way from the lowest to the highest; of one of many
+        histories, which part of the states is lower.
+        """
+        return self._with(self.placed(place))
+
+    def placed(self, place: FloatArray) -> FloatArray:
+        """Return the states themselves, (draws,)."""
+        low, high = self.ordered[0], self.ordered[-1]
+        state: FloatArray = low + (place if self.alone else edged(place)) * (high - low)
+        return state
+
+    def below(self, places: FloatArray) -> FloatArray:
+        """Return which part of the states is lower than those at places (any, draws)."""
+        if not self.alone:
+            return places
+        low, high = self.ordered[0], self.ordered[-1]
+        ways = (self.ordered - low) / np.where(high > low, high - low, 1.0)
+        parts = np.linspace(0.0, 1.0, len(ways))
+        every = [np.interp(*both, parts) for both in zip(places.T, ways.T, strict=True)]
+        return np.stack(every, axis=1)
+
+    def drawn(self, part: FloatArray) -> FloatArray:
+        """Return θ (draws, parameters) with the states of which ``part`` (draws,) are lower."""
+        if not self.alone:
+            return self.at(part)
+        place = part * (len(self.ordered) - 1)
+        index, draws = (
+            np.minimum(place.astype(np.int64), len(self.ordered) - 2),
+            np.arange(part.size),
+        )
+        lower = self.ordered[index, draws]
+        return self._with(lower + (place - index) * (self.ordered[index + 1, draws] - lower))
+
+    def _with(self, state: FloatArray) -> FloatArray:
+        return self.table.replaced(self.theta, "initial", state)
 
 
 class _Grid(NamedTuple):
     """What a lead-in says of the states of one history.
 
-    ``parts`` (nodes, draws) of the way from the lowest to the highest, their log ``density`` up to
-    a constant, and the log ``evidence`` (draws,) for the history.
+    ``places`` (nodes, draws) of the states, the log ``density`` of the lead-in there up to a
+    constant, and the log ``evidence`` (draws,) for the history.
     """
 
-    parts: FloatArray
+    places: FloatArray
     density: FloatArray
     evidence: FloatArray
 
@@ -123,8 +162,7 @@ def chosen(
 ) -> tuple[Histories, FloatArray]:
     """Choose every draw's history and state by what the lead-in says; return θ with the states.
 
-    Beforehand all histories are equally probable, and in each all states between the lowest and the
-    highest.
+    Beforehand all histories are equally probable, and in each all :class:`States`.
     """
     draws = np.arange(len(theta))
     alone = len(likelihoods) == 1
@@ -138,11 +176,11 @@ def chosen(
         evidence = np.stack([grid.evidence for grid in grids])
         weight = np.cumsum(np.exp(evidence - np.max(evidence, axis=0)), axis=0)
         which = np.sum(weight < uniform(generator, draws.size) * weight[-1], axis=0)
-    parts, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
-    part = _drawn(parts, density, uniform(generator, draws.size))
-    part = part if alone else edged(part)
-    low, high = (np.stack([one.ends[i] for one in states])[which, draws] for i in range(2))
-    begun = likelihoods[0].table.replaced(theta, "initial", low + part * (high - low))
+    places, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
+    # In one of many histories a place is the part of states below, whichever of them it is.
+    place = _drawn(places, _weights(states[0], places, density), uniform(generator, draws.size))
+    state = np.stack([one.placed(place) for one in states])[which, draws]
+    begun = likelihoods[0].table.replaced(theta, "initial", state)
     return Histories(likelihoods, which), begun
 
 
@@ -167,8 +205,8 @@ def _grid(likelihood: Likelihood, states: States) -> _Grid:
             nodes, nodes, np.nan_to_num(likelihood.log_density(states.at(low)), nan=-np.inf)
         )
     for _ in range(ROUNDS):
-        parts = np.linspace(low, high, NODES)
-        every = np.concatenate([states.at(part) for part in parts])
+        places = np.linspace(low, high, NODES)
+        every = np.concatenate([states.at(place) for place in places])
         density = likelihood.log_density(every).reshape(NODES, draws)
         density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
         best = np.max(density, axis=0)
@@ -179,21 +217,32 @@ def _grid(likelihood: Likelihood, states: States) -> _Grid:
         first = np.maximum(np.argmax(possible, axis=0) - 1, 0)
         last = NODES - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
         columns = np.arange(draws)
-        low, high = parts[first, columns], parts[last, columns]
-    evidence = best + np.log(np.mean(np.exp(_between(density)), axis=0) * (parts[-1] - parts[0]))
-    return _Grid(parts, density, evidence)
+        low, high = places[first, columns], places[last, columns]
+    evidence = best + np.log(np.sum(_weights(states, places, density), axis=0))
+    return _Grid(places, density, evidence)
+
+
+def _weights(states: States, places: FloatArray, density: FloatArray) -> FloatArray:
+    """Return how probable the states of the cells between nodes (nodes, draws) are, (any, draws).
+
+    A cell has as much as it has beforehand, times what the lead-in says of its middle.
+    """
+    inside = np.arange(BETWEEN)[:, np.newaxis] / BETWEEN
+    edges = [a + inside * (b - a) for a, b in pairwise(places)]
+    beforehand = np.diff(states.below(np.concatenate([*edges, places[-1:]])), axis=0)
+    weights: FloatArray = beforehand * np.exp(_between(density))
+    return weights
 
 
 def _between(nodes: FloatArray) -> FloatArray:
-    """Return points (any, draws) between nodes (nodes, draws), on straight lines."""
+    """Return the middles (any, draws) of cells between nodes (nodes, draws), on straight lines."""
     inside = (np.arange(BETWEEN)[:, np.newaxis] + 0.5) / BETWEEN
     return np.concatenate([a + inside * (b - a) for a, b in pairwise(nodes)])
 
 
-def _drawn(parts: FloatArray, density: FloatArray, uniform_: FloatArray) -> FloatArray:
-    """Draw from a log density (nodes, draws) that goes straight from node to node of ``parts``."""
-    fine, places = _between(density), _between(parts)
-    weight = np.cumsum(np.exp(fine), axis=0)
+def _drawn(places: FloatArray, weights: FloatArray, uniform_: FloatArray) -> FloatArray:
+    """Draw places (draws,) from cells between nodes (nodes, draws), by their weights."""
+    weight = np.cumsum(weights, axis=0)
     index = np.sum(weight < uniform_ * weight[-1], axis=0)
-    drawn: FloatArray = places[index, np.arange(uniform_.size)]
+    drawn: FloatArray = _between(places)[index, np.arange(uniform_.size)]
     return drawn

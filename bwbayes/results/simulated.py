@@ -1,8 +1,8 @@
 """Records made by the model itself: what a replicate is fitted to, and others that it predicts.
 
 A record that is not fitted starts as :mod:`bwbayes.results.start` takes it to: from a hysteretic
-state anywhere between the lowest and the highest that an earlier drive could have left, with the
-dynamics as far from rest as their prior says, and with an offset of its own.
+state that a running drive of some amplitude leaves, with the dynamics as far from rest as their
+prior says, and with an offset of its own.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
-from bwbayes.model.operator import Span, narrower
+from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
@@ -293,37 +293,24 @@ def _unseen(
     *,
     settled: bool,
 ) -> Started:
-    """Draw the start from what is known of it beforehand: all histories are equally probable.
-
-    Where one number holds all states there is one history. Its states are then those of drives of
-    any amplitude within the span that were running when they were stopped: on either branch of
-    their loops.
-    """
+    """Draw the start from what is known of it beforehand: all histories are equally probable."""
     draws, first = len(theta), likelihoods[0]
-    earlier, span = likelihoods, first.actuator.span
     alone = len(likelihoods) == 1
-    if alone and not first.from_rest and span is not None:
-        earlier = tuple(
-            replace(first, actuator=replace(first.actuator, span=one)) for one in narrower(span)
-        )
     which = np.zeros(draws, dtype=np.int64)
-    if len(earlier) > 1:
-        which = (len(earlier) * uniform(generator, draws)).astype(np.int64)
-    histories = Histories(earlier, which)
+    if not alone:
+        which = (len(likelihoods) * uniform(generator, draws)).astype(np.int64)
+    histories = Histories(likelihoods, which)
     (sd,) = histories.each(theta, lambda one, some: (one.start_sd(some),))
     if settled:
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
     part = uniform(generator, draws)
-    if alone:
-        part = np.round(part)
     (begun,) = histories.each(
         np.column_stack([theta, part]),
-        lambda one, some: (States(one, some[:, :-1], alone=alone).at(some[:, -1]),),
+        lambda one, some: (States(one, some[:, :-1], alone=alone).drawn(some[:, -1]),),
     )
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(one.actuator for one in likelihoods)
-    which = np.zeros_like(which) if alone else which
     return Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
 
 

@@ -20,6 +20,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start, predict_record, predict_windows
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
+from tests.results.running import left_by_running_drives
 
 # Far from each other, so that none can stand for another.
 SENSOR, DISCREPANCY, TIME = 0.9, 0.25, 0.3
@@ -143,18 +144,20 @@ def test_twin_the_training_intervals_noise_would_be_seen(posterior: Posterior) -
 def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     posterior: Posterior, draw: FloatArray, sign: float
 ) -> None:
-    """At the end of the voltage's range the last drive went there: h has that sign.
+    """At the end of the voltage's range the last drive went there: h is close to its ceiling.
 
-    It lies between none, after ever smaller loops, and the ceiling; any other drive would leave h
-    anywhere between both ceilings, 0 on average.
+    Any other drive would leave h anywhere between both ceilings, 0 on average.
     """
     named = dict(zip(posterior.prior.names, posterior.prior.theta(draw)[0], strict=True))
     top = named["alpha"] / (named["beta"] + named["gamma"])
+    every = np.array([-100.0, 100.0])
+    left = float(np.mean(left_by_running_drives(named, sign * 100.0, every, 1000)))
+    assert 0.9 * top < sign * left < top
     held = Record(np.full(60, sign * 100.0), None, INTERVAL)
     bands = predict_record(posterior, np.repeat(draw, 400, axis=0), held, Start(), _seeded())
     # Late, when the dynamics have settled; h stays as the voltage does.
     h = named["d"] * held.voltage[-1] + named["offset"] - bands.mean[-1]
-    assert sign * top / 2 == pytest.approx(h, abs=0.05 * top)
+    assert left == pytest.approx(h, abs=0.02 * top)
 
 
 def _seeded() -> np.random.Generator:

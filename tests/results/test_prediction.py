@@ -22,6 +22,7 @@ from bwbayes.results import prediction
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import Start, predict_record, predict_windows, thinned
 from bwbayes.results.start import Started, started
+from tests.results.running import left_by_running_drives
 
 TRUTH = {
     "d": 0.7,
@@ -276,7 +277,7 @@ def test_a_lead_in_finds_the_initial_state(posterior: Posterior, draws: FloatArr
 
 
 def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior) -> None:
-    """Mean and sd of the hysteretic state against 2,000 nodes, for three seeds."""
+    """Mean and sd of the hysteretic state against 8,000 states of running drives, three seeds."""
     record = made(start=0.7)
     centre = np.array([TRUTH[name] for name in posterior.names])
     same = np.tile(centre, (2000, 1))
@@ -285,8 +286,9 @@ def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior
     window = Start().window(record)
     assert window is not None
     assert record.displacement is not None
-    theta = np.tile(posterior.prior.theta(centre[np.newaxis]), (2000, 1))
-    nodes = np.linspace(np.min(states) - 1, np.max(states) + 1, 2000)
+    theta = np.tile(posterior.prior.theta(centre[np.newaxis]), (8000, 1))
+    every = np.concatenate([record.voltage, posterior.only.voltage])
+    nodes = left_by_running_drives(TRUTH, float(record.voltage[0]), every, len(theta))
     theta[:, posterior.prior.names.index("initial")] = nodes
     theta[:, posterior.prior.names.index("offset")] = np.mean(record.displacement[window])
     likelihood = Likelihood(

@@ -88,11 +88,15 @@ class OneState(Operator):
         From below and from above. No hysteresis at all, as after small and smaller loops, lies
         between.
         """
-        swept = self.swept(column, voltage, span)
-        return np.minimum(np.min(swept, axis=0), 0.0), np.maximum(np.max(swept, axis=0), 0.0)
+        left = self.left(column, voltage, span)
+        return np.minimum(np.min(left, axis=0), 0.0), np.maximum(np.max(left, axis=0), 0.0)
+
+    def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
+        """Return the states (2, models) that sweeps through the span leave, from either side."""
+        return np.stack(self.swept(column, voltage, span))
 
     def swept(self, column: Values, voltage: float, span: Span) -> list[FloatArray]:
-        """Return the states (models,) that sweeps through the span leave, from either side."""
+        """Return what the operator remembers (models,) of sweeps, from either side."""
         low, high = span
         sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
         start = np.zeros_like(column["d"])

@@ -160,19 +160,14 @@ class Pinned(OneState, Solver):
             fixed = self.trace(column, np.array([0.0, voltage]), fixed)[1]
         return Memory(voltage, fixed)
 
-    def reachable(
-        self, column: Values, voltage: float, span: Span
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return how far behind (models,) sweeps through the span leave the walls, um.
-
-        No lag, as after small and smaller loops, lies between.
-        """
+    def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
+        """Return how far behind (2, models) sweeps through the span leave the walls, um."""
         walls, behind = self.walls(column), []
         for fixed in self.swept(column, voltage, span):
             p = self.at_rest(walls, fixed, np.full_like(fixed, voltage))
             level, _ = self.curve((voltage + walls.coupling * p) / walls.field)
             behind.append(np.clip(walls.saturation * level - fixed, -walls.lag, walls.lag))
-        return np.minimum(np.min(behind, axis=0), 0.0), np.maximum(np.max(behind, axis=0), 0.0)
+        return np.stack(behind)
 
     def _fixed(self, column: Values, voltage: float, behind: FloatArray) -> FloatArray:
         """Return P_irr (models,) of walls that lag ``behind`` P_an by so much (models,), um.

@@ -1,0 +1,33 @@
+"""What running drives leave of Bouc-Wen hysteresis, by sweeping them one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.boucwen import hysteresis
+
+__all__ = ["left_by_running_drives"]
+
+
+def left_by_running_drives(
+    model: Mapping[str, float], voltage: float, every: FloatArray, count: int
+) -> FloatArray:
+    """Return as many states h at a voltage, each as probable as the next, um.
+
+    They are those of loops of 16 amplitudes about the middle of ``every`` voltage, left on either
+    branch, and none; between them are straight lines.
+    """
+    shape = (np.array([model[name]]) for name in ("alpha", "beta", "gamma"))
+    alpha, beta, gamma = shape
+    middle, half = (np.max(every) + np.min(every)) / 2, np.ptp(every) / 2
+    states = [0.0]
+    for part in np.arange(1, 17) / 16:
+        low, high = middle - part * half, middle + part * half
+        for sweeps in ([0.0, high, low, high, low], [0.0, low, high, low, high]):
+            h = hysteresis(np.array([*sweeps, voltage]), alpha, beta, gamma)
+            states.append(float(h[0, -1]))
+    places = np.linspace(0.0, 1.0, len(states))
+    return np.interp((np.arange(count) + 0.5) / count, places, np.sort(states))
