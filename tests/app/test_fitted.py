@@ -23,6 +23,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.results.outputs import write_bands
 from bwbayes.results.prediction import Start
+from bwbayes.results.result import summary
 from tests.app import small
 
 
@@ -126,6 +127,16 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
 # What it shows
 
 
+def test_the_loops_are_those_of_the_summary(fit: Fit) -> None:
+    loops = fit.loops
+    assert loops is not None
+    told: Any = summary(fit.result)["loops"]
+    opening = loops.major.estimates["opening_um"]
+    assert opening is not None
+    assert opening.lower < opening.mean < opening.upper
+    assert opening.mean == pytest.approx(told["major"]["opening_um"]["mean"])
+
+
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
     said, page = repr(fit), fit._repr_html_()
     for name, row in fit.summary.iterrows():
@@ -144,7 +155,8 @@ def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["loop", "bands", "coverage", "innovations", "corner", "trace", "ranks", "record"]
+    "name",
+    ["loop", "loops", "bands", "coverage", "innovations", "corner", "trace", "ranks", "record"],
 )
 def test_every_figure_is_one_of_matplotlib(fit: Fit, name: str) -> None:
     assert getattr(fit.plot, name)().axes
@@ -223,6 +235,7 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
         lambda: made.summary,
         lambda: made.bands,
         lambda: made.residuals,
+        lambda: made.loops,
         lambda: made.predict(made.problem.record),
         made.plot.loop,
         made.plot.corner,

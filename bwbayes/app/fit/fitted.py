@@ -46,6 +46,7 @@ from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record, read_record
 from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
+from bwbayes.results.loops import Loops
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
@@ -186,6 +187,11 @@ class Fit(Advice):
         return xr.DataArray(
             values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
         )
+
+    @property
+    def loops(self) -> Loops | None:
+        """The major and a minor loop and the initial curve: ``fit.loops.major.estimates``."""
+        return self._converged().loops
 
     @property
     def plot(self) -> Plots:

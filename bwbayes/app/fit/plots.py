@@ -19,6 +19,7 @@ from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
+from bwbayes.app.figures.loops import draw_loops
 from bwbayes.app.figures.record import draw_record
 from bwbayes.app.figures.style import STYLE
 from bwbayes.app.figures.tracking import draw_tracking
@@ -59,6 +60,10 @@ class Plots:
         By default for all that was predicted with the fit, or for the bands of these names.
         """
         return _drawn(draw_loop, [self._bands(name) for name in names] or self.converged().bands)
+
+    def loops(self) -> Figure:
+        """Draw the major and a minor loop and the initial curve, measured."""
+        return _drawn(draw_loops, self.converged().loops)
 
     def bands(self, name: str | None = None) -> Figure:
         """Draw the bands of one window or record along time, by default the first fitted one."""
