@@ -299,3 +299,22 @@ def test_finite_for_parameters_over_many_decades(exponents: tuple[float, ...]) -
         inside = np.where(gamma > beta, 1.0, 10 ** generator.uniform(-3, 3, 1000))
         initial = highest * inside * generator.uniform(-1, 1, 1000)
         assert np.isfinite(hysteresis(voltage, alpha, beta, gamma, exponent, initial)).all()
+
+
+@given(
+    beta=st.floats(0.0, 0.2),
+    fraction=st.floats(-1.0, 1.0),
+    exponent=st.floats(1.0, 6.0),
+    edge=st.floats(1.0, 200.0),
+)
+def test_the_initial_curve_rises(
+    beta: float, fraction: float, exponent: float, edge: float
+) -> None:
+    """From no hysteresis, either way, w = d u − h follows the voltage, for any α below d."""
+    voltage = np.linspace(0.0, edge, 200)
+    gamma = fraction * beta
+    shape = (np.array([one]) for one in (ALPHA, beta, gamma, exponent))
+    alpha, *others = shape
+    for sign in (1.0, -1.0):
+        w = sign * (1.001 * ALPHA * sign * voltage - hysteresis(sign * voltage, alpha, *others)[0])
+        assert np.min(np.diff(w)) > 0

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
@@ -44,3 +48,23 @@ def test_says_what_is_wrong_by_name() -> None:
         PolynomialGain(("cubik",))
     with pytest.raises(InputError, match="cubic: nan in model 1; must be finite"):
         PolynomialGain(("cubic",)).check({"cubic": np.array([0.0, np.nan])})
+
+
+def displaced(term: str, voltage: list[float]) -> FloatArray:
+    """Return the displacement of Bouc-Wen hysteresis and one term of a gain, um."""
+    span = Span(-100.0, 100.0)
+    actuator = Actuator("none", "first", 1.0, gain=PolynomialGain((term,), span), span=span)
+    values = {"d": 0.7, "alpha": 0.3, "beta": 0.03, "gamma": 0.01, "exponent": 1.0, term: 5.0}
+    model = [[values.get(name, 0.0) for name in actuator.parameters]]
+    return actuator.displacement(model, np.array(voltage))[0]
+
+
+@given(st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=20))
+def test_a_cubic_gain_keeps_the_odd_symmetry(voltage: list[float]) -> None:
+    mirrored = displaced("cubic", [-u for u in voltage])
+    np.testing.assert_allclose(mirrored, -displaced("cubic", voltage), rtol=0, atol=1e-12)
+
+
+def test_a_quadratic_gain_breaks_it() -> None:
+    up, down = displaced("quadratic", [0.0, 100.0]), displaced("quadratic", [0.0, -100.0])
+    np.testing.assert_allclose(up + down, [0.0, 10.0], rtol=0, atol=1e-12)

@@ -305,7 +305,7 @@ def test_preisach_does_not_obey_masing() -> None:
 
 
 @every_case
-def test_the_first_curve_rises_and_rises_faster_than_a_branch_starts(case: Case) -> None:
+def test_the_initial_curve_rises(case: Case) -> None:
     up = run(case.operator, case.column, np.linspace(0.0, 300.0, 500), None)
     assert np.min(np.diff(up, axis=1)) > 0
 

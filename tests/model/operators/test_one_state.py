@@ -29,7 +29,13 @@ OPERATORS: dict[str, OneState] = {
     "jiles-atherton": JilesAtherton(),
     "domain-wall": DomainWall(),
 }
-ODD = ("backlash-like", "duhem", "bouc-wen-asymmetric by the voltage", "jiles-atherton")
+ODD = (
+    "backlash-like",
+    "duhem",
+    "bouc-wen-asymmetric by the voltage",
+    "jiles-atherton",
+    "domain-wall",
+)
 NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
 
 every = pytest.mark.parametrize("name", OPERATORS)
@@ -163,7 +169,9 @@ def test_others_are_not_symmetric(name: str) -> None:
     assert np.median(np.abs(sum_).max(axis=1)) > 0.1
 
 
-@pytest.mark.parametrize("name", ["backlash-like", "bouc-wen-asymmetric", *ODD[-1:], "domain-wall"])
+@pytest.mark.parametrize(
+    "name", ["backlash-like", "bouc-wen-asymmetric", "jiles-atherton", "domain-wall"]
+)
 def test_the_initial_curve_rises(name: str) -> None:
     """From zero volts either way, and from no hysteresis; Duhem's is in its own tests."""
     operator = OPERATORS[name]
