@@ -16,6 +16,9 @@ from click.testing import CliRunner
 
 from bwbayes.app.commands import cli
 from bwbayes.data import read_record, write_record
+from bwbayes.inference.noise import NOISES
+from bwbayes.model.gain import TERMS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 from tests.app import small
 from tests.data.spoilt import looping
 
@@ -105,6 +108,14 @@ def test_help_names_every_command(bwbayes: Type, arguments: tuple[str, ...]) -> 
     assert (0, "") == (said.status, said.err)
     for command in COMMANDS:
         assert f"  {command} " in said.out
+
+
+@pytest.mark.parametrize("command", ["models", "compare"])
+def test_help_lists_every_part_of_a_model(bwbayes: Type, command: str) -> None:
+    # A long name may go on in the next line, after its hyphen.
+    said = re.sub(r"-\n\s+", "-", bwbayes(command, "--help").out)
+    words = set(re.split(r"[,\s]+", said))
+    assert {*HYSTERESIS, *TERMS, *DYNAMICS, *NOISES, "creep"} <= words
 
 
 def test_version_is_the_packages(bwbayes: Type) -> None:

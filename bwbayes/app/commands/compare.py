@@ -10,6 +10,7 @@ from rich.console import Console
 from bwbayes.app.commands.shared import (
     FILE,
     NOT_CONVERGED,
+    WithParts,
     executor_option,
     overwrite_option,
     quiet_option,
@@ -29,7 +30,7 @@ USUAL = (
 )
 
 
-@click.command()
+@click.command(cls=WithParts)
 @click.argument("paths", type=FILE, nargs=-1, required=True)
 @click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL}.")
 @click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from bwbayes.app.commands.shared import WithParts
+
 __all__ = ["config", "models"]
 
 
@@ -20,7 +22,7 @@ def config(key: str | None) -> int:
     return 0
 
 
-@click.command()
+@click.command(cls=WithParts)
 @click.argument("name", required=False)
 def models(name: str | None) -> int:
     """Print the parts of a model, or of one NAME its equation, parameters and default priors.

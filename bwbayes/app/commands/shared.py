@@ -19,6 +19,7 @@ __all__ = [
     "FILE",
     "INTERRUPTED",
     "NOT_CONVERGED",
+    "WithParts",
     "capacitance_option",
     "current_option",
     "executor_option",
@@ -34,6 +35,20 @@ BAD_INPUT = 2
 DOES_NOT_HOLD = 3
 NOT_CONVERGED = 4
 INTERRUPTED = 130
+
+
+class WithParts(click.Command):
+    """A command whose help lists the parts that a model may have, as the registries do."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the parts, by kind."""
+        # Here, because it is slow to load.
+        from bwbayes.app.config.reference import PARTS
+
+        del ctx
+        with formatter.section("Parts"):
+            formatter.write_dl([(kind, ", ".join(names)) for kind, names in PARTS.items()])
+
 
 FILE = click.Path(path_type=Path)
 workers_option = click.option(

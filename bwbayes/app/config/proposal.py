@@ -24,6 +24,7 @@ from bwbayes.data.io.checks import Table
 from bwbayes.data.io.columns import Naming, unit_in
 from bwbayes.data.io.formats import read_table
 from bwbayes.errors import InputWarning
+from bwbayes.model.registry import DYNAMICS
 
 __all__ = ["Proposal", "propose"]
 
@@ -152,7 +153,7 @@ def _text(
     written += [
         "",
         "[model]",
-        'dynamics = "lag"  # or "none", "second-order"',
+        f'dynamics = "lag"  # or {", ".join(_quoted(n) for n in DYNAMICS if n != "lag")}',
         *lines["model"],
         "",
         "# Priors come from the record's ranges; `bwbayes check` shows them. To say more:",
