@@ -17,6 +17,7 @@ import pytest
 from bwbayes.app.commands import cli
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
+from bwbayes.model.registry import HYSTERESIS
 from bwbayes.results.bands import LEVELS
 from tests.examples import README, ROOT, blocks
 from tests.measured import measured
@@ -169,6 +170,12 @@ def parts() -> str:
         abs(t) for one in every.values() for t in one["bands, standard errors off"].values()
     )
     missed = {name: one["unconverged"] for name, one in every.items()}
+    bands = [
+        100 * cover
+        for one in every.values()
+        for name, cover in one["bands cover"].items()
+        if name.startswith("other") and name.endswith("sensor 95")
+    ]
     many = {name: count for name, count in missed.items() if count > MOST_UNCONVERGED * REPLICATES}
     told = ", ".join(f"{name} {count}" for name, count in sorted(many.items()))
     most = max(set(missed.values()) - set(many.values()))
@@ -176,8 +183,9 @@ def parts() -> str:
     run = (f"{name} (`{OPTIONS[name].strip()}`)" if name in OPTIONS else name for name in every)
     return (
         f"{', '.join(sorted(run))}, {REPLICATES} replicates each: no test of ranks failed, none "
-        f"of {18 * len(every)} bands is off by more than {worst:.1f} standard errors; not "
-        f"converged in their budget at most {most}"
+        f"of {18 * len(every)} bands is off by more than {worst:.1f} standard errors; 95 % sensor "
+        f"bands of another record cover {min(bands):.1f} to {max(bands):.1f} %; not converged in "
+        f"their budget at most {most}"
         + (f", but more than the tenth that is allowed of {told}" if many else "")
         + (f"; not run to the end: {late}" if late else "")
     )
@@ -235,6 +243,22 @@ def moving() -> str:
         f"{kinds} kinds of {records} records: 95 % bands cover {min(parts):.1f} to "
         f"{max(parts):.1f} %, none of the {3 * len(cells)} bands of 50, 90 and 95 % is off by more "
         f"than {worst:.1f} standard errors"
+    )
+
+
+def moving_operators() -> str:
+    start = "moving operators, "
+    every = {n.removeprefix(start): one for n, one in measured().items() if n.startswith(start)}
+    cells = [cell for one in every.values() for cell in one["coverage and t"].values()]
+    parts = [100 * one["coverage and t"]["95"][0] for one in every.values()]
+    wider = max(one["widening from rest"] for one in every.values())
+    missing = sorted(set(HYSTERESIS) - set(every))
+    return (
+        f"{min(one['records'] for one in every.values())} records of each operator: 95 % bands "
+        f"cover {min(parts):.1f} to {max(parts):.1f} %, none of the {len(cells)} bands of 50, 90 "
+        f"and 95 % is off by more than {max(abs(t) for _, t in cells):.1f} standard errors; no "
+        f"wider than {wider:.2f} times where a record did start from rest"
+        + (f"; not run: {', '.join(missing)}" if missing else "")
     )
 
 
@@ -358,6 +382,7 @@ FINDINGS = [
     steady,
     verdicts,
     moving,
+    moving_operators,
     nested,
     spikes,
     closed_loop,
