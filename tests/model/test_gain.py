@@ -56,7 +56,8 @@ def displaced(term: str, voltage: list[float]) -> FloatArray:
     actuator = Actuator("none", "first", 1.0, gain=PolynomialGain((term,), span), span=span)
     values = {"d": 0.7, "alpha": 0.3, "beta": 0.03, "gamma": 0.01, "exponent": 1.0, term: 5.0}
     model = [[values.get(name, 0.0) for name in actuator.parameters]]
-    return actuator.displacement(model, np.array(voltage))[0]
+    moved: FloatArray = actuator.displacement(model, np.array(voltage))[0]
+    return moved
 
 
 @given(st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=20))

@@ -20,14 +20,14 @@ def left_by_running_drives(
     They are those of loops of 16 amplitudes about the middle of ``every`` voltage, left on either
     branch, and none; between them are straight lines.
     """
-    shape = (np.array([model[name]]) for name in ("alpha", "beta", "gamma"))
-    alpha, beta, gamma = shape
+    alpha, beta, gamma = (np.array([model[name]]) for name in ("alpha", "beta", "gamma"))
     middle, half = (np.max(every) + np.min(every)) / 2, np.ptp(every) / 2
     states = [0.0]
-    for part in np.arange(1, 17) / 16:
-        low, high = middle - part * half, middle + part * half
+    for reach in np.arange(1, 17) / 16:
+        low, high = middle - reach * half, middle + reach * half
         for sweeps in ([0.0, high, low, high, low], [0.0, low, high, low, high]):
             h = hysteresis(np.array([*sweeps, voltage]), alpha, beta, gamma)
             states.append(float(h[0, -1]))
     places = np.linspace(0.0, 1.0, len(states))
-    return np.interp((np.arange(count) + 0.5) / count, places, np.sort(states))
+    parts = (np.arange(count) + 0.5) / count
+    return np.asarray(np.interp(parts, places, np.sort(states)), dtype=np.float64)
