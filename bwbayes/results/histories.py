@@ -79,8 +79,9 @@ class States:
 
     Of one of many histories these are the states between the lowest and the highest that drives of
     its range leave (:func:`edged`). Where one number holds all states, and a history is ``alone``,
-    they are what drives of any amplitude leave that were running when the record began: the
-    branches of loops, no hysteresis at all, and straight lines from one to the next.
+    they are what drives of any amplitude leave that were running when the record began, on the
+    branches of their loops, the lowest and the highest as far out as any drive leaves them; between
+    them are straight lines.
     """
 
     def __init__(self, likelihood: Likelihood, theta: FloatArray, *, alone: bool) -> None:
@@ -92,13 +93,14 @@ class States:
         assert actuator.span is not None
         column, voltage = self.table.columns(theta), float(likelihood.voltage[0])
         operator = actuator.hysteresis
+        low, high = operator.reachable(column, voltage, actuator.span)
+        self.ordered = np.stack([low, high])
         if alone:
             ranges = narrower(actuator.span, further=(1.0,))
-            ends = [operator.left(column, voltage, one) for one in ranges]
-            none = np.zeros((1, len(theta)))
-            self.ordered = np.sort(np.concatenate([*ends, none]), axis=0)
-        else:
-            self.ordered = np.stack(operator.reachable(column, voltage, actuator.span))
+            left = [operator.left(column, voltage, one) for one in ranges]
+            self.ordered = np.sort(np.concatenate(left), axis=0)
+            self.ordered[0] = np.minimum(self.ordered[0], low)
+            self.ordered[-1] = np.maximum(self.ordered[-1], high)
 
     @property
     def open(self) -> bool:
@@ -124,8 +126,11 @@ class States:
         if not self.alone:
             return places
         low, high = self.ordered[0], self.ordered[-1]
-        ways = (self.ordered - low) / np.where(high > low, high - low, 1.0)
-        parts = np.linspace(0.0, 1.0, len(ways))
+        parts = np.linspace(0.0, 1.0, len(self.ordered))
+        # A draw with a single state has it at all places.
+        several = high > low
+        ways = (self.ordered - low) / np.where(several, high - low, 1.0)
+        ways[:, ~several] = parts[:, np.newaxis]
         every = [np.interp(*both, parts) for both in zip(places.T, ways.T, strict=True)]
         return np.stack(every, axis=1)
 
@@ -133,11 +138,9 @@ class States:
         """Return θ (draws, parameters) with the states of which ``part`` (draws,) are lower."""
         if not self.alone:
             return self.at(part)
-        place = part * (len(self.ordered) - 1)
-        index, draws = (
-            np.minimum(place.astype(np.int64), len(self.ordered) - 2),
-            np.arange(part.size),
-        )
+        last, draws = len(self.ordered) - 1, np.arange(part.size)
+        place = part * last
+        index = np.minimum(place.astype(np.int64), last - 1)
         lower = self.ordered[index, draws]
         return self._with(lower + (place - index) * (self.ordered[index + 1, draws] - lower))
 

@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import Span
-from bwbayes.results.histories import Histories, chosen, edged
+from bwbayes.results.histories import Histories, States, chosen, edged
 from bwbayes.results.prediction import Start
 from bwbayes.results.start import started
 from tests.results.moving import RATE, Case, posterior_of_case
@@ -128,3 +128,23 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
     assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
+
+
+def test_what_part_of_the_states_lies_below_is_a_distribution_even_of_a_single_state() -> None:
+    """Of several it rises from 0 to 1 and undoes what draws them; of one, all places are it."""
+    posterior = posterior_of_case(Case(hysteresis="backlash-like"))
+    actuator = replace(posterior.only.actuator, span=Span(-95.0, 95.0))
+    likelihood = replace(posterior.likelihood, from_rest=False, actuator=actuator)
+    theta = np.repeat(posterior.prior.theta(np.empty((1, 0))), 2, axis=0)
+    states = States(likelihood, theta, alone=True)
+    column = posterior.prior.names.index("initial")
+    low, high = states.ordered[0, 0], states.ordered[-1, 0]
+    for part in (0.0, 0.3, 0.99, 1.0):
+        h = states.drawn(np.full(2, part))[:, column]
+        place = (h - low) / (high - low)
+        np.testing.assert_allclose(states.below(place[np.newaxis])[0], part, atol=1e-12)
+    states.ordered[:, 0] = 2.0
+    places = np.linspace([0.0, 0.0], [1.0, 1.0], 9)
+    below = states.below(places)
+    np.testing.assert_array_equal(below[:, 0], places[:, 0])
+    assert (np.diff(below[:, 1]) > 0).all()
