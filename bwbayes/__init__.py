@@ -59,6 +59,7 @@ __all__ = [
     "Waveform",
     "assess",
     "campaign",
+    "compare",
     "draws",
     "first_chain",
     "fit",
@@ -90,7 +91,7 @@ if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.config.config import load as load_config
     from bwbayes.app.config.config import parse as parse_config
-    from bwbayes.app.fit.calls import fit, open_run, resume_run
+    from bwbayes.app.fit.calls import compare, fit, open_run, resume_run
     from bwbayes.app.fit.campaigns import Campaign, campaign
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem, resolve
@@ -159,6 +160,7 @@ else:
         "Waveform": "data.waveforms",
         "assess": "results.verdict",
         "campaign": "app.fit.campaigns",
+        "compare": "app.fit.calls",
         "draws": "sampling.sampler",
         "first_chain": "sampling.sampler",
         "forecast": "results.prediction",
@@ -196,4 +198,4 @@ else:
 
 def __dir__() -> list[str]:
     """List the public names, loaded or not."""
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

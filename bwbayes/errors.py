@@ -9,8 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
+from shlex import quote
 
-__all__ = ["InputError", "InputWarning", "NotConvergedError", "one_line", "suggestion"]
+__all__ = [
+    "ColumnsError",
+    "InputError",
+    "InputWarning",
+    "NotConvergedError",
+    "one_line",
+    "suggestion",
+]
 
 # How alike two words must be, from 0 to 1, for one to be a misspelling of the other.
 ALIKE = 0.6
@@ -31,6 +39,47 @@ class InputError(ValueError):
 
 class NotConvergedError(InputError):
     """An interval was asked of a sampling that has not converged; the text says how to go on."""
+
+
+class ColumnsError(InputError):
+    """Columns or units of a file that are not known; ``columns`` and ``units`` are a guess.
+
+    The text says what to write in Python; :meth:`in_config` and :meth:`in_command` what to write
+    elsewhere. ``place`` is the table of the config that names the file.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        columns: Mapping[str, str],
+        units: Mapping[str, str],
+        place: str = "record",
+    ) -> None:
+        self.problem, self.place = problem, place
+        self.guess = {"columns": dict(columns), "units": dict(units)}
+        said = ", ".join(f"{key}={table!r}" for key, table in self.guess.items() if table)
+        super().__init__(f"{problem}; say {said}")
+
+    def within(self, place: str) -> ColumnsError:
+        """Return the error of a file that a table of a config names."""
+        return ColumnsError(self.problem, self.guess["columns"], self.guess["units"], place)
+
+    def in_config(self) -> InputError:
+        """Return the error for a config, with the lines to write into its table."""
+        lines = []
+        for key, table in self.guess.items():
+            pairs = ", ".join(f"{quantity} = {text!r}" for quantity, text in table.items())
+            lines += [f"{key} = {{ {pairs} }}"] if table else []
+        return InputError(f"{self.problem}; under [{self.place}] say {' and '.join(lines)}")
+
+    def in_command(self, command: str) -> InputError:
+        """Return the error for the command line, with the whole command to copy."""
+        options = [
+            f"--{key.removesuffix('s')} {quantity}={quote(text)}"
+            for key, table in self.guess.items()
+            for quantity, text in table.items()
+        ]
+        return InputError(f"{self.problem}; copy and correct: {' '.join([command, *options])}")
 
 
 def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | None = None) -> str:

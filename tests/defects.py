@@ -92,7 +92,7 @@ def run_tests(tests: Iterable[str], defect: Defect | None = None) -> tuple[int, 
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         # What numba has compiled comes along: it knows its source by date and size.
-        for part in ("bwbayes", "tests"):
+        for part in ("bwbayes", "tests", "runs"):
             shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("*.pyc"))
         shutil.copy(ROOT / "pyproject.toml", copy)
         if defect is not None:

@@ -66,7 +66,7 @@ SHORTER = {
 # actuators few.
 DEFAULTS = {
     "bwbayes.app.figures._draw": lambda *_: Figure(),
-    "bwbayes.app.commands.compare.USUAL": "linear; bouc-wen",
+    "bwbayes.app.commands.compare.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}
 

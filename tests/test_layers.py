@@ -18,7 +18,7 @@ LONGEST_FILE = 400
 
 # Lowest first: a module imports from its own layer and from lower ones.
 LAYERS = (
-    ("bwbayes.errors", "bwbayes.arrays"),
+    ("bwbayes.errors", "bwbayes.arrays", "bwbayes.shown"),
     ("bwbayes.model",),
     ("bwbayes.data",),
     ("bwbayes.inference",),
@@ -33,6 +33,7 @@ LAYERS = (
 # Libraries that few modules may know, and these modules (patterns).
 KEEPERS = {
     "h5py": ("bwbayes.sampling.storage", "bwbayes.data.io.hdf5", "bwbayes.data.io.matlab"),
+    "nptdms": ("bwbayes.data.io.labview",),
     # The inverse of many models, and the likelihood.
     "numba": ("bwbayes.model.inverse.compiled.*", "bwbayes.inference.compiled.*"),
     "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves", "bwbayes.sampling.walking"),

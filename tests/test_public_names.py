@@ -15,7 +15,7 @@ import bwbayes
 # A name that leaves this list breaks somebody's program.
 PUBLIC = {
     "bwbayes.app.config.config": {"Config", "load as load_config", "parse as parse_config"},
-    "bwbayes.app.fit.calls": {"fit", "open_run", "resume_run"},
+    "bwbayes.app.fit.calls": {"compare", "fit", "open_run", "resume_run"},
     "bwbayes.app.fit.campaigns": {"Campaign", "campaign"},
     "bwbayes.app.fit.fitted": {"Fit"},
     "bwbayes.app.running.predictions": {"Prediction"},

@@ -354,7 +354,15 @@ def inverse() -> str:
 
 
 def compensation() -> str:
-    every = measured()["compensation"]
+    return _errors("compensation")
+
+
+def compensation_by_a_dac() -> str:
+    return _errors("compensation by a DAC")
+
+
+def _errors(study: str) -> str:
+    every = measured()[study]
     bands, rms = (
         "/".join(f"{100 * every[f'{kind} {level}'][0]:.0f}" for level in LEVELS)
         for kind in ("band", "rms")
@@ -391,6 +399,7 @@ FINDINGS = [
     agreement,
     inverse,
     compensation,
+    compensation_by_a_dac,
     specimens,
     populations,
     defects,

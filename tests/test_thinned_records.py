@@ -110,7 +110,7 @@ def answer(
     text += f"[validation.rest]\nwindow = [{stop}, {end}]\n"
     problem, source = problem_of(text, folder), np.random.default_rng([32, seed])
     draws, weights = weighted_draws(problem.posterior, source)
-    window = problem.validations["rest"].window
+    window = problem.validations["rest"].windows
     assert window is not None
     chosen = draws[source.choice(len(draws), KEPT, p=weights)]
     (bands,) = predict_windows(problem.posterior, chosen, problem.record, {"rest": window}, source)

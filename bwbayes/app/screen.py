@@ -28,6 +28,7 @@ from bwbayes.results.calibration import Calibration
 from bwbayes.results.loops import MEASURES, Loops
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
+from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
 
 __all__ = [
@@ -43,7 +44,7 @@ __all__ = [
     "show_remarks",
     "show_result",
     "show_scores",
-    "show_verdicts",
+    "show_standing",
 ]
 
 
@@ -53,8 +54,8 @@ CHANGED = 0.03
 # Columns of a comparison that a terminal has room for: the page has all.
 ON_SCREEN = (0, 1, 2, 4, 5, 6, 8)
 
-PARAMETER_COLUMNS = ("parameter", "mean", "sd", "95 % interval", "unit", "ESS", "R-hat")
-SCORE_COLUMNS = ("NRMSE", "max error", "CRPS", "95 % width", "sensor band covers, %")
+PARAMETER_COLUMNS = ("Parameter", "Mean", "SD", "95% interval", "Unit", "ESS", "R-hat")
+SCORE_COLUMNS = ("NRMSE", "Max error", "Width 95%", f"Coverage {'/'.join(map(str, LEVELS))}%")
 
 
 def show_result(result: Result, folder: RunFolder | None, console: Console) -> None:
@@ -62,7 +63,7 @@ def show_result(result: Result, folder: RunFolder | None, console: Console) -> N
 
     The folder, if given, is where its report lies.
     """
-    show_verdicts(result.verdicts.values(), console)
+    show_standing(result.standing, console)
     rows = list(parameter_rows(result))
     if rows:
         table = _table(*PARAMETER_COLUMNS)
@@ -107,12 +108,12 @@ def parameter_rows(result: Result) -> Iterator[tuple[str, ...]]:
         )
 
 
-def show_verdicts(verdicts: Iterable[Verdict], console: Console) -> None:
-    """Show first what does not hold, with its cause and what helps."""
-    for verdict in verdicts:
-        if verdict.holds is False:
-            line = f"[bold red]DOES NOT HOLD[/]: {escape(verdict.line)}"
-            console.print(line, highlight=False, soft_wrap=True)
+def show_standing(standing: Standing, console: Console) -> None:
+    """Show first what does not hold, with its cause and fix, or what is open."""
+    colour = {True: "green", False: "red", None: "yellow"}[standing.holds]
+    for line in standing.lines:
+        text = f"[bold {colour}]{standing.headline}[/]: {escape(line)}"
+        console.print(text, highlight=False, soft_wrap=True)
 
 
 def _sampling(result: Result) -> str:
@@ -127,7 +128,7 @@ def show_scores(
     scores: Mapping[str, Scores], console: Console, verdicts: Mapping[str, Verdict] | None = None
 ) -> None:
     """Show how predictions turned out."""
-    table = _table("prediction", *(["holds"] if verdicts else []), *SCORE_COLUMNS)
+    table = _table("Record", *(["Validation"] if verdicts else []), *SCORE_COLUMNS)
     for name, one in scores.items():
         held = [_held(verdicts[name])] if verdicts else []
         table.add_row(name, *held, *score_texts(one))
@@ -149,20 +150,17 @@ def show_loops(loops: Loops, console: Console) -> None:
 def score_texts(scores: Scores) -> tuple[str, ...]:
     """Return scores as texts, one for each of ``SCORE_COLUMNS``."""
     covered = scores.coverage["sensor"] or {}
-    error = scores.coverage_error["sensor"] or {}
     return (
-        f"{scores.nrmse:.2%}",
+        f"{100 * scores.nrmse:.2f}%",
         f"{scores.max_error_um:.2f} um",
-        f"{scores.crps_um:.3f} um",
         f"{scores.width_um[95]:.2f} um",
-        ",\n".join(
-            f"{level} %: {100 * covered[level]:.1f} ± {100 * error[level]:.1f}" for level in covered
-        ),
+        "/".join(f"{100 * part:.1f}" for part in covered.values()),
     )
 
 
 def _held(verdict: Verdict) -> str:
-    return {True: "yes", False: "[bold red]NO[/]", None: "unknown"}[verdict.holds]
+    words = {True: "passed", False: "[bold red]FAILED[/]", None: "[yellow]inconclusive[/]"}
+    return words[verdict.holds]
 
 
 def show_calibration(calibration: Calibration, folder: CalibrationFolder, console: Console) -> None:

@@ -17,6 +17,8 @@ from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.future import Future
 from bwbayes.results.bands import Bands
 from bwbayes.results.scores import Scores
+from bwbayes.results.standing import Standing
+from bwbayes.shown import brief
 
 __all__ = ["Candidate", "Mean", "judged"]
 
@@ -60,8 +62,8 @@ class Candidate:
         Whether it has any hysteresis.
     held_out, scores
         Bands of what was held out and measured, and their scores by the bands' name.
-    not_holding
-        The names of those whose bands do not hold.
+    standing
+        Whether its run's bands hold.
     joint
         Log density of the held-out readings of the training records together, nats, and Pareto k̂
         of the ratios that it is a mean of; None if there are none.
@@ -73,6 +75,8 @@ class Candidate:
         The largest among the draws, nats.
     """
 
+    __repr__ = brief
+
     name: str
     model: str
     converged: bool
@@ -82,7 +86,7 @@ class Candidate:
     hysteresis: bool = True
     held_out: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
-    not_holding: tuple[str, ...] = ()
+    standing: Standing = field(default_factory=Standing)
     joint: tuple[float, float] | None = None
     future: Future | None = None
     evidence: Evidence | None = None

@@ -19,6 +19,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.differences import SURE, Difference, paired
 from bwbayes.comparison.future import BELIEVED_K
+from bwbayes.results.standing import Standing
+from bwbayes.shown import brief
 
 __all__ = ["Comparison", "Measure", "choose"]
 
@@ -65,6 +67,8 @@ class Comparison:
         What speaks against it, a line each.
     """
 
+    __repr__ = brief
+
     candidates: tuple[Candidate, ...]
     measure: Measure
     best: str | None
@@ -73,6 +77,11 @@ class Comparison:
     alike: tuple[str, ...]
     lines: tuple[str, ...]
     against: tuple[str, ...]
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the bands of the recommended model hold."""
+        return Standing() if self.recommended is None else self[self.recommended].standing
 
     def __getitem__(self, name: str) -> Candidate:
         """Return a model by its name."""
@@ -247,8 +256,7 @@ def _against(
         said.append(
             f"{best.name} has the best {WORDS[measure]}, by {-lost.value:.2g} ± {lost.error:.2g}"
         )
-    if chosen.not_holding:
-        said.append(f"its bands do not hold on {_listed(chosen.not_holding)}")
+    said += chosen.standing.said
     if measure == "evidence":
         said.append("nothing was held out, so the evidence decides, which trusts priors and noise")
     elif measure == "future":

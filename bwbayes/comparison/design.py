@@ -24,6 +24,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.identifiability import stretches_once
+from bwbayes.shown import brief
 
 __all__ = ["Asked", "Promise", "promises", "ranked"]
 
@@ -50,6 +51,8 @@ class Promise:
     refused
         Why the amplifier cannot make it; empty if it can.
     """
+
+    __repr__ = brief
 
     name: str
     left: float

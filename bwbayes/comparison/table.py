@@ -76,6 +76,7 @@ def numbers(comparison: Comparison) -> dict[str, object]:
         "alike": list(comparison.alike),
         "recommendation": list(comparison.lines),
         "against": list(comparison.against),
+        "validation": comparison.standing.numbers,
         "models": {
             one.name: _model(one, comparison.differences.get(one.name, {}))
             for one in comparison.candidates
@@ -91,6 +92,7 @@ def _model(one: Candidate, known: Mapping[Measure, Difference]) -> dict[str, obj
         "stop_reason": one.stop_reason,
         "free": one.free,
         "readings": one.readings,
+        "validation": one.standing.status if one.converged else None,
         "held_out": None if one.mean is None else vars(one.mean),
         "windows": {name: as_summary(scores) for name, scores in one.scores.items()},
         "joint_log_score": None if one.joint is None else one.joint[0],

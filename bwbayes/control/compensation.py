@@ -3,33 +3,43 @@
 The voltage is the inverse of the posterior's mean model, or the one whose squared error, expected
 over the posterior, is least. What it does is then predicted with every draw, as any planned voltage
 is: bands of the displacement, and so of the tracking error, its rms with an interval, and the
-probability that it stays below a limit. Beside it stands what a linear command would do, which is
-the line through the record that was fitted.
+probability that it stays below a limit. Beside it stands what a linear command would do, by the
+slope of a line through the record that was fitted.
+
+A command is played by a DAC, which holds each voltage until the next sample. So it has a hold of
+its own, whatever the voltage did in the record that was fitted: a command for straight lines that a
+DAC holds comes half a sample late. The errors are those at the samples, just before the voltage
+changes, and to the reference as requested, not as it was smoothed.
+
+0 um of a reference is where the actuator stands at zero volts as the command begins, here as in a
+closed loop and in an exported model. A command so begins at zero volts and goes on from where the
+actuator is, which is also where one would set a sensor to zero. Where the sensor of the record that
+was fitted had its zero says nothing of the actuator: to take it for 0 um would make a command begin
+with a jump, of 10 V for an offset of 7 um.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import get_args
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.control.predicted import Choice, Compensation, Errors, Played, planned
 from bwbayes.control.wished import Reference
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.results.bands import KINDS, LEVELS, Bands
+from bwbayes.model.linear import Hold
 from bwbayes.results.prediction import predict_record
 from bwbayes.results.start import Start, Started, started
 
-__all__ = ["ROUNDS", "Choice", "Compensation", "Played", "compensate"]
-
-Choice = Literal["mean", "expected"]
+__all__ = ["ROUNDS", "compensate"]
 
 # Rounds in which the command with the least expected error is looked for.
 ROUNDS = 4
@@ -37,132 +47,8 @@ ROUNDS = 4
 # Numbers (draws x samples) that are simulated at once.
 BLOCK = 2_000_000
 
-
-@dataclass(frozen=True, eq=False)
-class Played:
-    """A command and what it will do.
-
-    ``voltage`` (samples,), V; ``bands`` of the displacement; ``rms`` and ``largest`` (draws,), um,
-    of the tracking error with the discrepancy, one draw each; ``expected`` the square root of the
-    squared error that the parameters leave, expected over the draws, um.
-    """
-
-    voltage: FloatArray
-    bands: Bands
-    rms: FloatArray
-    largest: FloatArray
-    expected: float
-
-    def probability(self, limit: float) -> float:
-        """Return the probability that the error stays below a limit, um, at all samples."""
-        return float(np.mean(self.largest <= limit))
-
-    def numbers(self, limit: float | None) -> dict[str, Any]:
-        """Return what is promised of the error, um, and the voltages, V."""
-        said: dict[str, Any] = {
-            "voltage_V": [float(np.min(self.voltage)), float(np.max(self.voltage))],
-            "expected_rms_um": self.expected,
-        }
-        for name, values in (("rms_um", self.rms), ("largest_um", self.largest)):
-            said[name] = {"mean": float(np.mean(values))} | {
-                f"{level}": _interval(values, level) for level in LEVELS
-            }
-        if limit is not None:
-            said["probability_below_limit"] = self.probability(limit)
-        return said
-
-
-def _interval(values: FloatArray, level: int) -> list[float]:
-    tail = (1 - level / 100) / 2
-    return [float(edge) for edge in np.quantile(values, [tail, 1 - tail])]
-
-
-@dataclass(frozen=True, eq=False)
-class Compensation:
-    """A command that makes a displacement, and what is promised of it.
-
-    ``reference`` is what was asked for; ``command`` says which of the two voltages was taken;
-    ``compensated`` is that command, ``linear`` the one without compensation; ``difference`` the
-    largest difference of the two voltages that could have been taken, V, and ``other`` what the
-    other one leaves, as ``Played.expected``, um. ``limit`` is that of the error, um, if there is
-    one; ``hold`` what the voltage does between samples.
-    """
-
-    reference: Reference
-    command: Choice
-    compensated: Played
-    linear: Played
-    difference: float
-    other: float
-    hold: str
-    from_rest: bool
-    limit: float | None = None
-    remarks: tuple[str, ...] = ()
-
-    @property
-    def asked(self) -> FloatArray:
-        """What the displacement is to be, (samples,), um."""
-        return np.asarray(self.reference.displacement)
-
-    @property
-    def voltage(self) -> FloatArray:
-        """The command, (samples,), V."""
-        return self.compensated.voltage
-
-    @property
-    def record(self) -> Record:
-        """The command as a record that a signal generator can play."""
-        return _planned(
-            self.voltage, self.reference, self.hold, f"command for {self.reference.name}"
-        )
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What is promised, in numbers."""
-        asked = self.asked
-        return {
-            "reference": self.reference.name,
-            "samples": asked.size,
-            "interval_s": self.reference.interval,
-            "from_um": float(np.min(asked)),
-            "to_um": float(np.max(asked)),
-            "smoothed_s": self.reference.smoothed,
-            "smoothing_moves_um": self.reference.moved,
-            "from_rest": self.from_rest,
-            "hold": self.hold,
-            "command": self.command,
-            "limit_um": self.limit,
-            "compensated": self.compensated.numbers(self.limit),
-            "uncompensated": self.linear.numbers(self.limit),
-            "other_command": {
-                "largest_difference_V": self.difference,
-                "expected_rms_um": self.other,
-            },
-            "remarks": list(self.remarks),
-        }
-
-    def columns(self) -> Iterator[tuple[str, FloatArray]]:
-        """Yield names and values of the columns of ``compensation.csv``."""
-        yield "time_s", self.reference.time
-        yield "reference_um", self.asked
-        yield "voltage_V", self.voltage
-        bands = self.compensated.bands
-        yield "mean_um", bands.mean
-        for kind in KINDS:
-            for level in LEVELS:
-                yield f"{kind}_lower_{level}_um", bands.lower[kind, level]
-                yield f"{kind}_upper_{level}_um", bands.upper[kind, level]
-        for level in LEVELS:
-            yield f"error_lower_{level}_um", bands.lower["displacement", level] - self.asked
-            yield f"error_upper_{level}_um", bands.upper["displacement", level] - self.asked
-        yield "uncompensated_voltage_V", self.linear.voltage
-        yield "uncompensated_mean_um", self.linear.bands.mean
-
-    def to_pandas(self) -> Any:
-        """Return the columns of ``compensation.csv`` as a pandas.DataFrame."""
-        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
-
-        return pd.DataFrame(dict(self.columns()))
+# Segments of a sampling interval in which the displacement between samples is simulated.
+SEGMENTS = 10
 
 
 @dataclass(frozen=True)
@@ -173,12 +59,13 @@ class _Task:
     draws: FloatArray
     reference: Reference
     start: Start
-    hold: str
+    hold: Hold
     seed: int
 
     @property
-    def asked(self) -> FloatArray:
-        return np.asarray(self.reference.displacement)
+    def references(self) -> FloatArray:
+        """The reference as requested and as smoothed, (2, samples), um."""
+        return np.stack([self.reference.given, np.asarray(self.reference.displacement)])
 
     def generator(self) -> np.random.Generator:
         """Return the same random numbers for every command: they share their starts."""
@@ -186,10 +73,10 @@ class _Task:
 
     def begun(self, voltage: FloatArray) -> Started:
         theta = self.posterior.prior.theta(self.draws)
-        return started(self.posterior, theta, self.planned(voltage), self.start, self.generator())
+        return started(self.posterior, theta, self.record(voltage), self.start, self.generator())
 
-    def planned(self, voltage: FloatArray) -> Record:
-        return _planned(voltage, self.reference, self.hold, self.reference.name)
+    def record(self, voltage: FloatArray) -> Record:
+        return planned(voltage, self.reference, self.hold, self.reference.name)
 
     def simulated(self, voltage: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
         """Yield some draws at a time, and their displacement (draws, samples), um."""
@@ -206,42 +93,43 @@ class _Task:
             )
             yield some, part.advance(voltage)[0]
 
-    def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
-        """Return the expected squared error, um², and the weighted mean displacement (samples,)."""
-        squares, mean = 0.0, np.zeros(voltage.size)
+    def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the expected rms errors, um, and the weighted mean displacement (samples,).
+
+        Errors to the reference as requested and as smoothed, (2,).
+        """
+        squares, mean = np.zeros(2), np.zeros(voltage.size)
         for some, simulated in self.simulated(voltage):
             mean += weights[some] @ simulated
-            squares += float(np.sum(np.mean((simulated - self.asked) ** 2, axis=1)))
-        return squares / len(self.draws), mean
+            squares += self.squares(simulated)
+        return np.sqrt(squares / len(self.draws)), mean
+
+    def squares(self, simulated: FloatArray) -> FloatArray:
+        """Return the squared errors of some displacements, summed over draws, um², (2,)."""
+        return np.array(
+            [np.sum(np.mean((simulated - one) ** 2, axis=1)) for one in self.references]
+        )
 
     def played(self, voltage: FloatArray) -> Played:
         """Predict a command."""
         bands = predict_record(
-            self.posterior, self.draws, self.planned(voltage), self.start, self.generator()
+            self.posterior, self.draws, self.record(voltage), self.start, self.generator()
         )
         record = self.posterior.only
         theta = record.table.noise(self.posterior.prior.theta(self.draws))
         noise, generator = record.noise.at(self.reference.interval), self.generator()
-        rms, largest = np.empty((2, len(theta)))
-        squares = 0.0
+        rms, largest = np.empty((2, 2, len(theta)))
+        squares = np.zeros(2)
         for some, simulated in self.simulated(voltage):
-            missed = simulated - self.asked
-            squares += float(np.sum(np.mean(missed**2, axis=1)))
-            for row, one in enumerate(missed, some.start):
-                error = one + noise.draw(theta[row : row + 1], one.size, generator)[0]
-                rms[row] = np.sqrt(np.mean(error**2))
-                largest[row] = np.max(np.abs(error))
-        return Played(voltage, bands, rms, largest, float(np.sqrt(squares / len(theta))))
-
-
-def _planned(voltage: FloatArray, reference: Reference, hold: str, origin: str) -> Record:
-    return Record(
-        voltage,
-        None,
-        reference.interval,
-        voltage_is="command" if hold == "zero" else "output",
-        origin=origin,
-    )
+            squares += self.squares(simulated)
+            for row, one in enumerate(simulated, some.start):
+                moved = one + noise.draw(theta[row : row + 1], one.size, generator)[0]
+                errors = moved - self.references
+                rms[:, row] = np.sqrt(np.mean(errors**2, axis=1))
+                largest[:, row] = np.max(np.abs(errors), axis=1)
+        expected = np.sqrt(squares / len(theta)).tolist()
+        requested, smoothed = (Errors(*of) for of in zip(rms, largest, expected, strict=True))
+        return Played(**vars(requested), voltage=voltage, bands=bands, smoothed=smoothed)
 
 
 def compensate(
@@ -251,6 +139,7 @@ def compensate(
     generator: np.random.Generator,
     *,
     command: Choice = "mean",
+    hold: Hold = "zero",
     from_rest: bool = False,
     limits: Limits | None = None,
     nearest: bool = False,
@@ -264,17 +153,23 @@ def compensate(
     posterior, draws
         The posterior of one record, and draws (draws, free) from it, parameters in their own units.
     reference
-        What the displacement is to be, as the sensor of that record would read it.
+        What the displacement is to be. 0 um is where the actuator stands at zero volts as the
+        command begins; a reference that begins elsewhere gets a way from there before it.
     generator
         Draws the starts and the discrepancy.
     command
         ``"mean"``: the inverse of the mean model. ``"expected"``: the voltage at which the mean of
         the draws' displacements, each weighted by its slope, is the reference. For an actuator that
-        is slow enough not to show its dynamics, that is where the expected squared error is least;
-        it is taken only if it is less.
+        is slow enough not to show its dynamics, that is where the expected squared error, to the
+        reference as smoothed, is least; it is taken only if it is less.
+    hold
+        What the command does between samples, whatever the record's voltage did: ``"zero"``, it is
+        held, as a DAC does, and the voltage of a sample is the one that brings the displacement to
+        the reference at the next sample, just before it changes; ``"first"``, it goes in straight
+        lines.
     from_rest
-        The actuator starts demagnetised at zero volts; otherwise it has waited at the first voltage
-        until it stood still, in a state of its hysteresis that nothing tells.
+        The actuator starts demagnetised; otherwise it has waited at zero volts until it stood
+        still, in a state of its hysteresis that nothing tells.
     limits, nearest
         The amplifier's, and whether to come as near as they allow; see
         :func:`~bwbayes.model.inverse.chain.inverse`.
@@ -286,16 +181,31 @@ def compensate(
     Raises
     ------
     InputError
-        A reference that cannot be reached, with its place and time; a limit that is not positive.
+        A reference that cannot be reached, with its place and time; an amplifier without zero
+        volts; a limit that is not positive.
     """
     if limit is not None and not limit > 0:
         raise InputError(f"limit: {limit:g} um; must be positive")
-    hold = posterior.only.actuator.hold
+    if command not in get_args(Choice):
+        raise InputError(
+            f"command: {command!r} is unknown; {suggestion(command, get_args(Choice))}"
+        )
+    limits = limits or Limits()
+    if not limits.low <= 0 <= limits.high:
+        raise InputError(
+            f"voltage: {limits.low:g} to {limits.high:g} V leaves out zero volts, where a command "
+            "begins; include it"
+        )
+    reference = reference.from_zero()
     seed = int(generator.integers(2**62))
     task = _Task(posterior, draws, reference, Start(from_rest, False, settled=True), hold, seed)
-    linear = _linear(posterior, task.asked, limits or Limits())
+    requested, target = task.references
+    linear = _linear(posterior, requested, limits)
     begun = task.begun(linear)
     actuator, model = begun.actuators[-1], begun.model.mean(axis=0)
+    # The mean model's own place at zero volts, where all begin, is not the mean of the places.
+    place = actuator.displacement(model, [0.0], from_rest=from_rest)[0, 0]
+    model[actuator.parameters.index("offset")] -= place
     column = actuator.columns(begun.model)
     span = actuator.span
     assert span is not None
@@ -306,53 +216,80 @@ def compensate(
         made = inverse(actuator, model, asked, from_rest=from_rest, limits=limits, nearest=nearest)
         return np.asarray(made[0])
 
-    by_mean = inverted(task.asked)
+    by_mean = inverted(target)
     error, mean = task.expected(by_mean, weights)
-    best, least, asked = by_mean, error, task.asked
+    best, least, asked = by_mean, error, target
     for _ in range(ROUNDS):
-        asked = asked + (task.asked - mean)
+        asked = asked + (target - mean)
         tried = inverted(asked)
         left, mean = task.expected(tried, weights)
-        if not left < least:
+        if not left[1] < least[1]:
             break
         best, least = tried, left
     taken, other = (by_mean, least) if command == "mean" else (best, error)
+    played, between = task.played(taken), _between(actuator, model, taken, from_rest)
+    said = _said(reference, taken, actuator, limits, nearest)
+    if between > np.mean(played.rms):
+        said.append(
+            f"between samples the displacement leaves a straight line by up to {between:.3g} um, "
+            "more than the rms error at them; choose a shorter sampling interval"
+        )
     return Compensation(
         reference,
         command,
-        task.played(taken),
+        played,
         task.played(linear),
         float(np.max(np.abs(best - by_mean))),
-        float(np.sqrt(other)),
+        float(other[1]),
         hold,
+        between,
         from_rest,
         limit,
-        (*remarks, *_said(reference, taken, actuator, limits, nearest)),
+        (*remarks, *said),
     )
 
 
-def _linear(posterior: Posterior, asked: FloatArray, limits: Limits) -> FloatArray:
-    """Return the voltage that a straight line through the fitted readings gives for a reference."""
+def _linear(posterior: Posterior, reference: FloatArray, limits: Limits) -> FloatArray:
+    """Return the voltage for a reference by the slope of a line through the fitted readings."""
     record = posterior.only
     rows = record.readings.rows
-    slope, level = np.polyfit(record.voltage[rows], record.readings.values, 1)
-    return np.asarray(np.clip((asked - level) / slope, limits.low, limits.high))
+    slope, _ = np.polyfit(record.voltage[rows], record.readings.values, 1)
+    return np.asarray(np.clip(reference / slope, limits.low, limits.high))
+
+
+def _between(actuator: Actuator, model: FloatArray, voltage: FloatArray, from_rest: bool) -> float:
+    """Return how far a model's displacement leaves straight lines between samples, um."""
+    samples = np.arange(voltage.size)
+    segments = np.arange((voltage.size - 1) * SEGMENTS + 1)
+    between = voltage[segments // SEGMENTS]
+    if actuator.hold == "first":
+        between = np.interp(segments / SEGMENTS, samples, voltage)
+    faster = replace(actuator, interval=actuator.interval / SEGMENTS)
+    moved = faster.displacement(model, between, from_rest=from_rest)[0]
+    straight = np.interp(segments / SEGMENTS, samples, moved[::SEGMENTS])
+    return float(np.max(np.abs(moved - straight)))
 
 
 def _said(
     reference: Reference,
     voltage: FloatArray,
     actuator: Actuator,
-    limits: Limits | None,
+    limits: Limits,
     nearest: bool,
 ) -> list[str]:
     said = []
+    if reference.approach > 0:
+        begins = reference.given[round(reference.approach / reference.interval)]
+        said.append(
+            f"the reference begins at {begins:.4g} um: a way of {reference.approach:g} s is put "
+            "before it, from 0 um, where the actuator stands at zero volts"
+        )
     if reference.moved > 0:
         said.append(
             f"the reference is smoothed over {reference.smoothed:.3g} s, which moves it by up to "
-            f"{reference.moved:.3g} um"
+            f"{reference.moved:.3g} um; errors are those to the reference as requested"
         )
-    if nearest and limits is not None:
+    if nearest:
         at = np.mean((voltage <= limits.low) | (voltage >= limits.high))
         fast = np.abs(np.diff(voltage)) >= (1 - 1e-9) * limits.rate * actuator.interval
         if at > 0 or fast.any():

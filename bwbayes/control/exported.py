@@ -29,6 +29,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.shown import brief
 
 __all__ = ["Exported", "exported"]
 
@@ -71,6 +72,8 @@ class Exported:
     without_inverse
         Why it has no inverse; None if it has one.
     """
+
+    __repr__ = brief
 
     name: str
     model: SampledModel
@@ -118,6 +121,12 @@ class Exported:
             "hysteresis": self._hysteresis,
             "gain": self._gain,
             "creep_growth_per_V": self._growth,
+            "zero": {
+                "value": float(self.model.zero[0]),
+                "unit": "um",
+                "description": "subtracted, so that 0 um is where the demagnetized actuator stands "
+                "at zero volts",
+            },
             "sections": {
                 "unit": "um of displacement for a um of drive, both from rest",
                 "recursions": self._sections,
@@ -158,6 +167,7 @@ class Exported:
             sections=self._sections,
             gain=self._gain,
             growth=self._growth,
+            zero=float(self.model.zero[0]),
             inverse=self.without_inverse is None,
             without_inverse=_plain(self.without_inverse or ""),
             close=resolution(self.limits),

@@ -26,6 +26,7 @@ from bwbayes.control.discrete import frequency_response
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.model.operator import Span
+from bwbayes.shown import brief
 
 __all__ = ["Gains", "Margins", "Robustness", "design", "margins"]
 
@@ -92,6 +93,8 @@ class Margins:
     the circle criterion holds; ``pole`` is the largest of the closed loop at its steepest slope,
     below one if it is stable.
     """
+
+    __repr__ = brief
 
     gain: FloatArray
     phase: FloatArray

@@ -9,6 +9,7 @@ number of rounds is bounded.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inverse.stepped import DriveStep, step_of
 from bwbayes.model.inverse.steps import Gone, HysteresisStep
 from bwbayes.model.operator import Span
+from bwbayes.shown import brief
 
 ComplexArray = NDArray[np.complex128]
 
@@ -75,7 +77,8 @@ class SampledModel:
     """A batch of models, a sample at a time.
 
     They start demagnetised at zero volts, go to a first voltage and settle there, with dynamics and
-    creep at rest. The displacement is without the sensor's offset.
+    creep at rest. 0 um is where they stand at zero volts: the displacement is without the sensor's
+    offset.
 
     Parameters
     ----------
@@ -88,6 +91,8 @@ class SampledModel:
     sections
         Dynamics and creep.
     """
+
+    __repr__ = brief
 
     actuator: Actuator
     column: dict[str, FloatArray]
@@ -119,8 +124,16 @@ class SampledModel:
         filters = np.zeros((*self.sections.gains.shape, 2))
         return SteppedState(memory, voltage, rest, rest * self._growth(voltage), filters)
 
+    @cached_property
+    def zero(self) -> FloatArray:
+        """What dynamics and creep make of the drive at zero volts, where 0 um is, (models,), um."""
+        return self._settled(self.begin(np.zeros(self.models)))
+
     def level(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,) at which they began, um."""
+        return self._settled(state) - self.zero
+
+    def _settled(self, state: SteppedState) -> FloatArray:
         before = np.where(self.sections.crept, state.crept_rest[:, None], state.rest[:, None])
         return (self.sections.gains * before).sum(axis=1)
 

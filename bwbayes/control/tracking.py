@@ -4,6 +4,7 @@ Four controllers are compared on the paper's signals, from slow to where the dyn
 linear command (no compensation), the mean model's inverse (feed-forward), a PID controller, and a
 PID controller beside the feed-forward. The last one compares the reading with what the mean model
 says the fed command does, so that it answers what the model does not know and nothing else.
+All begin demagnetized at zero volts, and 0 um of a reference is where the actuator stands there.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.shown import brief
 
 __all__ = ["CONTROLLERS", "Tracking", "Wishes", "track"]
 
@@ -81,6 +83,8 @@ class Tracking:
     Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
     take the time ``rise``, s.
     """
+
+    __repr__ = brief
 
     gains: Gains
     margins: Margins
@@ -302,10 +306,10 @@ def _reach(mean: SampledModel, limits: Span) -> Span:
     """Return the displacements, um, that slow sweeps between the limits end at."""
     memory = mean.step.demagnetised()
     ends = []
-    for voltage in (limits.high, limits.low, limits.high, limits.low):
+    for voltage in (0.0, limits.high, limits.low, limits.high, limits.low):
         w, _, memory = mean.drive(memory, np.array([voltage]))
         ends.append(float(w[0]))
-    return Span(ends[3], ends[2])
+    return Span(ends[4] - ends[0], ends[3] - ends[0])
 
 
 def _amplitude(given: float | None, ends: Span) -> float:

@@ -1,7 +1,9 @@
 """What a displacement is to be over time: from a file, or one of the usual shapes.
 
-The shapes begin at rest at zero, go smoothly to their middle, and have their corners rounded:
-no actuator with a lag follows a jump, nor a speed that jumps.
+0 um is where the actuator stands at zero volts as the command begins, so that a command begins at
+zero volts, where the actuator is, whatever the sensor's offset. The shapes begin at rest there, go
+smoothly to their middle, and have their corners rounded: no actuator with a lag follows a jump, nor
+a speed that jumps. A reference that begins elsewhere gets a smooth way there.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -16,6 +19,7 @@ from scipy.signal import sawtooth
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError, suggestion
+from bwbayes.shown import brief
 
 __all__ = ["SHAPES", "Reference", "shaped"]
 
@@ -24,6 +28,13 @@ SHORTEST = 10
 
 # Part of a period that a shape rests before it begins, and by which its corners are rounded (sd).
 REST, ROUNDED = 0.25, 0.01
+
+# How long the way from 0 um to a reference that begins elsewhere takes, s; and the part of its
+# range by which one that begins at 0 um may be off by rounding.
+APPROACH, CLOSE = 1.0, 1e-9
+
+# Sds of the Gaussian on either side.
+WIDTH = 4.0
 
 # The part of a raster's period in which its line is written; the rest is the way back.
 WRITTEN = 0.9
@@ -47,6 +58,9 @@ SHAPES: Mapping[str, Callable[[FloatArray, int], FloatArray]] = {
 class Reference:
     """What a displacement is to be, (samples,), um, at a sampling interval, s.
 
+    0 um is where the actuator stands at zero volts as the command begins. The smoothing keeps the
+    first value and the last.
+
     Parameters
     ----------
     displacement, interval
@@ -55,6 +69,8 @@ class Reference:
         What it is called.
     smoothed
         Sd of the Gaussian that smooths it, s; zero leaves it as it is.
+    approach
+        Length of the way from 0 um that was put before it, s; see :meth:`from_zero`.
 
     Raises
     ------
@@ -63,10 +79,13 @@ class Reference:
         positive, or a negative smoothing.
     """
 
+    __repr__ = brief
+
     displacement: ArrayLike
     interval: float
     name: str = "reference"
     smoothed: float = 0.0
+    approach: float = 0.0
     given: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,9 +107,26 @@ class Reference:
         smooth: FloatArray = values
         if self.smoothed > 0:
             sd = self.smoothed / self.interval
-            smooth = np.asarray(gaussian_filter1d(values, sd, mode="nearest"))
+            # Turned about its ends, so that it begins and ends where it did.
+            beyond = int(WIDTH * sd) + 1
+            turned = np.pad(values, beyond, "reflect", reflect_type="odd")
+            smooth = gaussian_filter1d(turned, sd, truncate=WIDTH)[beyond:-beyond]
         object.__setattr__(self, "given", values)
         object.__setattr__(self, "displacement", smooth)
+
+    def from_zero(self) -> Reference:
+        """Return the reference with a smooth way from 0 um before it, if it begins elsewhere."""
+        first = float(self.given[0])
+        if abs(first) <= CLOSE * np.ptp(self.given):
+            return self
+        way = _way(first, max(round(APPROACH / self.interval), SHORTEST))
+        return Reference(
+            np.concatenate([way, self.given]),
+            self.interval,
+            self.name,
+            self.smoothed,
+            way.size * self.interval,
+        )
 
     @property
     def time(self) -> FloatArray:
@@ -101,6 +137,11 @@ class Reference:
     def moved(self) -> float:
         """How far the smoothing moves it at most, um."""
         return float(np.max(np.abs(np.asarray(self.displacement) - self.given)))
+
+
+def _way(end: float, samples: int) -> FloatArray:
+    """Return a smooth way (samples,) from 0 um to an end that comes after it, um."""
+    return np.asarray(end * (1 - np.cos(np.pi * np.arange(samples) / samples)) / 2)
 
 
 def shaped(
@@ -122,7 +163,8 @@ def shaped(
         ``"sine"``; ``"triangle"``; ``"staircase"``, as many ``levels`` from the middle to either
         end; ``"raster"``, lines that are written slowly, with quick ways back.
     interval, amplitude, frequency, middle, periods
-        Sampling interval, s; um; Hz; um; how many periods, or lines.
+        Sampling interval, s; um; Hz; um from where the actuator stands at zero volts; how many
+        periods, or lines.
     smoothed
         Sd of the smoothing, s; by default a hundredth of a period.
 
@@ -135,6 +177,9 @@ def shaped(
         raise InputError(f"reference: {shape!r} is unknown; {suggestion(shape, SHAPES)}")
     numbers = {"interval": interval, "amplitude": amplitude, "frequency": frequency}
     numbers |= {"periods": periods, "levels": levels}
+    for name, value in (numbers | {"middle": middle}).items():
+        if not isinstance(value, Real):
+            raise InputError(f"{shape}: {name} {value!r}; must be a number")
     for name, value in numbers.items():
         if not 0 < value < math.inf:
             raise InputError(f"{shape}: {name} {value:g}; must be positive")
@@ -152,8 +197,7 @@ def shaped(
     )
     rest = np.zeros(max(round(REST / (frequency * interval)), 1))
     if middle:
-        risen = round(1 / (frequency * interval))
-        way = (1 - np.cos(np.pi * np.arange(risen) / risen)) / 2
-        rest = np.concatenate([rest, middle * way, np.full(rest.size, middle)])
+        way = _way(middle, round(1 / (frequency * interval)))
+        rest = np.concatenate([rest, way, np.full(rest.size, middle)])
     sd = ROUNDED / frequency if smoothed is None else smoothed
     return Reference(np.concatenate([rest, middle + swung]), interval, shape, sd)

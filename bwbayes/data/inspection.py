@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.loopfit import LoopFit, fit_loop
-from bwbayes.data.patterns import runs, scatter, spikes, turning_points
+from bwbayes.data.patterns import find_gross_outliers, runs, scatter, spikes, turning_points
 from bwbayes.data.record import Record
 from bwbayes.data.stuck import SHORTEST_AT_END, Stuck, clipped, clipped_drive, held, repeated
+from bwbayes.shown import brief
 
 __all__ = ["Finding", "inspect", "isolated_outliers"]
 
@@ -39,7 +40,10 @@ LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
 SPIKE_PART = 0.01  # of the range
 LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
 MOST_WINDOWS = 5  # that a remedy writes out
-MOST_SPIKES = 0.02  # of the readings: more are not outliers
+# A start that holds more than this part of the drive's path is not left out.
+MOST_LEFT_OUT = 0.05
+SETTLE_FIRST = "measure again once the displacement has settled"
+MOST_SPIKES = 0.05  # of the readings: more are not outliers
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ class Finding:
     remedy : str
         What to do about it: a line of config, or what to change in the file or the measurement.
     """
+
+    __repr__ = brief
 
     kind: str
     start: float
@@ -82,22 +88,22 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
     ['reversed sign']
     """
+    outliers = np.empty(0, dtype=np.int64)
+    if record.displacement is not None:
+        outliers = isolated_outliers(record)
+    spiky = [*_spikes(record, outliers)]
+    # All else is said of the others.
+    record = record.without(outliers)
     findings = [*_units(record), *_sampling(record), *_amplitude(record)]
-    if record.displacement is None:
-        return tuple(findings)
-    rows = np.flatnonzero(record.has_reading)
-    outliers = isolated_outliers(record)
-    left_out = np.zeros(record.samples, dtype=np.bool_)
-    left_out[outliers] = True
-    if rows.size - outliers.size < 3:
-        return tuple(findings)
-    loop = fit_loop(record, left_out)
+    if record.displacement is None or record.readings < 3:
+        return (*findings, *spiky)
+    loop = fit_loop(record)
     unlike = [*_relation(record, loop)]
     if {"few readings", "coarse sampling"} & {one.kind for one in findings}:
         # Of so little only the most obvious can be said.
-        return (*findings, *(one for one in unlike if one.kind == "no relation"))
-    unlike += [*_stuck(record), *_clipping(record), *_clipped_drive(record, left_out)]
-    findings += [*unlike, *_spikes(record, outliers)]
+        return (*findings, *(one for one in unlike if one.kind == "no relation"), *spiky)
+    unlike += [*_stuck(record), *_clipping(record), *_clipped_drive(record)]
+    findings += [*unlike, *spiky]
     if not unlike:
         findings += [*_transient(record, loop), *_drift(record, loop)]
     return tuple(findings)
@@ -161,15 +167,22 @@ def _amplitude(record: Record) -> Iterator[Finding]:
         yield _whole(record, "one amplitude", text, remedy)
 
 
-def isolated_outliers(record: Record) -> IntArray:
-    """Return the samples whose readings are isolated outliers; none if they are too many."""
+def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
+    """Return the samples whose readings are isolated outliers; none if they are too many.
+
+    With `ends` also a first or last reading that may as well belong to a transient.
+    """
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
-    voltage = record.voltage[rows]
+    gross = find_gross_outliers(displacement, record.voltage[rows])
+    others = np.delete(np.arange(rows.size), gross)
+    displacement, voltage = displacement[others], record.voltage[rows[others]]
     extent = _extent(displacement)
     levels = np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    isolated = spikes(displacement, drive, max(SPIKE_PART * extent, 6 * resolution))
+    least = max(SPIKE_PART * extent, 6 * resolution)
+    near = spikes(displacement, drive, least, ends=ends)
+    isolated = np.union1d(gross, others[near])
     return rows[isolated] if isolated.size <= MOST_SPIKES * rows.size else rows[:0]
 
 
@@ -283,7 +296,7 @@ def _clipping(record: Record) -> Iterator[Finding]:
             yield _where(record, rows, "clipping", text + "voltage moves", some)
 
 
-def _clipped_drive(record: Record, left_out: BoolArray) -> Iterator[Finding]:
+def _clipped_drive(record: Record) -> Iterator[Finding]:
     """Find a voltage at the end of its range while the displacement goes on."""
     rows = np.flatnonzero(record.has_reading)
     displacement = _readings(record)
@@ -292,7 +305,7 @@ def _clipped_drive(record: Record, left_out: BoolArray) -> Iterator[Finding]:
         at_end = voltage == voltage.max()
         if runs(at_end)[1].max() < SHORTEST_AT_END or (~at_end[rows]).sum() < LEAST_READINGS:
             continue
-        loop = fit_loop(record, left_out | at_end)
+        loop = fit_loop(record, at_end)
         some = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
         if some is not None:
             text = (
@@ -326,7 +339,10 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         f"the displacement starts {abs(size):.3g} um {'above' if size > 0 else 'below'} where the "
         f"voltage would have it, and settles with a time constant of {time:.2g} s"
     )
-    yield Finding("switch-on transient", begin, over, text, f"start = {over:.3g} under [record]")
+    gone = int(np.searchsorted(record.time, over))
+    share = steps[:gone].sum() / steps.sum()
+    remedy = SETTLE_FIRST if share > MOST_LEFT_OUT else f"start = {over:.3g} under [record]"
+    yield Finding("switch-on transient", begin, over, text, remedy)
 
 
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:

@@ -7,20 +7,36 @@ can be looked at in the same way.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["Decay", "decay", "runs", "scatter", "spikes", "trend", "turning_points"]
+__all__ = [
+    "Decay",
+    "decay",
+    "find_gross_outliers",
+    "runs",
+    "scatter",
+    "spikes",
+    "trend",
+    "turning_points",
+]
 
 # A normal distribution's sd over its median absolute deviation.
 NORMAL = 1.4826
 
 # Samples in the median that a spike is held against: two beside each other are a spike still.
 NEIGHBOURS = 5
+
+# Times the range of a line through the values, and of most residuals, that no actuator's
+# hysteresis, lag, creep or ringing lies off that line.
+GROSS = 2.0
+
+# Rounds of reweighting to the line of least absolute deviations.
+REWEIGHTED = 30
 
 
 class Decay(NamedTuple):
@@ -66,24 +82,31 @@ def turning_points(values: FloatArray, least: float) -> IntArray:
     return np.array([*kept, *([last] if last != kept[-1] else [])])
 
 
-def spikes(values: FloatArray, drive: FloatArray | None = None, least: float = 0.0) -> IntArray:
+def spikes(
+    values: FloatArray,
+    drive: FloatArray | None = None,
+    least: float = 0.0,
+    *,
+    ends: bool = False,
+) -> IntArray:
     """Return the samples of isolated outliers in values (samples,).
 
     A spike is one or two samples that lie off the median of their neighbourhood by eight times what
     is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
-    unit, has a spike of its own nearby, the values may have one of twice its size.
+    unit, has a spike of its own nearby, the values may have one of twice its size. With `ends` the
+    first and the last value may be spikes too, though a fast transient begins like one.
     """
-    off = _off_median(values)
+    off = _off_median(values, ends)
     allowed = np.zeros_like(values)
     if drive is not None:
-        allowed = 2 * maximum_filter1d(np.abs(_off_median(drive)), 2 * NEIGHBOURS + 1)
+        allowed = 2 * maximum_filter1d(np.abs(_off_median(drive, ends)), 2 * NEIGHBOURS + 1)
     usual = scatter(off[off != 0]) if np.any(off) else 0.0
     limit = max(8 * usual, least) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
     # A spike moves its neighbours' medians too. The largest comes first, and a straight line takes
     # its place before the next is judged.
     half = NEIGHBOURS // 2
-    rest = np.pad(values, half, mode="edge")
+    rest = np.pad(values, half, mode="reflect" if ends else "edge")
     isolated = np.zeros(rest.size, dtype=np.bool_)
     for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
         middle = np.sort(rest[at - half : at + half + 1])[half]
@@ -98,8 +121,34 @@ def spikes(values: FloatArray, drive: FloatArray | None = None, least: float = 0
     return np.flatnonzero(isolated[half:])
 
 
-def _off_median(values: FloatArray) -> FloatArray:
-    off: FloatArray = values - median_filter(values, NEIGHBOURS, mode="nearest")
+def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
+    """Return the samples of isolated values (samples,) that are far off the range of all others.
+
+    They lie off the line of least absolute deviations through `values` over `drive` (samples,),
+    which a minority does not move, by more than twice the range of that line and of the central
+    80% of the residuals. Ranges and fits are to be taken without them.
+    """
+    line = np.stack([np.ones_like(drive), drive - drive.mean()])
+    weights = np.ones_like(values)
+    for _ in range(REWEIGHTED):
+        # Sums, without the threads of a linear algebra library.
+        products = np.einsum("in,n,jn->ij", line, weights, line)
+        pulls = np.einsum("in,n,n->i", line, weights, values)
+        coefficients = np.linalg.lstsq(products, pulls)[0]
+        off = np.abs(values - coefficients @ line)
+        weights = 1 / np.maximum(off, 1e-6 * max(float(np.median(off)), 1e-300))
+        weights /= weights.max()
+    low, high = np.quantile(values - coefficients @ line, (0.1, 0.9))
+    far = off > GROSS * (abs(coefficients[1]) * np.ptp(drive) + high - low)
+    first, length = runs(far)
+    short = length <= NEIGHBOURS // 2
+    gross: IntArray = np.union1d(first[short], (first + length - 1)[short])
+    return gross
+
+
+def _off_median(values: FloatArray, ends: bool) -> FloatArray:
+    mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
+    off: FloatArray = values - median_filter(values, NEIGHBOURS, mode=mode)
     return off
 
 

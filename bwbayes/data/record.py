@@ -11,21 +11,26 @@ from __future__ import annotations
 
 import hashlib
 import math
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
-from bwbayes.data.io.checks import Column, Table, VoltageIs, checked, require_voltage_is
-from bwbayes.data.io.columns import COMMON_NAMES, Naming
-from bwbayes.data.io.frames import frame_table
-from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.data.io.checks import VoltageIs, checked, require_voltage_is
+from bwbayes.data.io.columns import QUANTITIES, Naming
+from bwbayes.data.io.frames import frame_source, in_seconds
+from bwbayes.data.io.grid import decimals_of
+from bwbayes.data.io.table import table_of
+from bwbayes.data.io.vectors import array_table, frozen_vector
+from bwbayes.errors import InputError, one_line
+from bwbayes.shown import brief
 
-__all__ = ["Record", "Split", "Window", "require_readable"]
+__all__ = ["Record", "Split", "Window"]
+
+# Of a sample: what rounding may do to a time.
+ROUNDING = 1e-6
 
 Window = tuple[float, float]
 """A stretch of time in s: start <= time < stop."""
@@ -64,6 +69,9 @@ class Record:
         that do not print become blanks.
     truth : array (samples,), um, or None
         Noise-free displacement, known for simulated records only.
+    time_offset : float, s
+        What a clock adds to the record's times, which count from about its first sample: the time
+        stamp of time zero.
 
     Raises
     ------
@@ -78,6 +86,8 @@ class Record:
     (3, 2, 0.03)
     """
 
+    __repr__ = brief
+
     voltage: FloatArray
     displacement: FloatArray | None
     interval: float
@@ -85,19 +95,21 @@ class Record:
     voltage_is: VoltageIs = "output"
     origin: str = ""
     truth: FloatArray | None = None
+    time_offset: float = 0.0
 
     def __post_init__(self) -> None:
         samples = np.size(self.voltage)
         for name in ("voltage", "displacement", "truth"):
             values = getattr(self, name)
             if values is not None:
-                object.__setattr__(self, name, _frozen_vector(name, values, samples))
+                object.__setattr__(self, name, frozen_vector(name, values, samples))
         if not (math.isfinite(self.interval) and self.interval > 0):
             raise InputError(f"interval: {self.interval} s is not a positive time; give it in s")
         if not math.isfinite(self.start):
             raise InputError(f"start: {self.start} s is not a time; give it in s")
         object.__setattr__(self, "interval", float(self.interval))
         object.__setattr__(self, "start", float(self.start) + 0.0)  # turns -0.0 into 0.0
+        object.__setattr__(self, "time_offset", float(self.time_offset))
         object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
         object.__setattr__(self, "origin", one_line(self.origin))
 
@@ -107,32 +119,71 @@ class Record:
         voltage: ArrayLike,
         displacement: ArrayLike | None = None,
         *,
-        interval: float,
-        start: float = 0.0,
+        interval: float | None = None,
+        start: float | None = None,
+        time: ArrayLike | None = None,
+        units: Mapping[str, str] | None = None,
         voltage_is: VoltageIs = "output",
         origin: str = "arrays",
     ) -> Self:
-        """Return the record of a voltage in V and a displacement in um, checked as a file is.
+        """Return the record of a voltage and a displacement, checked as a file is.
 
         Parameters
         ----------
         voltage, displacement : arrays (samples,), V and um
             The displacement is nan where a reading is missing, and None for a planned voltage.
         interval, start : float, s
-            Sampling interval, and time of the first sample.
+            Sampling interval, and time of the first sample (default: 0).
+        time : array (samples,), s
+            Times of the samples, uniform, in place of interval and start; dates and durations too.
+        units : dict
+            Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
+            ``"-nm"`` turns the sign.
         voltage_is, origin
             As of the record itself.
 
         Raises
         ------
         InputError
-            What cannot be used, as of a file: too few samples, a voltage that does not move.
+            What cannot be used, as of a file: too few samples, times that are not uniform, a
+            voltage that does not move; neither interval nor time, or both.
+
+        Warns
+        -----
+        InputWarning
+            If samples are missing between the times, in which a commanded voltage was held.
+
+        Examples
+        --------
+        >>> ms, sine = np.arange(1000.0), np.sin(np.arange(1000.0))
+        >>> units = {"time": "ms", "displacement": "nm"}
+        >>> record = Record.from_arrays(sine, 700 * sine, time=ms, units=units)
+        >>> record.interval, round(float(record.displacement.max()), 3)
+        (0.001, 0.7)
         """
+        units = units or {}
+        if (time is None) == (interval is None) or (time is not None and start is not None):
+            raise InputError(f"{origin}: give either interval (and start), in s, or time, a vector")
+        if time is None and "time" in units:
+            raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
         # The record makes arrays of what it gets, or says that it cannot.
         given: Any = {"voltage": voltage, "displacement": displacement}
-        made = cls(**given, interval=interval, start=start, voltage_is=voltage_is, origin=origin)
-        require_readable(made, origin)
-        return made
+        given |= {"interval": 1.0 if interval is None else interval, "start": start or 0.0}
+        made = cls(**given, voltage_is=voltage_is, origin=origin)
+        times = None
+        if time is not None:
+            times = frozen_vector("time", in_seconds(np.asarray(time)), made.samples)
+        arrays = {
+            "time": made.time if times is None else times,
+            "voltage": made.voltage,
+            "displacement": made.displacement,
+        }
+        notes = {"origin": made.origin}
+        if times is None:
+            notes["interval_s"] = repr(made.interval)
+        table = array_table(origin, arrays, units, notes)
+        need = displacement is not None
+        return cls(**checked(table, voltage_is=made.voltage_is, need_displacement=need))
 
     @classmethod
     def from_pandas(
@@ -143,6 +194,7 @@ class Record:
         voltage: str | None = None,
         displacement: str | None = None,
         units: dict[str, str] | None = None,
+        fs: float | None = None,
         voltage_is: VoltageIs = "output",
         origin: str = "DataFrame",
     ) -> Self:
@@ -152,12 +204,14 @@ class Record:
         ----------
         frame : pandas.DataFrame
             A column each for time, voltage and displacement; without the last one it is a planned
-            voltage. The time may be the index; dates or durations count from the first sample.
+            voltage. The time may be the index; dates count from the first sample.
         time, voltage, displacement : str
             The columns' names, if they are neither ``time_s``, ``voltage_mV`` and the like, nor can
-            be recognised as those of a file are.
+            be recognized as those of a file are.
         units : dict
             Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
+        fs : float, Hz
+            The sampling rate, in place of a time column.
         voltage_is, origin
             As of the record itself.
 
@@ -170,12 +224,15 @@ class Record:
         Warns
         -----
         InputWarning
-            If a column is recognised by nothing but its unit, or samples are missing in which a
+            If a column is recognized by nothing but its unit, or samples are missing in which a
             commanded voltage was held.
         """
         given = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in given.items() if name is not None}
-        table = frame_table(frame, Naming(columns, units or {}), origin)
+        naming = Naming(columns, units or {}, fs)
+        # Without a displacement it is a planned voltage; which it is, only what is said can tell.
+        needed = QUANTITIES if displacement is not None else ("time", "voltage")
+        table = table_of(frame_source(frame, origin), naming, needed)
         need = displacement is not None
         return cls(**checked(table, voltage_is=voltage_is, need_displacement=need))
 
@@ -241,10 +298,15 @@ class Record:
             problem = "holds no sample"
         else:
             return slice(first, last)
+        end = self.start + self.duration
         raise InputError(
-            f"window {start:g} to {stop:g} s: {problem}; choose start < stop within"
-            f" {self.start:g} to {self.start + self.duration:g} s"
+            f"window {self.clock(start)} to {self.clock(stop)} s: {problem}; choose start < stop "
+            f"within {self.clock(self.start)} to {self.clock(end)} s"
         )
+
+    def clock(self, time: float) -> str:
+        """Return a time in s with the decimals that tell neighboring samples apart."""
+        return f"{round(time, decimals_of(self.interval)):.15g}"
 
     def window(self, start: float, stop: float) -> Record:
         """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
@@ -269,11 +331,17 @@ class Record:
         return replace(self, displacement=displacement)
 
     def exclude(self, windows: Sequence[Window]) -> Record:
-        """Return the record without the readings in `windows`, pairs (start, stop) in s."""
-        left = self
-        for window in windows:
-            left = left.without(self.window_slice(*window))
-        return left
+        """Return the record without the readings in `windows`, pairs (start, stop) in s.
+
+        A window that begins or ends between two samples takes both of them.
+        """
+        left_out = np.zeros(self.samples, dtype=np.bool_)
+        for start, stop in windows:
+            # Refuses what is outside, or ends before it begins.
+            self.window_slice(start, max(stop, start + self.interval) if start < stop else stop)
+            edges = _offset(self, start) + ROUNDING, _offset(self, stop) - ROUNDING
+            left_out[max(math.floor(edges[0]), 0) : math.ceil(edges[1])] = True
+        return self.without(left_out)
 
     def decimate(self, factor: int) -> Record:
         """Return the record with every `factor`-th reading, from the first one on.
@@ -308,8 +376,9 @@ class Record:
                 for other, other_slice in others:
                     if one_slice.start < other_slice.stop and other_slice.start < one_slice.stop:
                         raise InputError(
-                            f"training window {one[0]:g} to {one[1]:g} s: overlaps the {kind}"
-                            f" window {other[0]:g} to {other[1]:g} s; move one (record.train)"
+                            f"training window {self.clock(one[0])} to {self.clock(one[1])} s: "
+                            f"overlaps the {kind} window {self.clock(other[0])} to "
+                            f"{self.clock(other[1])} s; move one (record.train)"
                         )
         return Split(tuple(part for _, part in trained), tuple(part for _, part in held))
 
@@ -323,51 +392,9 @@ class Record:
         )
 
 
-def require_readable(record: Record, where: str) -> None:
-    """Refuse a record that could be written to a file and not be read back.
-
-    Raises
-    ------
-    InputError
-        As for a file that is called ``where``.
-    """
-    arrays = {
-        "time": record.time,
-        "voltage": record.voltage,
-        "displacement": record.displacement,
-        "truth": record.truth,
-    }
-    columns = {q: Column(COMMON_NAMES[q], v, 0) for q, v in arrays.items() if v is not None}
-    table = Table(Path(where), columns, {"interval_s": repr(record.interval)})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        checked(table, need_displacement=record.displacement is not None)
-
-
 def _offset(record: Record, time: float) -> float:
     """Return the samples from the start to `time`, cut off where it is outside anyway."""
     offset = (time - record.start) / record.interval
     if math.isnan(offset):
         raise InputError(f"window: {time} s is not a time; give it in s")
     return min(max(offset, -2.0), record.samples + 2.0)
-
-
-def _frozen_vector(name: str, values: ArrayLike, samples: int) -> FloatArray:
-    try:
-        vector = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: not numbers ({error}); give real numbers") from error
-    if vector.ndim != 1 or vector.size == 0:
-        raise InputError(f"{name}: shape {vector.shape} is not a vector; give (samples,)")
-    if vector.size != samples:
-        raise InputError(f"{name}: {vector.size} samples, voltage has {samples}; give the same")
-    missing = np.isnan(vector) if name == "displacement" else np.zeros(samples, dtype=np.bool_)
-    if missing.all():
-        raise InputError(f"{name}: holds no reading; give at least one")
-    vector[missing] = np.nan  # one nan for all, as there are many and a digest tells them apart
-    finite = np.isfinite(vector) | missing
-    if not finite.all():
-        sample = int(np.argmin(finite))
-        raise InputError(f"{name}: {vector[sample]} at sample {sample}; give finite numbers")
-    vector.setflags(write=False)
-    return vector

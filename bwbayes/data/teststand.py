@@ -28,6 +28,7 @@ from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Recursion, first_order_lag
 from bwbayes.model.operators.one_state import OneState
+from bwbayes.shown import brief
 
 __all__ = ["Amplifier", "LaserSensor", "RingBender", "VirtualTestStand", "creep"]
 
@@ -156,7 +157,7 @@ class LaserSensor:
 
 @dataclass(frozen=True)
 class VirtualTestStand:
-    """The whole stand: command in, :class:`~bwbayes.data.record.Record` with its truth out.
+    """The whole stand: command in, :class:`bwbayes.Record` with its truth out.
 
     The actuator follows the amplifier's held output, starting at rest and demagnetised at the
     first sample; an operator that remembers extrema came there straight from zero volts. On top of
@@ -188,8 +189,8 @@ class VirtualTestStand:
         The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
         interval is the stand's, its hold that of the amplifier.
     true : mapping of str to float
-        True values of its parameters; of those that are not given the ``table``'s, or those of
-        :func:`~bwbayes.data.truths.true_values`. With an ``initial`` the hysteresis starts in that
+        True values of its parameters; of those that are not given the ``table``'s, or typical
+        ones. With an ``initial`` the hysteresis starts in that
         state.
 
     Raises
@@ -198,6 +199,8 @@ class VirtualTestStand:
         If the discrepancy is unknown, the sample rate not above zero, or a true value is none of
         the actuator's parameters.
     """
+
+    __repr__ = brief
 
     discrepancy: Literal["none", "process", "structural"] = "process"
     sample_rate: float = 1000.0

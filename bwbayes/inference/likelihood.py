@@ -22,6 +22,7 @@ from bwbayes.inference.noise import LOG_TWO_PI, Noise
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.table import Table
 from bwbayes.model.actuator import Actuator
+from bwbayes.shown import brief
 
 __all__ = ["Likelihood", "LinearStart", "Moments", "Score", "batches"]
 
@@ -129,6 +130,8 @@ class Likelihood:
     offset_sd
         Prior sd of an offset of the record's own beside that of θ, um; zero if it has none.
     """
+
+    __repr__ = brief
 
     voltage: FloatArray
     readings: Readings

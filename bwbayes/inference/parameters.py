@@ -23,6 +23,7 @@ from bwbayes.inference.plainmap import PlainMap
 from bwbayes.model.closed import Scored
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
+from bwbayes.shown import brief
 
 __all__ = ["COORDINATES", "Constraint", "JointPrior", "Parameter"]
 
@@ -49,6 +50,8 @@ class Parameter:
     InputError
         Neither prior nor fixed value, both, or bounds that leave nothing of the prior.
     """
+
+    __repr__ = brief
 
     name: str
     unit: str

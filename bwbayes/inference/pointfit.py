@@ -18,12 +18,12 @@ from scipy import linalg, optimize, special
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
+from bwbayes.shown import brief
 
 __all__ = ["PointFit", "approximated", "fit", "peaks"]
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
-DRAWS = 128
-STARTS = 5
+DRAWS, STARTS = 128, 5
 
 # Rounds of draws of the noise parameters, and the best that the next round is drawn around.
 ROUNDS, BEST = 4, 8
@@ -37,10 +37,8 @@ HOPELESS = 30.0
 
 # Optima whose sums of squares and coordinates agree to this part are one.
 SAME = 1e-2
-
 # A place is a mode's if the density falls by less, nats, at so many points on the straight way.
-DIP = 0.5
-WAY = 33
+DIP, WAY = 0.5, 33
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,8 @@ class PointFit:
     (modes, free) are the distinct local modes, the best first; ``prior_covariance`` (free, free)
     is that of the prior's draws.
     """
+
+    __repr__ = brief
 
     mode: FloatArray
     covariance: FloatArray

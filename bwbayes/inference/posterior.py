@@ -26,6 +26,7 @@ from bwbayes.inference.readings import Readings
 from bwbayes.inference.table import JointTable, Table
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.shown import brief
 
 __all__ = ["Alone", "Dataset", "Posterior"]
 
@@ -56,6 +57,8 @@ class Dataset:
     InputError
         The windows are out of order.
     """
+
+    __repr__ = brief
 
     voltage: FloatArray
     displacement: FloatArray
@@ -127,7 +130,7 @@ class Posterior:
     prior
         Its parameters are those of :attr:`table`, in that order.
     engine
-        What computes the likelihood; see :mod:`bwbayes.inference.engine`.
+        What computes the likelihood: ``"numpy"``, or ``"numba"``, which is compiled.
     joint
         The parameters of several records; may be left out of one.
 
@@ -136,6 +139,8 @@ class Posterior:
     InputError
         The prior is another model's.
     """
+
+    __repr__ = brief
 
     datasets: tuple[Dataset, ...]
     prior: JointPrior
@@ -246,6 +251,13 @@ class Posterior:
         """Return the posterior of other readings (samples,) of the same records, by name."""
         datasets = (replace(one, displacement=displacements[one.name]) for one in self.datasets)
         return replace(self, datasets=tuple(datasets))
+
+    def without(self, rows: Mapping[str, IntArray]) -> Posterior:
+        """Return the posterior without the readings of some samples of its records, by name."""
+        displacements = {one.name: one.displacement.copy() for one in self.datasets}
+        for name, left_out in rows.items():
+            displacements[name][left_out] = np.nan
+        return self.with_readings(displacements)
 
     @cached_property
     def _alone(self) -> dict[str, Posterior]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
+from bwbayes.shown import brief
 
 __all__ = ["Readings"]
 
@@ -34,6 +35,8 @@ class Readings:
         (readings,) readings that are missing just before each one: how much farther than ``stride``
         it is from the one before, in strides.
     """
+
+    __repr__ = brief
 
     rows: IntArray
     values: FloatArray

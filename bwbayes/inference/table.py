@@ -21,6 +21,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Scope
+from bwbayes.shown import brief
 
 __all__ = ["Column", "JointTable", "Table"]
 
@@ -28,6 +29,8 @@ __all__ = ["Column", "JointTable", "Table"]
 @dataclass(frozen=True)
 class Table:
     """The parameters of an actuator and of a noise, in the order of θ's columns."""
+
+    __repr__ = brief
 
     actuator_part: Actuator
     noise_part: Noise

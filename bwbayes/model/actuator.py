@@ -30,6 +30,7 @@ from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
+from bwbayes.shown import brief
 
 __all__ = ["Actuator", "State"]
 
@@ -52,6 +53,8 @@ class State:
     recursions, (models, taps - 1) each.
     """
 
+    __repr__ = brief
+
     hysteresis: Any
     rest: tuple[FloatArray, ...]
     filter: tuple[FloatArray, ...]
@@ -65,7 +68,7 @@ class Actuator:
     ----------
     dynamics
         ``"none"``; ``"lag"``, one first-order lag; ``"second-order"``, equation (7); or the import
-        path of another :class:`~bwbayes.model.filters.Filter`.
+        path of another filter.
     hold
         ``"first"``: the drive goes straight from sample to sample (a measured voltage);
         ``"zero"``: it is held until the next sample (the command of a DAC).
@@ -86,6 +89,8 @@ class Actuator:
     InputError
         An unknown ``dynamics`` or ``hold``, or an ``interval`` that is not positive and finite.
     """
+
+    __repr__ = brief
 
     dynamics: str = "lag"
     hold: Hold = "first"
@@ -165,8 +170,8 @@ class Actuator:
 
         Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here: the
         hysteresis is in the state that θ's initial one says; dynamics and creep are at rest at the
-        first drive, or ``unrest`` (models, unknowns) away from there, um, as in
-        :class:`~bwbayes.model.linear.Sections`; (models, 0) stands for rest.
+        first drive, or ``unrest`` (models, unknowns) away from there, um: the dynamics (also how
+        fast they move, where there is a mass), then each lag of the creep; (models, 0) is rest.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):

@@ -72,8 +72,7 @@ def hysteresis(
         dg/dv = α − c g,   c = β − γ while g < 0,   c = β + γ while g ≥ 0,
 
     and its solution g₀ exp(−c v) + α (1 − exp(−c v)) / c is used as it stands. For n > 1 the
-    equation is separable and :class:`~bwbayes.model.exponent.ExponentFlow` solves it with a
-    relative error below 1e-9 of the largest |h|.
+    equation is separable and solved with a relative error below 1e-9 of the largest |h|.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ from typing import Literal
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.distributions import Distribution
+from bwbayes.shown import brief
 
 __all__ = [
     "Context",
@@ -109,6 +110,8 @@ class Declaration:
     without_default
         Why there is no default prior, for messages.
     """
+
+    __repr__ = brief
 
     name: str
     unit: str

@@ -11,7 +11,7 @@ with z = pole x interval: written so, equal and nearly equal poles are not speci
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,15 +20,45 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
 
-__all__ = ["Hold", "Recursion", "Sections", "first_order_lag", "no_dynamics", "second_order"]
+__all__ = [
+    "HOLD_NAMES",
+    "Hold",
+    "Recursion",
+    "Sections",
+    "first_order_lag",
+    "no_dynamics",
+    "parse_hold",
+    "second_order",
+]
 
 Hold = Literal["first", "zero"]
+
+# What a command's hold is called outside of the package.
+HOLD_NAMES: Mapping[Hold, str] = {"zero": "zoh", "first": "foh"}
 
 ComplexArray = NDArray[np.complex128]
 
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
+
+
+def parse_hold(name: str) -> Hold:
+    """Return the hold called "zoh" (zero-order) or "foh" (first-order).
+
+    Raises
+    ------
+    InputError
+        Another name.
+    """
+    for hold, short in HOLD_NAMES.items():
+        if name in (hold, short):
+            return hold
+    raise InputError(
+        f"hold: {name!r} is unknown; give zoh (held until the next sample, as a DAC does) or foh "
+        "(straight lines between samples)"
+    )
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
 from bwbayes.population.specimen import Specimen, likelihoods, shared
+from bwbayes.shown import brief
 
 __all__ = ["FEWEST", "Among", "Population", "Spread", "population"]
 
@@ -69,6 +70,8 @@ class Among:
     likelihood was taken for normal because of it.
     """
 
+    __repr__ = brief
+
     lower: float
     median: float
     upper: float
@@ -102,6 +105,8 @@ class Spread:
         Of the populations' own weights.
     """
 
+    __repr__ = brief
+
     name: str
     unit: str
     logarithmic: bool
@@ -132,6 +137,8 @@ class Spread:
 @dataclass(frozen=True)
 class Population:
     """What specimens say together: a :class:`Spread` for each parameter, by its name."""
+
+    __repr__ = brief
 
     names: tuple[str, ...]
     parameters: Mapping[str, Spread]

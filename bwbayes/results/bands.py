@@ -8,19 +8,28 @@ measurement can check.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-from bwbayes.arrays import FloatArray
+import numpy as np
 
-__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "Switched"]
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.shown import brief
+
+__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "Switched", "titled"]
 
 Kind = Literal["parameter", "displacement", "sensor"]
 KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
 
 # Probabilities of the bands, percent.
 LEVELS = (50, 90, 95)
+
+
+def titled(name: str, *, training: bool, separate: bool) -> str:
+    """Return the name of bands, and what they are of."""
+    kind = "training" if training else "separate record" if separate else "held out"
+    return name if name == kind else f"{name} ({kind})"
 
 
 @dataclass(frozen=True)
@@ -34,12 +43,11 @@ class Switched:
     decay: float
     nats: float
 
-    def line(self, start: float, *, sure: bool) -> str:
+    def line(self, start: float) -> str:
         """Say what it is, of a record whose lead-in begins at ``start``, s."""
         return (
             f"a transient of {self.size:.3g} um that decays within {self.decay:.2g} s from "
             f"{start:.4g} s on explains the readings better, by {self.nats:.3g} nats"
-            f"{'' if sure else ', which may be chance'}"
         )
 
 
@@ -70,8 +78,14 @@ class Bands:
     um, ``log_score`` the log of its density there, nats; all None without a measurement. Samples
     before ``scored_from`` served to estimate the record's offset and are not judged. ``interval``
     is the sampling interval in s; ``training`` says that the samples were fitted to. ``lead_in``
-    says how well the lead-in fits, if there was one.
+    says how well the lead-in fits, if there was one. ``inside`` (samples,) tells which samples the
+    bands are about, where they are several windows of a record: the others have no reading here.
+    ``time_offset`` is what the file's own clock adds to the times, s; ``common_sd`` the sd of what
+    the parameters leave unsure of all samples alike, as an offset does, um; ``separate`` says that
+    it is another record than any that was fitted.
     """
+
+    __repr__ = brief
 
     name: str
     time: FloatArray
@@ -88,15 +102,40 @@ class Bands:
     training: bool = False
     lead_in: LeadIn | None = None
     log_score: FloatArray | None = None
+    inside: BoolArray | None = None
+    time_offset: float = 0.0
+    common_sd: float = 0.0
+    separate: bool = False
+
+    def within(self, windows: Sequence[slice]) -> Bands:
+        """Return the bands of some windows: from the first sample of them to the last."""
+        whole = slice(windows[0].start, windows[-1].stop)
+        inside = np.zeros(self.time.size, dtype=np.bool_)
+        for window in windows:
+            inside[window] = True
+        changes: dict[str, Any] = {
+            name: np.where(inside, values, np.nan)[whole]
+            for name in ("measured", "truth", "pit", "crps", "log_score")
+            if (values := getattr(self, name)) is not None
+        }
+        for name in ("time", "voltage", "mean"):
+            changes[name] = getattr(self, name)[whole]
+        for name in ("lower", "upper"):
+            changes[name] = {band: edge[whole] for band, edge in getattr(self, name).items()}
+        inside = inside[whole]
+        return replace(self, **changes, inside=None if inside.all() else inside)
 
     def columns(self) -> Iterator[tuple[str, FloatArray]]:
         """Yield the names and values of the columns of ``bands.csv``."""
-        yield "time_s", self.time
-        yield "voltage_V", self.voltage
+        rows = slice(None) if self.inside is None else self.inside
+        yield "time_s", self.time[rows]
+        if self.time_offset:
+            yield "file_time_s", self.time_offset + self.time[rows]
+        yield "voltage_V", self.voltage[rows]
         if self.measured is not None:
-            yield "displacement_um", self.measured
-        yield "mean_um", self.mean
+            yield "displacement_um", self.measured[rows]
+        yield "mean_um", self.mean[rows]
         for kind in KINDS:
             for level in LEVELS:
-                yield f"{kind}_lower_{level}_um", self.lower[kind, level]
-                yield f"{kind}_upper_{level}_um", self.upper[kind, level]
+                yield f"{kind}_lower_{level}_um", self.lower[kind, level][rows]
+                yield f"{kind}_upper_{level}_um", self.upper[kind, level][rows]

@@ -25,6 +25,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.replicates import RANKED, Entry
+from bwbayes.shown import brief
 
 __all__ = [
     "FAMILY_LEVEL",
@@ -137,6 +138,8 @@ class Calibration:
     shortcomings
         Why the calibration has failed; empty if it has passed.
     """
+
+    __repr__ = brief
 
     replicates: int
     unconverged: tuple[int, ...]

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.data.inspection import MOST_LEFT_OUT, SETTLE_FIRST
 from bwbayes.results.bands import Bands
 
 __all__ = ["Cause", "Kind", "Residuals", "cause", "drifts", "likeliest"]
@@ -66,8 +67,8 @@ class Cause:
 
     @property
     def line(self) -> str:
-        """Cause and remedy, as a part of a line."""
-        return f"likeliest cause: {self.text}; {self.remedy}"
+        """Cause and fix, as a part of a line."""
+        return f"Likely cause: {self.text}. Fix: {self.remedy}."
 
 
 @dataclass(frozen=True)
@@ -293,13 +294,17 @@ def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
 
 
 def cause(kind: Kind, r: Residuals, settled: float | None = None) -> Cause:
-    """Put a cause and its remedy into words; ``settled`` is when an odd start ends, if known."""
+    """Put a cause and its fix into words; ``settled`` is when an odd start ends, if known."""
     text, for_fit, for_other = _WORDS[kind]
+    until = _settled(r) if settled is None else settled
+    if kind == "start" and r.training:  # more than a few percent of the drive are not left out
+        steps = np.abs(np.diff(r.voltage, prepend=r.voltage[0]))
+        if steps[r.time < until].sum() > MOST_LEFT_OUT * steps.sum():
+            for_fit = SETTLE_FIRST
     words = {
         "name": r.name,
         "begin": f"{r.time[0]:.4g}",
-        "end": f"{r.time[-1] + r.interval:.4g}",
-        "settled": f"{_settled(r) if settled is None else settled:.4g}",
+        "settled": f"{until:.4g}",
         "size": f"{np.mean(r.residual):+.3g}",
         "low": f"{r.fitted[0]:.4g}",
         "high": f"{r.fitted[1]:.4g}",
@@ -326,72 +331,70 @@ def _windows(r: Residuals) -> str:
     return ", ".join(windows) + (", ..." if np.sum(r.spikes) > NAMED else "")
 
 
-# What a cause is called, and what helps: where the record was fitted, and where it was not.
+# What a cause is called, and its fix: where the record was fitted, and where it was not.
 _WORDS: dict[Kind, tuple[str, str, str]] = {
     "sign": (
-        "the displacement goes against the voltage",
+        "reversed sign of the displacement",
         "change the sign of the displacement in the file",
         "change the sign of the displacement in the file",
     ),
     "outliers": (
         "outliers",
-        "leave them out: exclude = [{spikes}] in [record]",
+        "set exclude = [{spikes}] in [record]",
         "empty their cells in the file, at {spikes} s: they are missing readings then",
     ),
     "lead-in": (
-        "a start that the lead-in does not show: a transient, a drift or another actuator",
-        "let the lead-in begin later: lead_in_from = {told} in [validation.{name}]",
-        "let it begin later: lead_in_from = {told} in [validation.{name}], or predict with "
-        "--lead-in-from {told}; a longer --lead-in or a --window may help too",
+        "a start that the lead-in does not show (a transient, a drift, or another actuator)",
+        "set lead_in_from = {told} in [validation.{name}]",
+        "set lead_in_from = {told} in [validation.{name}], or predict with --lead-in-from {told}; "
+        "a longer --lead-in or a --window may help too",
     ),
     "start": (
-        "the start of the record: residuals are large until {settled} s",
-        "leave it out: exclude = [[{begin}, {settled}]] in [record]",
-        "begin later: lead_in_from = {settled} in [validation.{name}], or predict with "
+        "the start of the record (large residuals until {settled} s)",
+        "set exclude = [[{begin}, {settled}]] in [record]",
+        "set lead_in_from = {settled} in [validation.{name}], or predict with "
         "--lead-in-from {settled}",
     ),
     "offset": (
         "an offset of {size} um",
         "free the offset: remove [parameters.offset]",
-        "let the record have its own, from a lead-in that fits: own_offset = true and lead_in "
-        "in [validation.{name}], or predict with --lead-in and without --same-offset",
+        "set own_offset = true and a longer lead_in in [validation.{name}], or predict with "
+        "--lead-in and without --same-offset",
     ),
     "drift": (
         "a drift of the readings",
-        "fit a shorter part: train = [[{begin}, {end}]] in [record] with another end",
-        "judge a shorter part: window = [{begin}, {end}] in [validation.{name}] with another end, "
-        "or predict with --window",
+        "measure again after a longer warm-up",
+        "validate a shorter part: set window in [validation.{name}], or predict with --window",
     ),
     "extrapolation": (
-        "extrapolation: residuals are large beyond the {low} to {high} V that were fitted",
-        "fit a record that goes as far",
-        "fit a record that goes as far, or predict a --window within these voltages",
+        "extrapolation beyond the {low} to {high} V of the training",
+        "train on a record that spans this range",
+        "train on a record that spans this range, or predict a --window within these voltages",
     ),
     "gain": (
-        "another gain: another actuator, load or sensor range than was fitted",
+        "another gain (another actuator, load or sensor range)",
         "give d a wider prior in [parameters.d]",
         "fit this record itself: bwbayes run CONFIG --record FILE",
     ),
     "delay": (
-        "a delay: another hold of the voltage, or dynamics that the model lacks",
+        "a delay (another hold of the voltage, or dynamics that the model lacks)",
         'set hold in [model], or dynamics = "second-order" there',
         'set voltage_is to "command" or "output", whichever it is, in [validation.{name}]',
     ),
     "loop": (
-        "residuals that follow the loop: the model is too simple, or this is another actuator",
-        'free the exponent by a prior in [parameters.exponent], or take dynamics = "second-order" '
+        "loop-shaped residuals (model too simple, or a different actuator)",
+        'free the exponent by a prior in [parameters.exponent], or set dynamics = "second-order" '
         "in [model]",
-        "fit this record itself, bwbayes run CONFIG --record FILE; if that fails too, the model is "
-        "too poor",
+        "fit this record itself: bwbayes run CONFIG --record FILE",
     ),
     "noise": (
-        "noise of another size than was fitted",
-        'keep noise = "discrepancy" in [model]',
-        "fit a record of this sensor with this sampling",
+        "noise of another size than in training",
+        'set noise = "discrepancy" in [model]',
+        "train on a record of this sensor with this sampling",
     ),
     "unknown": (
-        "none that the residuals show",
-        'look at the residuals in the report, and keep noise = "discrepancy" in [model]',
-        "look at the residuals in the picture; fit a record like this one",
+        "unknown (no pattern in the residuals)",
+        "look at the residuals in the report",
+        "look at the residuals in the figure; train on a record like this one",
     ),
 }

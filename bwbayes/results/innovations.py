@@ -1,22 +1,31 @@
 """Innovations: what each reading adds to those before it, and whether that is pure chance.
 
 Where model and noise model are right, a residual less what the readings before it predict, over
-its standard deviation, is an independent standard normal number. Four things can be seen in these
-innovations that the residuals hide: whether they are white, whether they are normal, whether their
-size depends on the drive (its rate, its voltage, its direction), and whether the record starts as
-it goes on. A remark is made where a departure is both beyond chance and large enough to matter;
-on a record that the model describes this happens to fewer than one in a hundred.
+its standard deviation, is an independent standard normal number. Five things can be seen in these
+innovations that the residuals hide: whether they are white, whether something oscillates in them,
+whether they are normal, whether their size depends on the drive (its rate, its voltage, its
+direction), and whether the record starts as it goes on. A remark is made where a departure is both
+beyond chance and large enough to matter; on a record that the model describes this happens to fewer
+than one in a hundred.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy import ndimage, stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
+from bwbayes.results.spectrum import (
+    ResidualSpectrum,
+    SpectralLine,
+    residual_spectrum,
+    without_lines,
+)
+from bwbayes.shown import brief
 
 __all__ = [
     "GROUPS",
@@ -42,6 +51,9 @@ CORRELATED, HEAVY, UNEVEN, ONE_SIDED = 0.1, 1.0, 1.3, 0.15
 # Parts of the drive that are compared.
 GROUPS = 3
 
+# Lines of the spectrum that are named.
+NAMED = 3
+
 # Fewer innovations show nothing.
 FEWEST = 100
 
@@ -57,13 +69,22 @@ ENDED = 0.6
 class Innovations:
     """Normalised innovations of the readings that were fitted, and the drive there.
 
-    All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s.
+    All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
+    ``residual`` in um. ``interval`` is that between readings, s; some may be missing.
     """
+
+    __repr__ = brief
 
     time: FloatArray
     white: FloatArray
     voltage: FloatArray
     rate: FloatArray
+    residual: FloatArray
+    interval: float
+
+    def spectrum(self) -> ResidualSpectrum:
+        """Return the residual's spectrum, with its lines."""
+        return residual_spectrum(self.time, self.interval, self.residual, self.white, self.voltage)
 
     @property
     def correlation(self) -> FloatArray:
@@ -120,16 +141,22 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     slow = ndimage.uniform_filter1d(posterior.only.voltage, smooth, mode="nearest")
     rate = np.gradient(slow) / interval if slow.size > 1 else np.zeros_like(slow)
     time = begin + interval * readings.rows.astype(np.float64)
-    return Innovations(
-        time, white[0, 0], posterior.only.voltage[readings.rows], rate[readings.rows]
-    )
+    voltage = posterior.only.voltage[readings.rows]
+    apart = interval * readings.stride
+    return Innovations(time, white[0, 0], voltage, rate[readings.rows], residual[0], apart)
 
 
 def remarks(series: Innovations) -> tuple[str, ...]:
     """Say, one line each, where the innovations depart from what the noise model assumes."""
     if series.white.size < FEWEST:
         return ()
-    lines = [*_correlated(series), *_heavy(series)]
+    oscillations = series.spectrum().lines
+    others = [line for line in oscillations if not line.at_drive]
+    rest = without_lines(series.time, series.white, others)
+    lines = [*_oscillating(oscillations), *_heavy(series)]
+    # An oscillation correlates, and spoils the noise's parameters, as far as it is large.
+    if np.var(rest) > (1 - CORRELATED) * np.var(series.white):
+        lines += _correlated(series)
     for what in ("rate", "voltage", "direction"):
         lines += _uneven(series, what)
     return tuple(f"noise model: {line}" for line in lines)
@@ -179,6 +206,7 @@ def numbers(series: Innovations) -> dict[str, object]:
             float(correlation[np.argmax(np.abs(correlation))]) if correlation.size else None
         ),
         "excess_kurtosis": series.kurtosis,
+        "lines": [asdict(line) for line in series.spectrum().lines],
         "by": {
             what: {
                 name: {"mean": float(np.mean(part)), "sd": float(np.std(part))}
@@ -188,6 +216,18 @@ def numbers(series: Innovations) -> dict[str, object]:
             for what in ("rate", "voltage", "direction")
         },
     }
+
+
+def _oscillating(lines: Sequence[SpectralLine]) -> Iterator[str]:
+    """Name the strongest lines of the residual's spectrum, those of the drive by themselves."""
+    for at_drive, fix in (
+        (False, "look for the source: a cable's shield and ground, a vibration"),
+        (True, "the model misses something that follows the drive"),
+    ):
+        named = [line.description for line in lines if line.at_drive == at_drive][:NAMED]
+        if named:
+            plural = "a line" if len(named) == 1 else "lines"
+            yield f"the residual has {plural} at {', '.join(named)}: {fix}"
 
 
 def _correlated(series: Innovations) -> list[str]:

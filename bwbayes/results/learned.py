@@ -23,6 +23,7 @@ from scipy import linalg
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.identifiability import percent
+from bwbayes.shown import brief
 
 __all__ = ["Combination", "Learned", "Taught", "learned", "numbers"]
 
@@ -77,6 +78,8 @@ class Combination:
 @dataclass(frozen=True)
 class Learned:
     """What a record taught: by parameter, the worst combinations, and what to say of it."""
+
+    __repr__ = brief
 
     parameters: Mapping[str, Taught]
     combinations: tuple[Combination, ...]

@@ -22,6 +22,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Span
+from bwbayes.shown import brief
 
 __all__ = [
     "MEASURES",
@@ -90,6 +91,8 @@ class Estimate:
 class Curve:
     """A displacement along a voltage: mean and 95 % band, each (points,), um."""
 
+    __repr__ = brief
+
     mean: FloatArray
     lower: FloatArray
     upper: FloatArray
@@ -124,6 +127,8 @@ class Loop:
     does not have it.
     """
 
+    __repr__ = brief
+
     voltage: FloatArray
     rising: Curve
     falling: Curve
@@ -144,6 +149,8 @@ class Loops:
     same middle; ``initial`` is the curve from the demagnetised state, along ``initial_voltage``
     (points,), V.
     """
+
+    __repr__ = brief
 
     major: Loop
     minor: Loop

@@ -124,7 +124,7 @@ def _format(name: str, column: FloatArray) -> str:
     far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
     # A float has no more than 17 digits.
     extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
-    return f"%.{min((9 if name == 'time_s' else 7) + extra, 17)}g"
+    return f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g"
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:

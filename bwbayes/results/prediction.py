@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -72,7 +72,7 @@ def predict_windows(
     posterior: Posterior,
     draws: FloatArray,
     record: Record,
-    windows: Mapping[str, slice],
+    windows: Mapping[str, slice | Sequence[slice]],
     generator: np.random.Generator,
 ) -> list[Bands]:
     """Predict windows of the training record: one simulation, one offset.
@@ -86,18 +86,23 @@ def predict_windows(
     record
         The training record, whole.
     windows
-        Slices of its samples, by name.
+        Slices of its samples, by name: one, or several, which make one set of bands.
     generator
         Draws the state of the dynamics at the record's start, where that is unknown.
     """
     theta = posterior.prior.theta(draws)
     mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
+    several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
+    edges = [(part.start, part.stop) for parts in several.values() for part in parts]
+    first = min(start for start, _ in edges)
+    whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)))
     bands = []
-    for name, window in windows.items():
+    for name, parts in several.items():
         training = any(
-            w.start < window.stop and window.start < w.stop for w in posterior.only.training
+            w.start < p.stop and p.start < w.stop for w in posterior.only.training for p in parts
         )
-        bands.append(replace(_bands(name, mixed, record, window), training=training))
+        moved = [slice(part.start - first, part.stop - first) for part in parts]
+        bands.append(replace(whole.within(moved), name=name, training=training))
     return bands
 
 
@@ -112,10 +117,9 @@ def forecast(
     """Predict what follows on the training record: its last sample goes on into a planned voltage.
 
     Hysteresis, dynamics and creep start from where the record leaves them, and the sensor keeps its
-    offset. The discrepancy goes on from where the fitted readings leave it
-    (:mod:`bwbayes.results.carried`): the band is narrower at first, and as wide as ever later.
-    Creep with a time longer than the record is known by its prior alone: the model needs times up
-    to the forecast's length.
+    offset. The discrepancy goes on from where the fitted readings leave it: the band is narrower at
+    first, and as wide as ever later. Creep with a time longer than the record is known by its prior
+    alone: the model needs times up to the forecast's length.
 
     Parameters
     ----------
@@ -183,7 +187,8 @@ def predict_record(
     if part.stop <= begun.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
     bands = _bands(name, _draws(posterior, theta, begun), record, part)
-    return replace(bands, scored_from=max(begun.judged_from - part.start, 0), lead_in=begun.lead_in)
+    scored_from = max(begun.judged_from - part.start, 0)
+    return replace(bands, scored_from=scored_from, lead_in=begun.lead_in, separate=True)
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
@@ -194,14 +199,18 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
     """Walk through a record and summarise the mixture over a window."""
     pieces = _simulated(mixed.start, record.voltage, window)
     parts: list[dict[str, FloatArray]] = []
+    totals = np.zeros(len(mixed.start.model))
     pending: deque[Future[dict[str, FloatArray]]] = deque()
     with ThreadPoolExecutor(THREADS) as executor:
         for first, simulated in pieces:
             pending.append(executor.submit(_summarised, mixed, record, first, simulated))
+            totals += simulated.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
             if len(pending) > THREADS:
                 parts.append(pending.popleft().result())
         parts += [one.result() for one in pending]
+    means = totals / (window.stop - window.start)
+    common = float(np.var(means) + np.mean(mixed.start.offset_sd**2))
     joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return Bands(
         name=name,
@@ -216,6 +225,8 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
         crps=joined.get("crps"),
         log_score=joined.get("log_score"),
         interval=record.interval,
+        time_offset=record.time_offset,
+        common_sd=float(np.sqrt(common)),
     )
 
 

@@ -17,6 +17,7 @@ from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.posterior import Posterior
+from bwbayes.shown import brief
 
 __all__ = ["STATISTICS", "Replicated", "Statistic", "numbers", "replicated"]
 
@@ -67,6 +68,8 @@ class Statistic:
 @dataclass(frozen=True)
 class Replicated:
     """The statistics by name, and how many records were made."""
+
+    __repr__ = brief
 
     statistics: Mapping[str, Statistic]
     records: int

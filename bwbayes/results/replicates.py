@@ -30,6 +30,7 @@ from bwbayes.results.passages import crossings, passed
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
+from bwbayes.shown import brief
 
 __all__ = [
     "EXTRA",
@@ -91,6 +92,8 @@ class Experiment:
     InputError
         No training voltage goes back and forth, so that there is no loop to measure.
     """
+
+    __repr__ = brief
 
     posterior: Posterior
     plan: SamplingPlan
@@ -181,6 +184,8 @@ class Replicate:
         Part of the samples inside each of the experiment's bands, by name; empty without draws.
     """
 
+    __repr__ = brief
+
     number: int
     converged: bool
     stop_reason: str
@@ -213,20 +218,14 @@ class Replicate:
 
 
 def replicates(
-    experiment: Experiment,
-    seed: int,
-    numbers: Iterable[int],
-    executor: Executor,
-    together: int = 1,
+    experiment: Experiment, seed: int, numbers: Iterable[int], executor: Executor, together: int = 1
 ) -> Iterator[Replicate]:
     """Make the replicates of those numbers, and yield each as soon as it is done.
 
     Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
     be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
     """
-    return as_done(
-        executor, together, replicate, ((experiment, seed, number) for number in numbers)
-    )
+    return as_done(executor, together, replicate, ((experiment, seed, n) for n in numbers))
 
 
 def as_done[T](

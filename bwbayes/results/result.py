@@ -22,10 +22,12 @@ from bwbayes.results.learned import Learned
 from bwbayes.results.loops import Loops
 from bwbayes.results.replicated import Replicated
 from bwbayes.results.scores import Scores, as_summary
+from bwbayes.results.standing import Standing
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.sampler import Outcome
+from bwbayes.shown import brief
 
 __all__ = ["Result", "summary"]
 
@@ -76,6 +78,8 @@ class Result:
         The true parameters, of a simulated record.
     """
 
+    __repr__ = brief
+
     name: str
     outcome: Outcome
     parameters: tuple[Parameter, ...]
@@ -106,9 +110,9 @@ class Result:
         return self.draws.reshape(-1, self.draws.shape[-1])
 
     @property
-    def failed(self) -> tuple[Verdict, ...]:
-        """The verdicts of bands that do not hold."""
-        return tuple(verdict for verdict in self.verdicts.values() if verdict.holds is False)
+    def standing(self) -> Standing:
+        """Whether all bands hold."""
+        return Standing.of(self.verdicts.values())
 
 
 def summary(result: Result) -> dict[str, object]:

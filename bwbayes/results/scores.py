@@ -15,6 +15,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.ensemble import autocorrelation_time
+from bwbayes.shown import brief
 
 __all__ = ["Scores", "as_summary", "block_bootstrap_error", "block_length", "score"]
 
@@ -42,6 +43,8 @@ class Scores:
     nrmse
         Root mean square of measured - mean over the range (largest - smallest) of the measured;
         nan if the measured does not vary.
+    nrmse_full
+        The same over the range of all readings that were fitted; None if it is not known.
     max_error_um
         Largest absolute measured - mean.
     log_score
@@ -66,6 +69,8 @@ class Scores:
         Lowest coverage of the sensor band over any second, by level.
     """
 
+    __repr__ = brief
+
     nrmse: float
     max_error_um: float
     crps_um: float
@@ -75,10 +80,13 @@ class Scores:
     coverage_error: dict[str, dict[int, float] | None]
     worst_second: dict[int, float]
     log_score: float | None = None
+    nrmse_full: float | None = None
 
 
-def score(bands: Bands, generator: np.random.Generator) -> Scores:
+def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Scores:
     """Judge bands against what was measured, and against the truth where it is known.
+
+    ``full`` is the range of all readings that were fitted, um, if it is known.
 
     Raises
     ------
@@ -101,7 +109,7 @@ def score(bands: Bands, generator: np.random.Generator) -> Scores:
         raise InputError(f"{bands.name}: all readings are missing; judge another window")
     measured = bands.measured[judged]
     residual = measured - bands.mean[judged]
-    extent = float(np.ptp(measured))
+    extent, rmse = float(np.ptp(measured)), float(np.sqrt(np.mean(residual**2)))
     against = {"sensor": bands.measured, "displacement": bands.truth}
     coverage: dict[str, dict[int, float] | None] = {}
     error: dict[str, dict[int, float] | None] = {}
@@ -121,7 +129,8 @@ def score(bands: Bands, generator: np.random.Generator) -> Scores:
         for level, hit in _hits(bands, "sensor", bands.measured).items()
     }
     return Scores(
-        nrmse=float(np.sqrt(np.mean(residual**2))) / extent if extent > 0 else np.nan,
+        nrmse=rmse / extent if extent > 0 else np.nan,
+        nrmse_full=rmse / full if full else None,
         max_error_um=float(np.abs(residual).max()),
         crps_um=float(bands.crps[judged].mean()),
         width_um={level: _width(bands, level, judged) for level in LEVELS},
@@ -144,6 +153,7 @@ def as_summary(scores: Scores) -> dict[str, object]:
 
     return {
         "nrmse": scores.nrmse if np.isfinite(scores.nrmse) else None,
+        "nrmse_full": scores.nrmse_full,
         "max_error_um": scores.max_error_um,
         "log_score": (
             scores.log_score

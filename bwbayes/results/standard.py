@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import signal, stats
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.results.bands import Bands, Kind
@@ -30,13 +30,18 @@ class Standard:
 
     ``z`` (readings,) residuals over the sensor band's sd; ``for_mean`` and ``for_size``
     independent readings that the record is worth to the mean of z and to that of z²; ``unsure``
-    is the sd of the logarithm of the noise's sd.
+    is the sd of the logarithm of the noise's sd. ``varying`` is z about its mean, scaled to a
+    variance of one, worth ``for_varying`` readings to that of its square; ``common`` is the part of
+    the band's variance that is one and the same for all readings, such as an offset's.
     """
 
     z: FloatArray
     for_mean: float
     for_size: float
     unsure: float
+    varying: FloatArray
+    for_varying: float
+    common: float
 
     @property
     def known(self) -> float:
@@ -45,8 +50,8 @@ class Standard:
 
     @property
     def worth(self) -> float:
-        """Independent readings that both together are worth."""
-        return 1 / (1 / self.for_size + 1 / self.known)
+        """Independent readings, about their mean, that record and fit together are worth."""
+        return 1 / (1 / self.for_varying + 1 / self.known)
 
     @property
     def scales(self) -> FloatArray:
@@ -66,8 +71,9 @@ def _sd(bands: Bands, kind: Kind, judged: BoolArray) -> FloatArray:
 def standardised(bands: Bands, judged: BoolArray, memory: float, unsure: float) -> Standard:
     """Take the residuals over their sd, and work out how many independent ones they are worth.
 
-    With p, q and w the shares of parameters, discrepancy and sensor in the variance, z at two
-    samples t apart has the correlation p + q exp(-t/τ), and z² that squared.
+    With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in the
+    variance, z at two samples t apart has the correlation c + p + q exp(-t/τ), and z² that squared.
+    About its mean the common error drops out.
     """
     assert bands.measured is not None
     sensor = np.maximum(_sd(bands, "sensor", judged), np.finfo(float).tiny)
@@ -76,19 +82,35 @@ def standardised(bands: Bands, judged: BoolArray, memory: float, unsure: float) 
     p = min(float(np.mean(_sd(bands, "parameter", judged) ** 2)) / total, 1.0)
     q = min(float(np.mean(_sd(bands, "displacement", judged) ** 2)) / total, 1.0) - p
     q = max(q, 0.0) if memory > 0 else 0.0
-    time = bands.time[judged]
-    length = float(time[-1] - time[0] + bands.interval)
-    once, twice = (_mean_correlation(length, memory / power, z.size) for power in (1, 2))
+    pairs = _pairs(judged)
+    lags = bands.interval * np.arange(pairs.size, dtype=np.float64)
+    once, twice = (_mean_correlation(pairs, lags, memory / power) for power in (1, 2))
     alone = 1 / z.size
+    common = min(bands.common_sd**2 / total, p)
+
+    def correlated(p: float, q: float) -> float:
+        """Mean correlation of all pairs of squares."""
+        return p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * alone
+
     mean = p + q * once + (1 - p - q) * alone
-    size = p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * alone
-    return Standard(z, 1 / mean, 1 / size, unsure)
+    left = (p - common) + q * (1 - once) + (1 - p - q) * (1 - alone)
+    varying = (z - np.mean(z)) / np.sqrt(left)
+    rest = correlated(min((p - common) / left, 1.0), min(q * (1 - once) / left, 1.0))
+    worth = 1 / correlated(p, q), unsure, varying, 1 / rest, common
+    return Standard(z, 1 / mean, *worth)
 
 
-def _mean_correlation(length: float, memory: float, readings: int) -> float:
-    """Mean correlation of all pairs of a process that forgets by exp(-t/memory)."""
-    x = length / memory if memory > 0 else np.inf
-    if not np.isfinite(x):
-        return 1 / readings
-    mean = 1.0 - x / 3 if x < 1e-4 else 2 * (x - 1 + np.exp(-x)) / x**2
-    return max(float(mean), 1 / readings)
+def _pairs(judged: BoolArray) -> FloatArray:
+    """Count the pairs of judged samples at each lag, (lags,), those in either order."""
+    there = judged[slice(*np.flatnonzero(judged)[[0, -1]] + [0, 1])].astype(np.float64)
+    counts = np.rint(signal.correlate(there, there, method="fft")[there.size - 1 :])
+    counts[1:] *= 2
+    result: FloatArray = counts
+    return result
+
+
+def _mean_correlation(pairs: FloatArray, lags: FloatArray, memory: float) -> float:
+    """Mean correlation of all pairs of readings of a process that forgets by exp(-lag/memory)."""
+    if memory <= 0:
+        return float(pairs[0] / pairs.sum())
+    return float(pairs @ np.exp(-lags / memory) / pairs.sum())

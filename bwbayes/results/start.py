@@ -32,6 +32,7 @@ from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
 from bwbayes.results.transient import switched
+from bwbayes.shown import brief
 
 if TYPE_CHECKING:
     from bwbayes.inference.compiled.walk import Walk
@@ -43,6 +44,10 @@ __all__ = ["Start", "Started", "fitted", "going_on", "started"]
 SLOW = 3
 MANY = 20
 TESTED = 100
+
+# The default lead-in: a part of the record, so many correlation times of the discrepancy at most,
+# or so many samples where it forgets at once.
+PART, MEMORIES, AT_LEAST = 0.25, 10.0, 100
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,8 @@ class Start:
         The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
         the training record, as it is for a planned voltage without a measurement.
     lead_in
-        Length of the lead-in, s.
+        Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
+        the discrepancy at most: after these the offset hardly widens the bands.
     lead_in_from
         Time at which it begins, s; by default that of the record's first sample. What comes before
         is simulated.
@@ -67,22 +73,27 @@ class Start:
         What the voltage does between samples; by default what the record says of its voltage.
     after
         What comes after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
-        readings leave it (:mod:`bwbayes.results.carried`).
+        readings leave it.
     settled
         Without a lead-in: the actuator has waited at the first voltage until it stood still, with
-        whatever earlier drives have left of hysteresis and creep.
+        whatever earlier drives have left of hysteresis and creep, and displacements count from
+        where it stands.
     """
+
+    __repr__ = brief
 
     from_rest: bool = False
     own_offset: bool = True
-    lead_in: float = 1.0
+    lead_in: float | None = None
     lead_in_from: float | None = None
     hold: Hold | None = None
     after: bool = False
     settled: bool = False
 
-    def window(self, record: Record) -> slice | None:
+    def window(self, record: Record, memory: float = np.inf) -> slice | None:
         """Return the samples of the lead-in, or None if nothing can be learned from one.
+
+        ``memory`` is the discrepancy's correlation time, s.
 
         Raises
         ------
@@ -101,18 +112,19 @@ class Start:
             return None
         begin = record.start if self.lead_in_from is None else self.lead_in_from
         first = round((begin - record.start) / record.interval)
-        last = first + round(self.lead_in / record.interval)
+        # White noise forgets at once: then a hundred readings tell the offset.
+        longest = max(MEMORIES * memory, AT_LEAST * record.interval)
+        length = self.lead_in or min(PART * (record.samples - first) * record.interval, longest)
+        last = first + round(length / record.interval)
+        lead_in = f"a lead-in of {length:g} s from {record.clock(begin)} s on"
         if not (0 <= first < last < record.samples):
+            end = record.start + record.duration
             raise InputError(
-                f"{record.origin}: a lead-in of {self.lead_in:g} s from {begin:g} s on leaves "
-                f"nothing of the record from {record.start:g} to "
-                f"{record.start + record.duration:g} s; choose another one"
+                f"{record.origin}: {lead_in} leaves nothing of the record from "
+                f"{record.clock(record.start)} to {record.clock(end)} s; choose another one"
             )
         if not np.isfinite(record.displacement[first:last]).any():
-            raise InputError(
-                f"{record.origin}: no reading in its lead-in from {begin:g} to "
-                f"{begin + self.lead_in:g} s; choose another one"
-            )
+            raise InputError(f"{record.origin}: no reading in {lead_in}; choose another one")
         return slice(first, last)
 
 
@@ -127,6 +139,8 @@ class Started:
     there is one, and ``judged_from`` is the first sample after it; ``carried`` is what its readings
     leave of the discrepancy, for a forecast. ``engine`` is what simulates.
     """
+
+    __repr__ = brief
 
     actuators: tuple[Actuator, ...]
     which: IntArray
@@ -215,7 +229,8 @@ def started(
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
     span = _voltages(posterior, record)
     actuator = replace(posterior.only.actuator, interval=record.interval, hold=hold, span=span)
-    window = start.window(record)
+    memory = posterior.only.noise.memory(posterior.only.table.noise(theta))
+    window = start.window(record, float(np.median(memory)))
     whole = _likelihood(posterior, actuator, record, start, window)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(replace(whole, actuator=replace(actuator, span=one)) for one in earlier)
@@ -311,7 +326,11 @@ def _unseen(
     )
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(one.actuator for one in likelihoods)
-    return Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
+    start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
+    if settled:
+        offset = first.actuator.parameters.index("offset")
+        model[:, offset] -= start.advance(first.voltage[:1])[0][:, 0]
+    return start
 
 
 def _informed(

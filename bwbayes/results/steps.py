@@ -20,6 +20,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.model.linear import Recursion
 from bwbayes.results.loops import Curve, Estimate
+from bwbayes.shown import brief
 
 __all__ = [
     "STEP_MEASURES",
@@ -53,6 +54,8 @@ STEP_MEASURES: Mapping[str, tuple[str, str]] = {
 class Step:
     """A step of the voltage from zero to ``height``, V, that is held for ``held``, s."""
 
+    __repr__ = brief
+
     height: float
     held: float
 
@@ -65,6 +68,8 @@ class StepResponse:
     growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
     those of :func:`measure_step`; a number is None if the model has none.
     """
+
+    __repr__ = brief
 
     step: Step
     time: FloatArray

@@ -16,6 +16,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.ensemble import Block, EnsembleState
 from bwbayes.sampling.moves import MOVES
 from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.shown import brief
 
 __all__ = ["MOST_DRAWS", "PHASES", "Chain", "Phase", "thinning"]
 
@@ -53,6 +54,8 @@ class Chain:
     second, refitted
         The proposal that was fitted to the first of these, if any, and how many they were.
     """
+
+    __repr__ = brief
 
     def __init__(self, starts: Sequence[EnsembleState]) -> None:
         self.starts = tuple(starts)

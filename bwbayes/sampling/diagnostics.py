@@ -25,6 +25,7 @@ from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.ensemble import autocorrelation_time
+from bwbayes.shown import brief
 
 __all__ = [
     "Check",
@@ -76,6 +77,8 @@ class Check:
     ``pareto_k`` is that of the proposal at these draws, None if there is no proposal;
     ``walker_rhat`` is the largest R-hat with each walker a chain.
     """
+
+    __repr__ = brief
 
     steps: int
     rhat: FloatArray

@@ -22,6 +22,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.walking import Steps, walk
+from bwbayes.shown import brief
 
 __all__ = [
     "RANDOM_STATE_WORDS",
@@ -52,6 +53,8 @@ class EnsembleState:
     ``coordinates`` (walkers, free), ``log_density`` (walkers,) and ``random_state`` (628,), the
     words of emcee's generator.
     """
+
+    __repr__ = brief
 
     coordinates: FloatArray
     log_density: FloatArray

@@ -18,6 +18,7 @@ from scipy.stats import skew
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.bends import Bend, some_of
+from bwbayes.shown import brief
 
 __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 
@@ -74,6 +75,8 @@ class StudentProposal:
     freedom
         ν; small enough for tails heavier than the posterior's.
     """
+
+    __repr__ = brief
 
     centre: FloatArray
     factor: FloatArray
@@ -147,6 +150,8 @@ class StudentMixture:
     bend
         What makes the coordinates in which they are straight; None for the coordinates themselves.
     """
+
+    __repr__ = brief
 
     weights: FloatArray
     components: tuple[StudentProposal, ...]

@@ -48,6 +48,7 @@ from bwbayes.sampling.ensemble import Block, advance_together, start
 from bwbayes.sampling.judge import Judge, constrained
 from bwbayes.sampling.moves import MOVES, pilot_moves, sampling_moves, spreading_moves
 from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.shown import brief
 
 __all__ = [
     "Outcome",
@@ -139,6 +140,8 @@ class SamplingPlan:
 @dataclass(frozen=True)
 class Outcome:
     """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
+
+    __repr__ = brief
 
     converged: bool
     stop_reason: str

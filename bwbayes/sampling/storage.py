@@ -141,7 +141,7 @@ class ChainFile(Chain):
             whole = sum(len(chain.history(phase)) for phase in PHASES)
             warnings.warn(
                 f"{path}: damaged ({damage}); the {whole} whole blocks before that are used, and "
-                "`bwbayes resume` makes the others again",
+                "resuming makes the others again",
                 InputWarning,
                 stacklevel=2,
             )
@@ -389,7 +389,7 @@ def _told(path: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: fix "
-            "that, then go on with `bwbayes resume`"
+            "that, then resume the run"
         ) from None
 
 

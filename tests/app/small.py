@@ -42,6 +42,7 @@ train = [[0.0, 5.0]]
 
 [stand]
 sample_rate = 50.0
+discrepancy = "none"
 
 [parameters]
 initial = { fixed = 0.0 }

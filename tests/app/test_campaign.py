@@ -78,9 +78,13 @@ def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
     assert "refused" == table["broken"]["status"]
     assert "broken.csv:2: displacement_um: 'x' is not a number" in table["broken"]["reason"]
     summary = json.loads((whole / "campaign.json").read_text())
-    assert {"refused": 1, "not converged": 0, "does not hold": 0, "done": COUNT} == (
-        summary["counts"]
-    )
+    assert {
+        "refused": 1,
+        "not converged": 0,
+        "validation failed": 0,
+        "validation inconclusive": 0,
+        "passed": COUNT,
+    } == (summary["counts"])
     for name in list(table)[1:]:
         own = json.loads((whole / f"records/{name}/summary.json").read_text())
         for key in ("mean", "lower_95"):
@@ -119,7 +123,7 @@ def test_the_command_says_which_records_were_refused_and_ends_with_2(
     )
     assert 2 == done.returncode, done.stderr
     assert "REFUSED: broken: broken.csv:2:" in done.stderr
-    assert "4 records: 1 refused, 3 done" in done.stdout
+    assert "4 records: 1 refused, 3 passed" in done.stdout
     assert_same_end(whole, out)
 
 
@@ -197,16 +201,16 @@ def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_pa
     arguments = re.findall(r"`bwbayes (resume .*)`", row.reason)[0].split()
     subprocess.run(small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True)
     again = ended(folder)
-    assert ("done", 0) == (again.rows[0].status, again.exit_status)
+    assert ("passed", 0) == (again.rows[0].status, again.exit_status)
 
 
 @pytest.mark.parametrize(
     ("status", "endings"),
     [
-        (0, ["done"]),
-        (3, ["done", "does not hold"]),
-        (4, ["done", "does not hold", "not converged"]),
-        (2, ["refused", "done", "does not hold", "not converged"]),
+        (0, ["passed"]),
+        (3, ["passed", "validation failed"]),
+        (4, ["passed", "validation failed", "not converged"]),
+        (2, ["refused", "passed", "validation failed", "not converged"]),
     ],
 )
 def test_the_worst_ending_is_the_exit_status(status: int, endings: list[str]) -> None:
@@ -234,7 +238,7 @@ def test_files_that_share_a_name_are_refused_and_others_fitted(tmp_path: Path) -
     config = config_text(tmp_path / "small.toml")
     folder = start(records, config, tmp_path, tmp_path / "batch", pictures=False)
     by_file = {row.file: row.status for row in ended(folder).rows}
-    assert {"s000.csv": "done", "twice.csv": "refused", "twice.h5": "refused"} == by_file
+    assert {"s000.csv": "passed", "twice.csv": "refused", "twice.h5": "refused"} == by_file
 
 
 def test_the_population_is_that_of_the_truths(whole: Path) -> None:
@@ -280,7 +284,7 @@ def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> No
         np.mean(b.upper["parameter", 95] - b.lower["parameter", 95]) for b in (bands, own)
     )
     assert wide > 5 * narrow
-    assert "3 records: 3 done" == repr(made)
+    assert "3 records: 3 passed" == repr(made)
     assert made.plot().axes
 
 

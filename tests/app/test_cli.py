@@ -178,23 +178,26 @@ def lines(*rows: str) -> bytes:
     ("content", "place", "problem"),
     [
         (lines(HEADER, *ROWS[:5], "0.05,abc,1", *ROWS[6:]), "7: voltage_V: ", "abc"),
-        (lines(HEADER, *ROWS[:5], "0.05,nan,1", *ROWS[6:]), "7: voltage_V: ", "nan"),
+        (
+            lines(HEADER, *ROWS[:5], "0.05,nan,1", *ROWS[6:]),
+            "7: voltage_V: ",
+            "no number (empty or nan)",
+        ),
         (lines(HEADER, *ROWS[:5], "0.05,1,inf", *ROWS[6:]), "7: displacement_um: ", "inf"),
-        (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "1e999"),
+        (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "inf"),
         (lines(HEADER, *ROWS[:5], "0.05,,1", *ROWS[6:]), "7: voltage_V: ", "empty"),
         (lines(HEADER, *ROWS[:5], "0.05,1", *ROWS[6:]), "7: ", "field"),
         (lines(HEADER, *ROWS[:5], "0.05,1,1,1", *ROWS[6:]), "7: ", "field"),
         (lines(HEADER, *ROWS[:20], *ROWS[25:]), "22: time_s: ", "0.06"),
         (lines(HEADER, *ROWS[:20], ROWS[19], *ROWS[20:]), "22: time_s: ", "repeat"),
         (lines(HEADER, *ROWS[:20], ROWS[5], *ROWS[21:]), "22: time_s: ", "back"),
-        (lines(HEADER, *(row.replace(",", ";") for row in ROWS)), "2: ", "semicolon"),
-        (lines(*ROWS), "1: ", "header"),
-        (lines("t,u,y", *ROWS), "1: t: ", "no unit of the time"),
+        (lines(*ROWS), " ", "which column is the time"),
+        (lines("t,u,y", *ROWS), "1: ", "which unit has 't' (time), which 'u' (voltage), which 'y'"),
         (lines(HEADER), "", "no "),
         (b"", "", "empty"),
         (lines(HEADER, *ROWS) + b"0.6", "62: ", "field"),
-        (lines(HEADER, *ROWS[:5], "0.05,1\0,1", *ROWS[6:]), "7: ", "NUL"),
-        (b"\xff\xfe\0\1", "", "text"),
+        (lines(HEADER, *ROWS[:5], "0.05,1\0,1", *ROWS[6:]), "7: ", "is not a number"),
+        (b"\xff\xfe\0\1", "", "no columns of numbers"),
         (lines(HEADER, *(f"{i / 100},5,{i % 7}" for i in range(60))), "", "constant"),
         (lines(HEADER, *(f"{i / 100},{i % 7},5" for i in range(60))), "", "constant"),
         (lines("time_s,voltage_V", *(row.rsplit(",", 1)[0] for row in ROWS)), "", "displacement"),
@@ -221,7 +224,7 @@ def test_malformed_record_is_one_line_and_leaves_nothing(
         ('[record]\nfil = "record.csv"', "record.fil: unknown key; did you mean file?"),
         (RECORD + "[sampling]\ness = nan", "sampling.ess: "),
         (RECORD + "[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
-        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window: "),
+        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window.0: "),
         (RECORD + "[validation.'a/b']\nwindow = [0.1, 0.2]", "validation.a/b"),
         (RECORD + "[validation.a]\nwindow = [0.1, 0.2]", "overlaps"),
         (RECORD + "[parameters.alfa]\nfixed = 1.0", "did you mean alpha?"),
@@ -366,7 +369,7 @@ def test_predict_writes_the_bands_of_a_signal(bwbayes: Type, run: Path, tmp_path
     said = bwbayes("predict", run, "--signal", "step50", "--from-rest", "--out", "new/bands.csv")
     assert 0 == said.status
     # A step is faster than the sine that was fitted.
-    assert "V/s were fitted: faster than that the bands are an extrapolation" in said.err
+    assert "V/s of training; the bands extrapolate" in said.err
     assert "wrote new/bands.csv" in said.out
     header, rows = columns(tmp_path / "new/bands.csv")
     assert ["time_s", "voltage_V", "mean_um"] == header[:3]
@@ -378,11 +381,12 @@ def test_predict_writes_the_bands_of_a_signal(bwbayes: Type, run: Path, tmp_path
 def test_predict_writes_the_bands_of_a_measured_record(
     bwbayes: Type, run: Path, tmp_path: Path
 ) -> None:
-    bwbayes("simulate", "new.csv", "--rate", "100", "--seed", "5")
+    bwbayes("simulate", "new.csv", "--rate", "100", "--seed", "5", "--discrepancy", "none")
     said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv")
-    assert (0, "") == (said.status, said.err)
-    assert "CRPS" in said.out
-    assert "%" in said.out
+    assert 0 == said.status
+    (remark,) = said.err.splitlines()
+    assert remark.startswith("bwbayes: new: duration of 16 s exceeds the 5 s of training; ")
+    assert "Coverage 50/90/95%" in said.out
     header, rows = columns(tmp_path / "bands.csv")
     assert ["time_s", "voltage_V", "displacement_um", "mean_um"] == header[:4]
     assert sorted(BANDS) == sorted(header[4:])
@@ -397,7 +401,7 @@ def test_predict_takes_a_voltage_alone(bwbayes: Type, run: Path, tmp_path: Path)
     (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows))
     said = bwbayes("predict", run, "--record", "plan.csv", "--out", "bands.csv")
     assert (0, "") == (said.status, said.err)
-    assert "CRPS" not in said.out
+    assert "Coverage" not in said.out
     header, _ = columns(tmp_path / "bands.csv")
     assert ["time_s", "voltage_V", "mean_um"] == header[:3]
 
@@ -409,8 +413,8 @@ def test_predict_says_where_a_voltage_leaves_what_was_fitted(
     (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows))
     said = bwbayes("predict", run, "--record", "plan.csv", "--out", "bands.csv")
     assert 0 == said.status
-    assert said.err.startswith("bwbayes: plan: the voltage goes from -500 to 500 V, and only -")
-    assert "the bands are an extrapolation" in said.err
+    assert said.err.startswith("bwbayes: plan: voltage -500 to 500 V exceeds the training range -")
+    assert "; the bands extrapolate" in said.err
 
 
 def test_no_file_is_replaced_unless_that_is_asked_for(
@@ -423,7 +427,7 @@ def test_no_file_is_replaced_unless_that_is_asked_for(
         ("simulate", "new.csv"),
         ("predict", run, "--record", "new.csv", "--lead-in", "0.2", "--out", "new.csv"),
     ):
-        assert_one_line(bwbayes(*command), "new.csv: exists; choose another name, or give --over")
+        assert_one_line(bwbayes(*command), "new.csv: exists; choose another name, or give `--over")
         assert before == (tmp_path / "new.csv").read_bytes()
     assert 0 == bwbayes("simulate", "new.csv", "--rate", "100", "--overwrite").status
     assert before != (tmp_path / "new.csv").read_bytes()
@@ -435,18 +439,20 @@ def test_lead_in_longer_than_the_record_is_refused(
     bwbayes: Type, run: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "new.csv").write_bytes(lines(HEADER, *ROWS))
-    said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv")
+    predict = "predict", run, "--record", "new.csv", "--out", "bands.csv"
+    said = bwbayes(*predict, "--lead-in", "1")
     assert_one_line(said, "lead-in of 1 s from 0 s on leaves nothing of the record from 0 to 0.6 s")
     assert not (tmp_path / "bands.csv").exists()
-    said = bwbayes("predict", run, "--record", "new.csv", "--out", "bands.csv", "--lead-in", "0.2")
-    assert 0 == said.status
+    # By itself it is a quarter of the record.
+    assert 2 != bwbayes(*predict).status
+    assert 60 == len(columns(tmp_path / "bands.csv")[1])
 
 
 def test_predict_after_goes_on_from_the_readings(bwbayes: Type, run: Path, tmp_path: Path) -> None:
     """The band of the displacement is narrower behind the lead-in, and as wide as ever later."""
     # Longer than the correlation times of all draws.
     sine = "--signal", "sine", "--frequency", "0.5", "--duration", "30"
-    bwbayes("simulate", "new.csv", *sine, "--rate", "50", "--seed", "5")
+    bwbayes("simulate", "new.csv", *sine, "--rate", "50", "--seed", "5", "--discrepancy", "none")
     record = "--record", "new.csv", "--from-rest", "--lead-in", "5"
     assert 0 == bwbayes("predict", run, *record, "--out", "usual.csv").status
     assert 0 == bwbayes("predict", run, *record, "--after", "--out", "after.csv").status

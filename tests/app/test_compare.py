@@ -105,6 +105,80 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
     assert f"{evidence:.2f}" in page
 
 
+KEYS: dict[str, Any] = {
+    "dynamics": "none",
+    "noise": "white",
+    "from_rest": True,
+    "ess": 200,
+    "seed": 3,
+    "train": (0, 4),
+    "validation": {"later": (4, 6)},
+    "parameters": {"gamma": {"fixed": 0.0172}},
+}
+
+
+def test_models_of_a_record_are_compared(tmp_path: Path) -> None:
+    """Named in one text or in a list, with nothing left or a folder, and its runs: the same."""
+    record = measured()
+    few: dict[str, Any] = {"future": False, "workers": 1, "progress": False}
+    made = bw.compare(record, models="linear; bouc-wen", **few, **KEYS)
+    assert ("bouc-wen", ["bouc-wen", "linear"]) == (
+        made.recommended,
+        sorted(made.to_pandas().index),
+    )
+    kept = bw.compare(
+        record, models=["linear", "bouc-wen"], folder=tmp_path / "kept", **few, **KEYS
+    )
+    assert made.to_pandas().equals(kept.to_pandas())
+    numbers = json.loads((tmp_path / "kept/comparison.json").read_text())
+    assert numbers["recommended"] == "bouc-wen"
+    with pytest.raises(InputError, match=r"comparison\.json: exists"):
+        bw.compare(record, folder=tmp_path / "kept", **few, **KEYS)
+    folders = [tmp_path / "kept" / name for name in ("linear", "bouc-wen")]
+    again = bw.compare(*folders, future=False, workers=1)
+    assert made.to_pandas().equals(again.to_pandas())
+    mixed = bw.compare([str(folders[0]), bw.open_run(folders[1])], future=False, workers=1)
+    assert made.to_pandas().equals(mixed.to_pandas())
+
+
+def test_fits_are_compared_at_the_top(fits: tuple[Fit, Fit], tmp_path: Path) -> None:
+    made = bw.compare(*fits, future=False, workers=1, folder=tmp_path / "out")
+    assert made.to_pandas().equals(fits[0].compare(fits[1], future=False, workers=1).to_pandas())
+    assert (tmp_path / "out/comparison.html").is_file()
+    same = bw.compare(fits[0], fits[0], future=False, workers=1)
+    assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
+
+
+def test_models_are_usual_ones_unless_they_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def noted(*given: Any, **_: Any) -> Any:
+        asked.append(given[2])
+        raise InputError("that is enough")
+
+    monkeypatch.setattr("bwbayes.app.fit.calls.run_models", noted)
+    with pytest.raises(InputError, match="that is enough"):
+        bw.compare(measured(), **KEYS)
+    assert len(asked[0]) == 7
+
+
+def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
+    record = measured()
+    for given, options, line in (
+        ([fits[0]], {}, "compare: one fit alone; give two or more, or a record"),
+        (fits, {"models": "linear"}, "compare: models: fits are compared as they are; leave it"),
+        (fits, {"train": (0, 1)}, "compare: train: fits are compared as they are; leave it out"),
+        ([fits[0], record], {}, "compare: Record: is neither a fit nor the folder of a run"),
+        ([fits[0], "nowhere"], {}, "compare: nowhere: is neither a fit nor the folder of a run"),
+        ([record], {"models": "liner"}, "models: 'liner' is unknown; did you mean linear?"),
+        ([record], {"models": []}, "models: names no model"),
+        ([record], {"trian": (0, 1)}, "compare: trian: unknown key; did you mean train?"),
+        ([], {}, "compare: record: list is not a record"),
+    ):
+        with pytest.raises(InputError, match=re.escape(line)):
+            bw.compare(*given, **options)
+
+
 def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
     fit, linear = fits
     time = np.arange(150) / 50

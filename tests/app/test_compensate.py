@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
+from bwbayes.app.commands.compensate import compensate as command
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.jobs.compensate import FILES, compensate_run
 from bwbayes.control.wished import shaped
@@ -55,6 +58,7 @@ def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Pat
     assert made.save(tmp_path / "new", overwrite=True) == files
 
 
+@pytest.mark.filterwarnings("ignore:between samples")
 def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -> None:
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
@@ -71,6 +75,73 @@ def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -
     np.testing.assert_array_equal(by_array.compensated.rms, again.compensated.rms)
 
 
+def test_a_shape_is_that_of_the_command_line(run: Path, tmp_path: Path) -> None:
+    """By its name, with the same numbers; with options left out, the same defaults."""
+    arguments = ["triangle", "--amplitude", "30", "--frequency", "1", "--periods", "2"]
+    out = ["--from-rest", "--limit", "5", "--out", str(tmp_path)]
+    assert 0 == command.main([str(run), *arguments, *out], standalone_mode=False)
+    numbers = json.loads((tmp_path / "compensation.json").read_text())
+    fit = bw.open_run(run)
+    with pytest.warns(bw.InputWarning) as warned:
+        made = fit.compensate(
+            "triangle", amplitude=30, frequency=np.int64(1), periods=2, from_rest=True, limit=5
+        )
+    assert numbers == made.summary
+    assert numbers["remarks"] == [str(one.message) for one in warned]
+    assert Path(__file__).name == Path(warned[0].filename).name
+    assert "triangle" == made.reference.name
+    shape = shaped("triangle", 0.02, 30.0, 1.0, periods=2)
+    np.testing.assert_array_equal(made.asked, shape.given)
+    again = compensate_run(run, shape, from_rest=True, limit=5)
+    assert numbers == again.summary
+    assert numbers == compensate_run(run, made.reference, from_rest=True, limit=5).summary
+
+
+@pytest.mark.parametrize(
+    ("reference", "options", "line"),
+    [
+        ("triangel", {}, "'triangel' is neither a shape nor a file; did you mean triangle?"),
+        ("nowhere.csv", {}, "nowhere.csv: does not exist; check the path"),
+        ("sine", {"amplitude": 1.0}, "sine: has no frequency; give it, in Hz"),
+        ("sine", {"frequency": 1.0}, "sine: has no amplitude; give it, in um"),
+        ("sine", {"amplitude": "much", "frequency": 1.0}, "sine: amplitude 'much'; must be a num"),
+        (None, {}, "reference: NoneType is none; give one of sine, triangle"),
+        (5.0, {}, "reference: float is none; give one of sine, triangle"),
+        ({"time": [0.0]}, {}, "reference: dict is none; give one of sine"),
+        (["a"] * 20, {}, "reference: list is none; give one of sine"),
+        ([0.0, 1.0] * 10, {"amplitude": 1.0}, "displacements take no amplitude; leave it out, or"),
+        ("a.csv", {"interval": 1.0}, "a file takes no interval; leave it out, or give one of sine"),
+        (shaped("sine", 0.02, 1.0, 1.0), {"smoothed": 0.1}, "made already takes no smoothed"),
+        ("sine", {"amplitud": 1.0}, "compensate: amplitud is unknown; did you mean amplitude?"),
+        (
+            "sine",
+            {"amplitude": 1.0, "frequency": 1.0, "command": "best"},
+            "command: 'best' is unknown; known are mean, expected",
+        ),
+    ],
+)
+def test_what_is_no_reference_is_one_line(
+    run: Path, reference: Any, options: dict[str, Any], line: str
+) -> None:
+    fit = bw.open_run(run)
+    with pytest.raises(InputError, match=re.escape(line)) as refused:
+        fit.compensate(reference, **options)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["compensate", "export", "track", "compare", "design"])
+def test_a_method_has_the_arguments_of_what_it_calls(name: str, run: Path) -> None:
+    """In its signature, described, and in the error of one that is unknown."""
+    method = getattr(bw.Fit, name)
+    text = inspect.getdoc(method)
+    assert text is not None
+    assert "{options}" not in text
+    for argument in inspect.signature(method).parameters:
+        assert argument == "self" or re.search(rf"^(?:\w+, )*{argument}(?:, \w+)*$", text, re.M)
+    with pytest.raises(InputError, match=f"^{name}: workes is unknown; "):
+        method(bw.open_run(run), workes=1)
+
+
 @pytest.mark.parametrize(
     ("values", "line"),
     [
@@ -78,7 +149,7 @@ def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -
         ([5000.0] * 50, "is 5 um all along"),
         (["nan", *range(49)], "not a number; give one at every sample"),
         ([0.0, *[9e5] * 49], r"needs .* V, and from .* s on it is beyond the amplifier's"),
-        ([], "no samples below the header"),
+        ([], "no columns of numbers in it"),
     ],
 )
 def test_references_that_cannot_be_used_are_one_line(

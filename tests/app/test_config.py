@@ -5,12 +5,18 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import Annotated, Any
 
 import hypothesis.strategies as st
+import numpy as np
 import pytest
 from hypothesis import given, settings
+from pydantic import BaseModel, TypeAdapter
 
 from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.config.keys import ANY, keys
+from bwbayes.app.config.keywords import config_of
+from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from tests.app import small
 
@@ -100,6 +106,48 @@ def test_no_error_shows_the_name_of_a_class() -> None:
         for value in ("3", "'a'", "[]", "[1]", "true", "{ a = [] }", "{ a = { b = [] } }"):
             said = refused(f"{key} = {value}\n" + ("" if key == "record" else RECORD))
             assert not re.search(r"Config|Model|Table|dict|pydantic|instance|extra inputs", said)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "text"),
+    [
+        ("model", "gain", "quadratic"),
+        ("model", "per_record", "sensor_sd"),
+        ("model", "shared", "offset"),
+        ("model", "terms", "b3"),
+        ("stand.model", "gain", "cubic"),
+        ("stand.model", "terms", "b4"),
+        ("record", "remarks", "noted"),
+    ],
+)
+def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
+    """In a config and as a keyword."""
+    head = RECORD if table == "record" else f"{RECORD}[{table}]\n"
+    alone, listed = (parse(f"{head}{key} = {one}\n", "") for one in (f'"{text}"', f'["{text}"]'))
+    assert alone == listed
+    if not table.startswith("stand"):
+        record = Record(np.arange(20.0), np.arange(20.0), 0.1)
+        by_keyword, by_list = (config_of(record, {key: one})[0] for one in (text, [text]))
+        assert by_keyword == by_list
+
+
+def test_every_list_of_texts_takes_a_text_alone() -> None:
+    """Whatever keys there will be."""
+    found = [key.path for key in keys(Config) if "list of texts" in key.kind]
+    assert len(found) >= 7
+    for path in found:
+        model: type[BaseModel] = Config
+        names = path.split(".")
+        for name in names[:-1]:
+            if name != ANY:
+                (inner,) = {k.table for k in keys(model) if k.path in (name, f"{name}.{ANY}")}
+                assert inner is not None
+                model = inner
+        field = model.model_fields[names[-1]]
+        annotation: Any = field.annotation
+        if field.metadata:
+            annotation = Annotated[annotation, *field.metadata]
+        assert ["a"] == TypeAdapter[Any](annotation).validate_python("a")
 
 
 def test_a_config_is_loaded_from_a_path_or_its_text(tmp_path: Path) -> None:
@@ -202,7 +250,7 @@ def test_a_window_of_another_record_is_what_is_judged() -> None:
     text = f'{RECORD}[validation.a]\nfile = "a.csv"\nwindow = [1.0, 2.0]\nlead_in_from = 0.5'
     result = parse(text, "").validation["a"]
     assert result.another
-    assert [1.0, 2.0] == result.window
+    assert [[1.0, 2.0]] == result.window
     assert 0.5 == result.lead_in_from
 
 

@@ -116,7 +116,7 @@ def test_a_page_names_what_cannot_be_told_apart_and_what_is_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "give either --parameter or --drive"),
+        ([], "give either a parameter or a drive"),
         (["--parameter", "alpha", "--drive", "verification"], "give either"),
         (["--parameter", "alpa"], "did you mean alpha?"),
         (["--parameter", "alpha", "--candidates", "none.toml"], "none.toml: No such file"),

@@ -43,7 +43,7 @@ def test_another_engine_is_refused_unless_asked_for(run: Path, tmp_path: Path) -
     text = folder.config.read_text().replace('engine = "numba"', 'engine = "numpy"')
     folder.config.write_text(text)
     before = ChainFile.read(folder.chain).steps("sampling")
-    with pytest.raises(InputError, match=r"sampled with the numba engine, not numpy.*--engine num"):
+    with pytest.raises(InputError, match=r'sampled with the numba engine, not numpy.*`engine="num'):
         carry_on(folder, small.quiet(), workers=1)
     assert before == ChainFile.read(folder.chain).steps("sampling")
 

@@ -76,7 +76,7 @@ def test_options_that_make_no_sense_are_one_line(
 
 def test_a_file_in_the_way_is_one_line(run: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="choose another place with --out"):
+    with pytest.raises(InputError, match="choose another folder"):
         export(run, tmp_path / "file")
 
 

@@ -138,14 +138,15 @@ def test_the_loops_are_those_of_the_summary(fit: Fit) -> None:
 
 
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
-    said, page = repr(fit), fit._repr_html_()
+    said, page = str(fit), fit._repr_html_()
     for name, row in fit.summary.iterrows():
         for text in (str(name), digits(row["mean"], row["sd"]), digits(row["sd"], row["sd"])):
             assert text in said
             assert text in page
     assert said.startswith("small: converged, ")
+    assert said.startswith(repr(fit).splitlines()[0])
     assert page.count("<table>") == 2
-    assert '<th scope="col">mean</th>' in page
+    assert '<th scope="col">Mean</th>' in page
 
 
 def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:
@@ -219,7 +220,7 @@ def test_ctrl_c_leaves_a_folder_to_go_on_from(
         patched.setattr("bwbayes.app.running.progress.Progress.__call__", interrupt)
         with pytest.raises(KeyboardInterrupt):
             bw.fit(record, folder=tmp_path / "a", **keys)
-    with pytest.raises(bw.InputError, match=r"a: exists; go on with `bwbayes resume"):
+    with pytest.raises(bw.InputError, match=r"a: exists; go on with `bwbayes\.resume_run\('"):
         bw.fit(record, folder=tmp_path / "a", **keys)
     assert bw.resume_run(tmp_path / "a", workers=1, progress=False).converged
     small.assert_same_end(folder, tmp_path / "a")
@@ -252,7 +253,7 @@ def test_without_convergence_the_draws_and_the_chains_figures_stay(folder: Path)
     assert made.draws.attrs["converged"] == 0
     assert made.plot.trace().axes
     for text in (repr(made), made._repr_html_()):
-        assert "NOT CONVERGED: budget of 25 steps used up; no interval is given" in text
+        assert "NOT CONVERGED: budget of 25 steps used up; intervals are withheld" in text
         assert "95 %" not in text
 
 
@@ -264,7 +265,7 @@ def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.warns(bw.InputWarning, match="not converged: budget of 25 steps") as caught:
+    with pytest.warns(bw.InputWarning, match="NOT CONVERGED: budget of 25 steps") as caught:
         made = bw.fit(record, **keys | {"steps": 25})
     assert {__file__} == {warning.filename for warning in caught}
     assert not made.converged
@@ -301,18 +302,18 @@ def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None
     assert other.displacement is not None
     turned = replace(other, displacement=-other.displacement)
     with pytest.warns(
-        bw.InputWarning, match="sine, not fitted: does not hold: .*against"
+        bw.InputWarning, match=r"VALIDATION FAILED: sine \(separate record\): the readings fall"
     ) as caught:
         bands = opened.predict(turned, from_rest=True, name="sine")
     assert {__file__} == {warning.filename for warning in caught}
     assert bands.holds is False
-    assert "DOES NOT HOLD" in repr(bands)
+    assert "VALIDATION FAILED" in repr(bands)
 
 
 def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
     made = opened.problem.record
     plan = replace(made, voltage=5 * made.voltage, displacement=None, truth=None)
-    with pytest.warns(bw.InputWarning, match="plan: the voltage .* are an extrapolation"):
+    with pytest.warns(bw.InputWarning, match="plan: voltage .* the bands extrapolate"):
         bands = opened.predict(plan, from_rest=True, name="plan")
     assert bands.scores is None
     assert bands.holds is None
@@ -374,7 +375,7 @@ def test_the_columns_of_a_file_are_recognised(
         header="t [ms],U [V],pos",
         comments="",
     )
-    with pytest.raises(bw.InputError, match="pos: no unit of the displacement in its name"):
+    with pytest.raises(bw.InputError, match="which unit has 'pos'"):
         bw.fit(tmp_path / "lab.csv")
     with pytest.raises(InterruptedError) as seen:
         bw.fit(tmp_path / "lab.csv", units={"displacement": "um"})

@@ -54,7 +54,7 @@ def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Problem) ->
     made = RunFolder.create(path, problem, overwrite=False)
     made.chain.write_bytes(b"draws")
     before = content(path)
-    assert_refused(path, problem, overwrite=False, why=f"go on with `bwbayes resume {path}`")
+    assert_refused(path, problem, overwrite=False, why=rf"`bwbayes\.resume_run\('{path}'\)`")
     assert before == content(path)
     RunFolder.create(path, problem, overwrite=True)
     assert not made.chain.exists()

@@ -98,8 +98,8 @@ def test_records_have_names_starts_and_truths_of_their_own() -> None:
     assert truth["offset[loops]"] == truth["offset[step]"] == 0.0
     (label,) = {p.label for p in made.parameters if p.name == "offset[step]"}
     assert label == r"y_0^{\mathrm{step}}"
-    assert made.windows("loops") == {"loops": slice(0, 150), "later": slice(150, 200)}
-    assert made.windows("step") == {"step": slice(0, 99)}
+    assert made.windows("loops") == {"loops": (slice(0, 150),), "later": (slice(150, 200),)}
+    assert made.windows("step") == {"step": (slice(0, 99),)}
 
 
 def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:

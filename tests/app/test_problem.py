@@ -67,15 +67,15 @@ def test_held_out_voltage_beyond_the_fitted_one_is_remarked_on(folder: Path) -> 
     text = RECORD + "train = [[0, 3.0]]\n[validation.rest]\nwindow = "
     # Jumps of up to 160 V are also faster than those of up to 100 V.
     remark, faster = beyond(of(text + "[3.0, 4.0]", folder))
-    assert remark.startswith("rest: the voltage goes from -")
-    assert "V were fitted: beyond that the bands are an extrapolation" in remark
-    assert "V/s were fitted: faster than that the bands are an extrapolation" in faster
+    assert remark.startswith("rest: voltage -")
+    assert "exceeds the training range" in remark
+    assert "V/s of training; the bands extrapolate" in faster
     assert [] == beyond(of(RECORD + "train = [[0, 4.0]]", folder))
 
 
 def beyond(problem: Problem) -> list[str]:
     """Return the remarks on an extrapolation."""
-    return [remark for remark in problem.remarks if "extrapolation" in remark]
+    return [remark for remark in problem.remarks if "extrapolate" in remark]
 
 
 def by_name(problem: Problem) -> dict[str, Parameter]:
@@ -168,7 +168,7 @@ def test_resolved_config_resolves_to_the_same_numbers(
     assert first.posterior.only.training == again.posterior.only.training
     for name, one in first.validations.items():
         other = again.validations[name]
-        assert (one.window, one.start) == (other.window, other.start)
+        assert (one.windows, one.start) == (other.windows, other.start)
         if one.record is not None and other.record is not None:
             assert one.record.sha256 == other.record.sha256
     z = np.random.default_rng(1).standard_normal((5, first.posterior.prior.dimensions))

@@ -403,7 +403,7 @@ def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder)
 
 def test_unfinished_run_is_not_drawn(copy: RunFolder) -> None:
     copy.summary.unlink()
-    with pytest.raises(InputError, match="not finished; go on with `bwbayes resume"):
+    with pytest.raises(InputError, match=r"not finished; go on with `bwbayes\.resume_run"):
         redraw(copy)
 
 
@@ -416,24 +416,26 @@ def test_chain_without_draws_predicts_nothing(
     watch_until(monkeypatch, "pilot", 5)
     with pytest.raises(KeyboardInterrupt):
         carry_on(made, small.quiet(), workers=1)
-    with pytest.raises(InputError, match="no draws yet; go on with `bwbayes resume"):
+    with pytest.raises(InputError, match=r"no draws yet; go on with `bwbayes\.resume_run"):
         module.finished(made)
 
 
 def test_fit_that_misses_its_own_readings_does_not_hold(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert () == redraw(copy).failed
-    monkeypatch.setattr("bwbayes.results.verdict.POOR", 1e-4)
-    (verdict,) = redraw(copy).failed
-    assert "training" == verdict.name
-    assert "the mean misses the readings that were fitted by" in verdict.reasons[0]
+    assert () == redraw(copy).standing.lines
+    said = ["NRMSE 9% on the training readings"]
+    monkeypatch.setattr("bwbayes.results.verdict.missed", lambda *_: said)
+    again = redraw(copy)
+    assert again.standing.holds is False
+    verdict = again.verdicts["training"]
+    assert "on the training readings" in verdict.reasons[0]
     row = small.numbers(copy.path)["validation"]["training"]
     assert row["holds"] is False
     assert list(verdict.reasons) == row["reasons"]
     assert row["remedy"]
     page = (copy.path / "report.html").read_text(encoding="utf-8")
-    assert 0 < page.index("DOES NOT HOLD") < page.index("Parameters")
+    assert 0 < page.index("VALIDATION FAILED") < page.index("Parameters")
     assert 3 == finish(copy.path, 1, quiet=True)
 
 

@@ -15,8 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.data import Record, read_record
-from bwbayes.data.io.columns import UNITS, Naming, recognised, unit_in
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.data.io.columns import Naming, choose, unit_in
+from bwbayes.data.io.series import Series, Source
+from bwbayes.errors import ColumnsError, InputError, InputWarning
+
+PREFIXES = ("", "n", "u", "µ", "μ", "m", "k")
 
 TIME = np.arange(200) / 100
 VOLTAGE = 50 * np.sin(6 * TIME)
@@ -68,15 +71,15 @@ def test_a_matlab_files_own_columns_are_read(tmp_path: Path) -> None:
         (
             {"displacement": "poss"},
             UNIT,
-            "no column 'poss' for the displacement; did you mean 'pos'",
+            "no column 'poss' for the displacement; choose one of There are 200 values each: '",
         ),
-        ({"displacement": "laser"}, UNIT, "no column 'laser' .*; there are '.*'"),
         (
             {},
             {},
-            "pos: no unit of the displacement in its name; write it there, or say units = { d",
+            r"which unit has 'pos' \(displacement\)\? There .* 'pos' \(-3.*; say .*units={'displ",
         ),
-        ({}, {"displacement": "pm"}, "units: displacement in 'pm' is unknown; write one of um"),
+        ({}, {"displacement": "in"}, "units: displacement in 'in' is unknown; write um, nm, mm, m"),
+        ({}, UNIT | {"displacement": "s"}, "units: displacement in 's' is unknown"),
         ({"position": "pos"}, UNIT, "columns: no quantity 'position'; write time, voltage, disp"),
         ({"voltage": "pos"}, UNIT, "columns: two quantities have the same column"),
         ({}, UNIT | {"time": "-s"}, "units: time does not run backwards"),
@@ -95,7 +98,7 @@ def test_columns_are_recognised_where_none_are_said(tmp_path: Path, suffix: str)
     units = UNIT | ({"time": "ms"} if suffix == ".mat" else {})
     path = write(tmp_path / f"a{suffix}")
     assert_same(read_record(path, units=units))
-    with pytest.raises(InputError, match=r": (pos|x|t): no unit of the (displacement|time) in its"):
+    with pytest.raises(InputError, match=r"which unit has .*'(pos|x)' \(displacement\)\?"):
         read_record(path)
 
 
@@ -121,6 +124,60 @@ def test_the_packages_own_names_come_before_others(tmp_path: Path) -> None:
     assert_same(read_record(path))
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".h5", ".mat"])
+def test_all_that_is_missing_is_said_at_once(tmp_path: Path, suffix: str) -> None:
+    """With a guess that reads the file, in the words of Python, a config and the command line."""
+    path = tmp_path / f"a{suffix}"
+    arrays = {"clock": 1e3 * TIME, "amp": VOLTAGE, "laser": DISPLACEMENT}
+    if suffix == ".csv":
+        rows = [",".join(map(repr, row)) for row in np.stack([*arrays.values()], axis=1).tolist()]
+        path.write_text("\n".join([",".join(arrays), *rows]) + "\n")
+    elif suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+    else:
+        scipy.io.savemat(path, arrays)
+    with pytest.raises(ColumnsError) as caught:
+        read_record(path)
+    error = caught.value
+    said = str(error)
+    assert "which column is the time, which the voltage, which the displacement?" in said
+    for name in arrays:
+        assert f"'{name}' (" in said
+    assert "units={'time': 's', 'voltage': 'V', 'displacement': 'um'}" in said
+    assert "under [record] say columns = { time = " in str(error.in_config())
+    command = str(error.in_command("bwbayes run a.csv"))
+    assert "copy and correct: bwbayes run a.csv --column time=" in command
+    assert command.endswith("--unit time=s --unit voltage=V --unit displacement=um")
+    assert_same(
+        read_record(
+            path,
+            columns=dict(zip(("time", "voltage", "displacement"), arrays, strict=True)),
+            units={"time": "ms", "voltage": "V", "displacement": "um"},
+        )
+    )
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5"])
+def test_a_column_goes_by_its_number_too(tmp_path: Path, suffix: str) -> None:
+    # HDF5 sorts by name.
+    numbers = ("3", "1", "2") if suffix == ".h5" else ("1", "2", "3")
+    columns = dict(zip(("time", "voltage", "displacement"), numbers, strict=True))
+    assert_same(read_record(write(tmp_path / f"a{suffix}"), columns=columns, units=UNIT))
+
+
+def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = [f"{v!r},{d!r}" for v, d in zip(VOLTAGE.tolist(), DISPLACEMENT.tolist(), strict=True)]
+    path.write_text("\n".join(["voltage_V,displacement_um", *rows]) + "\n")
+    with pytest.raises(InputError, match=r"no column for the time; .* the sampling rate, fs"):
+        read_record(path)
+    assert_same(read_record(path, fs=100.0))
+    with pytest.raises(InputError, match=r"fs: 0 Hz is no sampling rate"):
+        read_record(path, fs=0.0)
+
+
 def test_a_column_that_is_mapped_counts_and_its_namesake_does_not(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = [f"{t},{v},{2 * v},{d}" for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)]
@@ -133,8 +190,8 @@ def test_a_column_that_is_mapped_counts_and_its_namesake_does_not(tmp_path: Path
 
 
 @given(
-    st.sampled_from([(quantity, unit) for quantity in ("time", "voltage", "displacement")
-                     for unit in UNITS[quantity]]),
+    st.sampled_from([("time", f"{p}s") for p in PREFIXES] + [("voltage", f"{p}V") for p in PREFIXES]
+                    + [("displacement", f"{p}m") for p in PREFIXES]),
     st.sampled_from(["{} [{}]", "{} ({})", "{}_{}", "{} / {}", "{}[{}]", "{} {}"]),
     st.text("abcdefgh 1", min_size=1).map(str.strip).filter(bool),
 )  # fmt: skip
@@ -159,21 +216,21 @@ def test_a_name_without_a_unit_has_none(name: str) -> None:
     ],
 )
 def test_columns_are_recognised(names: list[str], expected: list[str] | None) -> None:
-    assert recognised(names) == dict(
-        zip(("time", "voltage", "displacement"), expected or names, strict=True)
-    )
+    source = Source(Path("a"), tuple(Series(name, 9, lambda: np.arange(9.0)) for name in names))
+    quantities = ("time", "voltage", "displacement")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        units = dict(zip(quantities, ("s", "V", "um"), strict=True))
+        chosen = choose(source, Naming(units=units))
+    assert dict(zip(quantities, expected or names, strict=True)) == {
+        quantity: series.name for quantity, (series, _) in chosen.items()
+    }
 
 
 def test_what_two_columns_may_be_is_left_open() -> None:
     names = ["t_s", "a_V", "b_V", "c_um", "d_um"]
-    assert {"time": "t_s"} == recognised(names)
-    with pytest.raises(InputError, match=r"which column is the voltage\? There are 'a_V', 'b_V'"):
+    with pytest.raises(InputError, match=r"which column is the voltage\? There are 20 values each"):
         Record.from_pandas(pd.DataFrame(np.ones((20, 5)), columns=names))
-
-
-def test_the_packages_own_names_need_no_mapping() -> None:
-    assert ("voltage", -3, 1) == Naming().of("voltage_mV")
-    assert ("displacement", 0, -1) == Naming(units={"displacement": "-um"}).of("displacement_um")
 
 
 # Arrays and tables
@@ -182,6 +239,69 @@ def test_the_packages_own_names_need_no_mapping() -> None:
 def test_arrays_are_a_record() -> None:
     assert_same(Record.from_arrays(VOLTAGE.tolist(), DISPLACEMENT, interval=0.01))
     assert Record.from_arrays(VOLTAGE, interval=0.01).displacement is None
+
+
+@pytest.mark.parametrize("time_unit", ["s", "ms", "us"])
+@pytest.mark.parametrize(("length", "scale"), [("nm", 1e3), ("-nm", -1e3), ("mm", 1e-3)])
+def test_arrays_may_have_times_and_units(time_unit: str, length: str, scale: float) -> None:
+    """As the columns of a file have, and the same numbers to the last bit."""
+    power = {"s": 1.0, "ms": 1e3, "us": 1e6}[time_unit]
+    units = {"time": time_unit, "displacement": length, "voltage": "mV"}
+    time, voltage, displacement = power * TIME, 1e3 * VOLTAGE, scale * DISPLACEMENT
+    record = Record.from_arrays(voltage, displacement, time=time.tolist(), units=units)
+    assert_same(record)
+    frame = pd.DataFrame({"time": time, "voltage": voltage, "displacement": displacement})
+    assert record.sha256 == Record.from_pandas(frame, units=units).sha256
+    plan = Record.from_arrays(voltage, time=time, units=units)
+    assert (plan.displacement, plan.interval) == (None, record.interval)
+
+
+def test_the_units_of_arrays_go_with_an_interval_too() -> None:
+    record = Record.from_arrays(
+        VOLTAGE, 1e3 * DISPLACEMENT, interval=0.01, start=2.0, units={"displacement": "nm"}
+    )
+    assert_same(record)
+    assert (2.0, "arrays") == (record.start, record.origin)
+
+
+def test_times_of_arrays_may_begin_anywhere_or_be_dates() -> None:
+    later = Record.from_arrays(VOLTAGE, DISPLACEMENT, time=TIME + 5.0)
+    assert later.start == 5.0
+    dates = np.datetime64("2024-01-01", "ns") + (TIME * 1e9).round().astype("timedelta64[ns]")
+    assert_same(Record.from_arrays(VOLTAGE, DISPLACEMENT, time=dates))
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({}, r"arrays: give either interval \(and start\), in s, or time, a vector"),
+        ({"interval": 0.01, "time": TIME}, "arrays: give either interval .*, or time, a vector"),
+        ({"time": TIME, "start": 1.0}, "arrays: give either interval .*, or time, a vector"),
+        ({"interval": 0.01, "units": {"time": "ms"}}, "arrays: units: interval is in s; leave"),
+        ({"time": TIME[1:]}, "time: 199 samples, voltage has 200; give the same"),
+        ({"time": TIME[::-1]}, "arrays:sample 1: time_s: time goes back from 1.99 s to 1.98 s"),
+        ({"time": TIME**2}, "arrays:sample .*: time_s: .*resample it on a uniform grid"),
+        ({"time": ["a"] * 200}, "time: not numbers"),
+        ({"time": np.full(200, np.nan)}, "time: nan at sample 0; give finite numbers"),
+        ({"time": TIME, "units": {"displacement": "inch"}}, "displacement in 'inch' is unknown"),
+        ({"time": TIME, "units": {"speed": "m"}}, "units: no quantity 'speed'; write time"),
+        ({"interval": -1.0}, "interval: -1.0 s is not a positive time"),
+    ],
+)
+def test_times_and_units_that_cannot_be_are_one_line(options: dict[str, Any], line: str) -> None:
+    with pytest.raises(InputError, match=line):
+        Record.from_arrays(VOLTAGE, DISPLACEMENT, **options)
+
+
+def test_samples_missing_between_times_are_held_in_a_command() -> None:
+    kept = np.r_[:50, 60:200]
+    with pytest.raises(InputError, match=r"arrays:sample 50: time_s: gap of 0.11 s after 0.49 s"):
+        Record.from_arrays(VOLTAGE[kept], DISPLACEMENT[kept], time=TIME[kept])
+    with pytest.warns(InputWarning, match="10 samples are missing"):
+        held = Record.from_arrays(
+            VOLTAGE[kept], DISPLACEMENT[kept], time=TIME[kept], voltage_is="command"
+        )
+    assert (200, 190) == (held.samples, held.readings)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +353,7 @@ def test_a_table_may_have_dates_for_times(kind: str) -> None:
     [
         (
             {"displacement": "poss"},
-            "DataFrame: no column 'poss' for the displacement; did you mean",
+            "DataFrame: no column 'poss' for the displacement; choose one of There are 200 values",
         ),
         ({"displacement": "U_mV"}, "columns: two quantities have the same column"),
     ],

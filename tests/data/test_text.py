@@ -75,6 +75,18 @@ def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None
         GOOD.replace(",", ";").replace(".", ",").encode(),
         GOOD.replace(",", "\t").replace(".", ",").encode(),
         GOOD.replace(",", " , ").encode(),
+        GOOD.replace(",", " ").encode(),
+        GOOD.replace(",", "  ").replace("\n", "\n  ").rstrip(" ").encode(),
+        GOOD.replace(",", "|").encode(),
+        "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]).encode(),
+        ("# " + GOOD).encode(),
+        GOOD.encode("utf-16"),
+        GOOD.encode("utf-16-le"),
+        GOOD.encode("utf-16-be"),
+        GOOD.replace("_um", "_µm").encode("cp1252"),
+        GOOD.replace("_um", " [µm]").replace("time_s", "Zeit / s").encode("cp1252"),
+        GOOD.replace(HEADER, "time,voltage,displacement\n(s),(V),(um)\n").encode(),
+        GOOD.replace(HEADER, "time,voltage,displacement\nsecond,Volt,micron").encode(),
         GOOD.replace("_um", "_µm").encode(),
         GOOD.replace("_um", "_\u03bcm").encode(),
         GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
@@ -90,7 +102,19 @@ def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None
         "semicolons",
         "decimal-commas",
         "tabs",
+        "blanks beside commas",
         "blanks",
+        "blanks and indented",
+        "bars",
+        "semicolons below",
+        "header in a comment",
+        "utf-16",
+        "utf-16-le",
+        "utf-16-be",
+        "cp1252",
+        "cp1252 and other names",
+        "units in a line",
+        "units in words",
         "micro",
         "mu",
         "case",
@@ -129,7 +153,7 @@ def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path:
 
 def test_a_planned_voltage_is_accepted_only_when_asked_for(tmp_path: Path) -> None:
     planned = "\n".join(line.rpartition(",")[0] for line in LINES)
-    assert "record.csv:1: displacement_um: missing" in fault(tmp_path, planned)
+    assert "record.csv:1: no column for the displacement; add it" in fault(tmp_path, planned)
     assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
 
 
@@ -141,9 +165,9 @@ def test_a_planned_voltage_is_accepted_only_when_asked_for(tmp_path: Path) -> No
         ("0x10", "'0x10' is not a number"),
         ("1_000", "'1_000' is not a number"),
         ("1;5", "'1;5' is not a number"),
-        ("inf", "'inf' is not a finite number"),
-        ("-Infinity", "'-Infinity' is not a finite number"),
-        ("1e999", "'1e999' is too large"),
+        ("inf", "inf is not a finite number"),
+        ("-Infinity", "-inf is not a finite number"),
+        ("1e999", "inf is not a finite number"),
         ("1e12", "1e+12 is absurdly large"),
     ],
 )
@@ -157,19 +181,12 @@ def test_a_bad_cell_is_named_by_line_and_column(
 
 
 @pytest.mark.parametrize("column", [0, 1])
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("", "empty cell; give one at every sample (only a displacement may be missing"),
-        ("  ", "empty cell; give one at every sample"),
-        ("nan", "'nan' is not a finite number; give one at every sample"),
-        ("-NaN", "'-NaN' is not a finite number; give one at every sample"),
-    ],
-)
+@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN", "#N/A"])
 def test_a_time_and_a_voltage_are_needed_at_every_sample(
-    tmp_path: Path, column: int, text: str, problem: str
+    tmp_path: Path, column: int, text: str
 ) -> None:
     where = f"record.csv:17: {HEADER.split(',')[column]}: "
+    problem = "no number (empty or nan); give one at every sample (only a displacement may be miss"
     assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 
 
@@ -260,38 +277,32 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
     (
         "missing field",
         cell(9, 1, "1").replace(",1,", ","),
-        "record.csv:9: displacement_um: missing",
+        "record.csv:9: missing field, 2 fields for 3 columns; complete the line",
     ),
-    ("extra field", cell(9, 2, "1.5,2.5"), "record.csv:9: field 4: extra field '2.5'"),
-    ("decimal comma", cell(9, 1, "1,5"), "record.csv:9: voltage_V: decimal comma or extra"),
+    ("extra field", cell(9, 2, "1.5,2.5"), "record.csv:9: extra field '2.5', 4 fields for"),
+    ("decimal comma", cell(9, 1, "1,5"), "record.csv:9: decimal comma or extra field"),
     (
         "all decimal commas",
         "\n".join([HEADER] + [row.replace(".", ",") for row in ROWS]),
-        "record.csv:2: time_s: decimal comma, 6 fields",
+        "record.csv:2: decimal commas, 6 fields for 3 columns; separate them by semicolons",
     ),
     (
         "two decimal commas",
         cell(9, 1, "1.5.5").replace(",", ";").replace(".", ","),
-        "record.csv:9: voltage_V: '1.5.5' is not a number",
-    ),
-    ("blanks", GOOD.replace(",", " "), "record.csv:1: blanks"),
-    (
-        "semicolons below",
-        "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]),
-        "record.csv:2: semicolons",
+        "record.csv:9: voltage_V: '1,5,5' is not a number",
     ),
     ("empty line", edited(lambda x: [*x[:8], "", *x[8:]]), "record.csv:9: empty line"),
     ("comment below", edited(lambda x: [*x[:8], "# x", *x[8:]]), "record.csv:9: comment"),
     (
         "time goes back",
         edited(lambda x: [*x[:8], x[5], *x[9:]]),
-        "record.csv:9: time_s: time goes back from 0.03 s to 0.02 s",
+        "record.csv:9: time_s: time goes back from 0.030 s to 0.020 s",
     ),
-    ("repeated", edited(lambda x: x[:8] + x[7:]), "record.csv:9: time_s: 0.03 s is repeated"),
+    ("repeated", edited(lambda x: x[:8] + x[7:]), "record.csv:9: time_s: 0.030 s is repeated"),
     (
         "gap",
         edited(lambda x: x[:8] + x[12:]),
-        "record.csv:9: time_s: gap of 0.025 s after 0.03 s, about 4 missing",
+        "record.csv:9: time_s: gap of 0.025 s after 0.030 s, about 4 missing",
     ),
     (
         "gap before the last sample",
@@ -301,7 +312,7 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
     (
         "gap after the first sample",
         edited(lambda x: x[:2] + x[3:]),
-        "record.csv:3: time_s: gap of 0.01 s after 0 s, about 1 missing",
+        "record.csv:3: time_s: gap of 0.01 s after 0.000 s, about 1 missing",
     ),
     (
         "irregular by the last decimal",
@@ -314,49 +325,57 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "record.csv:9: time_s: irregular sampling: 0.0052 s",
     ),
     (
-        "text above the header",
-        f"bench 2, 3 May\nby: me\n\n{GOOD}",
-        "record.csv:1: the header is in line 4; remove the lines above it",
+        "header missing",
+        "\n".join(ROWS),
+        "record.csv: which column is the time, which the voltage, which the displacement? There "
+        "are 30 values each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.8"
+        "8 to 20); say columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
     ),
-    ("header missing", "\n".join(ROWS), "record.csv:1: the header is missing"),
     (
         "column unknown",
         edited(lambda x: ["time_s,drift_V,displacement_um,mean_V", *(f"{r},1" for r in x[1:])]),
-        "record.csv:1: which column is the voltage? There are 'drift_V', 'mean_V'; say columns = {",
+        "record.csv:1: which column is the voltage? There are 30 values each: 'time_s' (0 to ",
     ),
-    ("column without unit", GOOD.replace("voltage_V", "voltage"), "record.csv:1: voltage: no unit"),
+    (
+        "column without unit",
+        GOOD.replace("voltage_V", "voltage"),
+        "record.csv:1: which unit has 'voltage' ",
+    ),
     (
         "unit unknown",
         GOOD.replace("voltage_V", "voltage_v"),
-        "record.csv:1: voltage_v: unknown unit 'v'; write one of V, mV",
+        "record.csv:1: which unit has 'voltage_v' (voltage)? There are",
     ),
     (
         "column without name",
         GOOD.replace("voltage_V", ""),
-        "record.csv:1: which column is the voltage? There are 'column 2'",
+        "record.csv:1: which column is the voltage? There are 30 values each: 'time_s'",
     ),
     ("duplicate", GOOD.replace("_um", "_nm").replace("time_s", "displacement_um"), "record.csv:1"),
-    ("truth", GOOD.replace("displacement_um", "truth_um"), "record.csv:1: truth_um: unknown"),
+    ("truth", GOOD.replace("displacement_um", "truth_um"), "record.csv:1: no column for the disp"),
     (
         "column missing",
         "\n".join(line.partition(",")[2] for line in LINES),
-        "record.csv:1: time_s: missing; add it",
+        "record.csv:1: no column for the time; add it (or give the sampling rate, fs)",
     ),
     ("empty file", "", "record.csv: the file is empty"),
     ("blank file", " \n\n", "record.csv: the file is empty"),
-    ("header alone", HEADER, "record.csv:1: no samples"),
-    ("header alone, ended", HEADER + "\n\n", "record.csv:1: no samples"),
+    ("header alone", HEADER, "record.csv: no columns of numbers in it"),
+    ("header alone, ended", HEADER + "\n\n", "record.csv: no columns of numbers in it"),
     ("few samples", "\n".join(LINES[:6]), "record.csv: too short, samples: 5"),
     ("one sample", "\n".join(LINES[:2]), "record.csv: too short, samples: 1"),
-    ("cut in a field", GOOD[:-3], "record.csv:31: displacement_um: the last line is cut off"),
-    ("cut behind a sign", GOOD[:-8], "record.csv:31: displacement_um: the last line is cut off"),
-    ("cut to two fields", GOOD[:-12], "record.csv:31: displacement_um: the last line is cut off"),
-    ("cut and ended", GOOD[:-12] + "\n", "record.csv:31: displacement_um: the last line is cut"),
-    ("NUL", cell(9, 1, "\0"), "record.csv:9: NUL byte"),
-    ("UTF-16", GOOD.encode("utf-16"), "record.csv: the text is UTF-16"),
-    ("UTF-16 without BOM", GOOD.encode("utf-16-le"), "record.csv:1: NUL byte"),
-    ("Latin-1", cell(9, 1, "\xb5").encode("latin-1"), "record.csv:9: byte 0xb5 is not UTF-8"),
-    ("a picture", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "record.csv:1: byte 0x89"),
+    ("cut in a field", GOOD[:-3], "record.csv:31: the last line is cut off"),
+    ("cut behind a sign", GOOD[:-8], "record.csv:31: the last line is cut off"),
+    ("cut to two fields", GOOD[:-12], "record.csv:31: the last line is cut off"),
+    ("cut and ended", GOOD[:-12] + "\n", "record.csv:31: the last line is cut off (2 fields"),
+    ("NUL", cell(9, 1, "\0"), "record.csv:9: voltage_V: "),
+    ("Latin-1", cell(9, 1, "\xb5").encode("latin-1"), "record.csv:9: voltage_V: "),
+    ("a picture", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "record.csv: neither text nor HDF5"),
+    (
+        "a workbook",
+        b"PK\3\4" + bytes(range(256)),
+        "record.csv: a workbook or an archive; export it",
+    ),
     (
         "constant voltage",
         "\n".join([HEADER] + [f"{i / 100},1.5,{i}" for i in range(20)]),
@@ -390,7 +409,7 @@ def test_each_fault_is_one_line_with_its_place(
         ("none.csv", "does not exist"),
         ("", "is a directory"),
         ("folder.csv", "is a directory"),
-        ("record.xyz", "unknown suffix '.xyz'"),
+        ("record.xyz", "the file is empty"),
         ("bad\0name.csv", "does not exist"),
     ],
 )

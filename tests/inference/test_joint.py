@@ -218,7 +218,7 @@ def test_outliers_are_found_in_the_record_that_has_them() -> None:
     spoilt = SLOW.displacement.copy()
     spoilt[40] += 60.0
     both = joint(LOOPS, replace(SLOW, displacement=spoilt))
-    aside = outliers(both, np.random.default_rng(6))
+    aside = outliers(both.without, np.random.default_rng(6))
     assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
 
 

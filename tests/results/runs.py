@@ -173,8 +173,8 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     """
     posterior, record = problem.posterior, problem.record
     draws = posterior_draws(posterior, source)
-    windows = {"training": posterior.only.training[0]}
-    windows |= {n: v.window for n, v in problem.validations.items() if v.window is not None}
+    windows = {"training": posterior.only.training}
+    windows |= {name: v.windows for name, v in problem.validations.items() if v.windows}
     bands = predict_windows(posterior, draws, record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:

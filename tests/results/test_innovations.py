@@ -18,7 +18,8 @@ def along(white: FloatArray) -> Innovations:
     """Return innovations along a sine of 1 Hz at 200 Hz."""
     time = 0.005 * np.arange(white.size, dtype=np.float64)
     voltage = 100 * np.sin(2 * np.pi * time)
-    return Innovations(time, white, voltage, np.gradient(voltage) / 0.005)
+    rate = np.gradient(voltage) / 0.005
+    return Innovations(time, white, voltage, rate, 0.5 * white, 0.005)
 
 
 def test_innovations_of_the_right_model_raise_no_remark() -> None:

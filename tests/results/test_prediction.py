@@ -281,9 +281,9 @@ def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior
     record = made(start=0.7)
     centre = np.array([TRUTH[name] for name in posterior.names])
     same = np.tile(centre, (2000, 1))
-    begun = [start_of(posterior, same, record, Start(), seed) for seed in range(3)]
+    begun = [start_of(posterior, same, record, Start(lead_in=1.0), seed) for seed in range(3)]
     states = [initial(posterior, one) for one in begun]
-    window = Start().window(record)
+    window = Start(lead_in=1.0).window(record)
     assert window is not None
     assert record.displacement is not None
     theta = np.tile(posterior.prior.theta(centre[np.newaxis]), (8000, 1))
@@ -347,14 +347,14 @@ def test_a_lead_in_that_fits_passes_and_one_of_another_actuator_does_not(
 ) -> None:
     record = made(start=0.4)
     assert record.displacement is not None
-    good = predicted(posterior, draws, record, Start()).lead_in
+    good = predicted(posterior, draws, record, Start(lead_in=1.0)).lead_in
     drifting = replace(record, displacement=record.displacement + 40 * record.time**2)
     stretched = replace(record, displacement=1.5 * record.displacement)
     assert good is not None
     assert good.p_value > 0.01
     assert (good.start, good.stop, good.samples) == (0.0, 1.0, 100)
     for bad in (drifting, stretched):
-        told = predicted(posterior, draws, bad, Start()).lead_in
+        told = predicted(posterior, draws, bad, Start(lead_in=1.0)).lead_in
         assert told is not None
         assert told.p_value < 0.002
 
@@ -363,16 +363,21 @@ def test_a_window_of_another_record_is_that_part_of_the_whole(
     posterior: Posterior, draws: FloatArray
 ) -> None:
     record = made(start=0.4)
-    whole = predicted(posterior, draws, record, Start())
+    whole = predicted(posterior, draws, record, Start(lead_in=1.0))
     part = predict_record(
-        posterior, draws, record, Start(), np.random.default_rng(3), window=(3.0, 7.0)
+        posterior, draws, record, Start(lead_in=1.0), np.random.default_rng(3), window=(3.0, 7.0)
     )
     assert (100, 0) == (whole.scored_from, part.scored_from)
     for (name, expected), (_, got) in zip(whole.columns(), part.columns(), strict=True):
         np.testing.assert_allclose(expected[300:700], got, atol=accuracy(name), err_msg=name)
     with pytest.raises(InputError, match="lead-in leaves nothing of the window"):
         predict_record(
-            posterior, draws, record, Start(), np.random.default_rng(3), window=(0.0, 0.5)
+            posterior,
+            draws,
+            record,
+            Start(lead_in=1.0),
+            np.random.default_rng(3),
+            window=(0.0, 0.5),
         )
 
 

@@ -139,7 +139,15 @@ def test_bands_with_nothing_after_the_lead_in_are_refused() -> None:
 def test_the_summary_is_json_with_the_keys_of_summary_json() -> None:
     values = correlated(np.random.default_rng(2), 1)[0]
     summary = as_summary(score(bands_around(0 * values, values), np.random.default_rng(0)))
-    expected = {"nrmse", "max_error_um", "crps_um", "coverage", "coverage_error", "worst_second"}
+    expected = {
+        "nrmse",
+        "nrmse_full",
+        "max_error_um",
+        "crps_um",
+        "coverage",
+        "coverage_error",
+        "worst_second",
+    }
     expected |= {"log_score"}
     expected |= {f"{name}_{n}_um" for name in ("width", "interval_score") for n in (50, 90, 95)}
     read = json.loads(json.dumps(summary, allow_nan=False))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.results.bands import LeadIn
+from bwbayes.results.bands import LeadIn, Switched
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.results.records import Made, bands_of, made
 
@@ -167,7 +167,7 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
         verdict = assess(bands_of(wide), Background(record.memory, 0.0, FITTED))
         assert verdict is not None
         assert verdict.holds is False
-        assert "times as wide as the residuals are" in verdict.reasons[-1]
+        assert "times too wide" in verdict.reasons[-1]
 
 
 def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
@@ -175,7 +175,7 @@ def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     verdict = assess(bands_of(record), Background(1.0, 0.0, FITTED))
     assert verdict is not None
     assert verdict.holds is None
-    assert "too few to tell" in verdict.reasons[0]
+    assert "is too small to validate the bands" in verdict.reasons[0]
     assert verdict.cause is None
 
 
@@ -193,21 +193,43 @@ def test_missing_readings_are_not_judged() -> None:
     assert assess(replace(bands, measured=None), Background()) is None
 
 
-def test_a_lead_in_that_does_not_fit_is_the_first_reason() -> None:
+def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
+    """It is the likely cause where the bands fail after it."""
     record = made(np.random.default_rng(3), length=30)
     bands = replace(bands_of(record), scored_from=100)
-    for p_value, holds in ((1e-5, False), (0.01, True)):
+    background = Background(record.memory, 0.0, FITTED)
+    note = "the lead-in of 0 to 1 s does not fit the model (p < 0.001)"
+    for p_value, notes in ((1e-5, (note,)), (0.01, ())):
         lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=p_value)
-        background = Background(record.memory, 0.0, FITTED)
         verdict = assess(replace(bands, lead_in=lead), background)
         assert verdict is not None
-        assert verdict.holds is holds
+        assert verdict.holds is True
+        assert notes == verdict.notes
+    assert bands.measured is not None
+    shifted = replace(bands, measured=bands.measured + 5 * float(record.sds["sensor"].mean()))
     lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
+    verdict = assess(replace(shifted, lead_in=lead), background)
+    assert verdict is not None
+    assert verdict.holds is False
+    assert verdict.cause is not None
+    assert "lead-in" == verdict.cause.kind
+    assert "--lead-in-from" in verdict.cause.remedy
+
+
+@pytest.mark.parametrize(("size", "named"), [(7.35, False), (3.0, True)])
+def test_no_transient_is_named_that_is_far_larger_than_any_residual(
+    size: float, named: bool
+) -> None:
+    record = made(np.random.default_rng(3), 60, 0.01, 0.1, 0.3, 0.1, 0.03)
+    bands = replace(bands_of(record), scored_from=100)
+    assert bands.measured is not None
+    largest = float(np.max(np.abs(bands.measured - bands.mean)[100:]))
+    transient = Switched(size * largest / 1.17, 0.4, 20.0)
+    lead = LeadIn(0.0, 1.0, 100, 0.5, transient)
     verdict = assess(replace(bands, lead_in=lead), Background(record.memory, 0.0, FITTED))
     assert verdict is not None
-    assert "the lead-in of 0 to 1 s does not fit the model (p = 1e-05)" == verdict.reasons[0]
-    assert verdict.cause is not None
-    assert "--lead-in-from" in verdict.cause.remedy
+    assert verdict.holds is True
+    assert named == any("a transient of" in note for note in verdict.notes)
 
 
 def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
@@ -217,7 +239,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
     fitted = assess(bands_of(record, training=True), background)
     assert fitted is not None
     assert fitted.holds is False
-    assert "the mean misses the readings that were fitted by" in fitted.reasons[0]
+    assert "on the training readings" in fitted.reasons[0]
     other = assess(bands_of(record), background)
     assert other is not None
     assert other.holds is True

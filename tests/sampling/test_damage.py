@@ -93,8 +93,7 @@ def read_damaged(path: Path) -> ChainFile:
     assert "\n" not in text
     assert text.startswith(f"{path}: damaged (")
     assert text.endswith(
-        f"); the {kept} whole blocks before that are used, and `bwbayes resume` makes the others "
-        "again"
+        f"); the {kept} whole blocks before that are used, and resuming makes the others again"
     )
     return chain
 
@@ -288,8 +287,8 @@ def test_full_disk_is_told_in_one_line_and_the_chain_goes_on_when_there_is_room(
 ) -> None:
     path = tmp_path / "chain.h5"
     says = (
-        ": cannot be written (File too large); no block of the chain is lost: fix that, then go "
-        "on with `bwbayes resume`"
+        ": cannot be written (File too large); no block of the chain is lost: fix that, then "
+        "resume the run"
     )
     for size in (10_000, 50_000):  # not even the layout
         assert f"{path}{says}" == error_with_room_for(path, size)

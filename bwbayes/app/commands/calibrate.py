@@ -92,7 +92,7 @@ def _calibrate(
     try:
         calibration = carry_on(folder, console, workers=workers, count=replicates, how=how)
     except KeyboardInterrupt:
-        click.echo(f"interrupted; go on with `{folder.GO_ON} {folder.path}`", err=True)
+        click.echo(f"interrupted; go on with {folder.resuming}", err=True)
         return INTERRUPTED
     if not quiet:
         show_calibration(calibration, folder, Console())

@@ -41,8 +41,8 @@ def campaign(
     """Fit every record of a FOLDER as a run does, and put them side by side.
 
     The same command goes on after an interruption, and fits records that were added or changed.
-    Exit status: 2 if records were refused, else 4 if some did not converge, else 3 if bands do not
-    hold; every record is in the table in any case.
+    Exit status: 2 if records were refused, else 4 if some did not converge, else 3 if validation
+    failed for some, else 5 if it is inconclusive; every record is in the table in any case.
 
     Example: bwbayes campaign records/ --config my.toml --out results/batch
     """

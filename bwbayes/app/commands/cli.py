@@ -1,8 +1,9 @@
 """The command line: a thin layer over the package, a module for each command.
 
-Exit status 0: done, and converged. 2: input that cannot be used, said in one line. 3: converged,
-but bands do not hold on a record that was measured, fitted or not. 4: finished without converging,
-or a calibration not passed. 130: interrupted; what was computed is kept.
+Exit status 0: success. 2: invalid input, said in one line. 3: converged, but validation failed: the
+bands do not hold on a record that was measured, fitted or not. 4: not converged, or calibration
+failed. 5: converged, but validation is inconclusive. 130: interrupted; what was computed is kept.
+Commands that build on a run end with the status of that run.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from bwbayes.app.commands.run import resume, run
 from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
 from bwbayes.app.commands.simulate import simulate
 from bwbayes.app.commands.track import track
-from bwbayes.errors import InputError
+from bwbayes.app.commands.wording import as_typed
+from bwbayes.errors import ColumnsError, InputError
 
 __all__ = ["main"]
 
@@ -40,8 +42,9 @@ __all__ = ["main"]
 def cli() -> None:
     """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
-    Exit status: 0 done; 2 input that cannot be used; 3 converged, but the bands do not hold on a
-    record that was measured; 4 not converged, or a calibration not passed; 130 interrupted.
+    Exit status: 0 success; 2 invalid input; 3 validation failed; 4 not converged or calibration
+    failed; 5 validation inconclusive; 130 interrupted. Commands that build on a run end with the
+    status of that run.
     """
 
 
@@ -71,7 +74,7 @@ def _terminate(*_: object) -> None:
 
 
 def _one_line(message: Warning | str, *_: object, **__: object) -> str:
-    return f"bwbayes: {message}\n"
+    return f"bwbayes: {as_typed(str(message))}\n"
 
 
 def main() -> None:
@@ -81,9 +84,12 @@ def main() -> None:
     warnings.formatwarning = _one_line
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
-    except (InputError, click.ClickException) as error:
-        message = error.format_message() if isinstance(error, click.ClickException) else str(error)
-        click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
+    except InputError as error:
+        line = error.in_config() if isinstance(error, ColumnsError) else error
+        click.echo(f"bwbayes: {as_typed(str(line))}", err=True)
+        status = BAD_INPUT
+    except click.ClickException as error:
+        click.echo(f"bwbayes: {' '.join(error.format_message().split())}", err=True)
         status = BAD_INPUT
     except OSError as error:
         # A full disk, a folder that went away: what is on disk already stays whole.

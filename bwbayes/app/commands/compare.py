@@ -11,28 +11,21 @@ from bwbayes.app.commands.shared import (
     FILE,
     NOT_CONVERGED,
     WithParts,
+    conclude,
     executor_option,
     overwrite_option,
     quiet_option,
     workers_option,
 )
+from bwbayes.app.config.limits import USUAL_MODELS
 from bwbayes.errors import InputError
 
-__all__ = ["USUAL", "compare"]
-
-# What a config is run with if nothing else is asked for: from no hysteresis at all to the two ways
-# of remembering it, a state or a stack of turning points, without and with the asymmetry of
-# measured loops.
-USUAL = (
-    "linear; bouc-wen; bouc-wen + quadratic; bouc-wen + quadratic + cubic; "
-    "prandtl-ishlinskii + quadratic + cubic; maxwell-slip(thresholds=4) + quadratic; "
-    "maxwell-slip(thresholds=4) + quadratic + cubic"
-)
+__all__ = ["compare"]
 
 
 @click.command(cls=WithParts)
 @click.argument("paths", type=FILE, nargs=-1, required=True)
-@click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL}.")
+@click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL_MODELS}.")
 @click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
 @click.option("--future/--no-future", default=True, help="Whether to leave out the future, too.")
 @overwrite_option
@@ -64,7 +57,7 @@ def compare(
 
     console = Console(stderr=True, quiet=quiet)
     if models is None and len(paths) == 1 and paths[0].suffix == ".toml":
-        models = USUAL
+        models = USUAL_MODELS
     if models is None:
         if len(paths) < 2:
             raise InputError("compare: give two runs or more, or a CONFIG (.toml)")
@@ -91,7 +84,8 @@ def compare(
         )
     if not quiet:
         show_comparison(made, where, Console())
-    if made.recommended is not None:
-        return 0
-    click.echo("NOT CONVERGED: no model has converged, so none is recommended", err=True)
-    return NOT_CONVERGED
+    if made.recommended is None:
+        click.echo("NOT CONVERGED: no model has converged, so none is recommended", err=True)
+        return NOT_CONVERGED
+    # It is among what speaks against the recommendation.
+    return conclude(made.standing, say=quiet)

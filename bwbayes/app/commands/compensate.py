@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import click
 
@@ -11,15 +11,12 @@ from bwbayes.app.commands.shared import (
     FILE,
     capacitance_option,
     current_option,
+    hold_option,
     overwrite_option,
     slew_option,
     voltage_option,
 )
 from bwbayes.errors import InputError
-
-if TYPE_CHECKING:
-    from bwbayes.control.compensation import Choice
-    from bwbayes.control.wished import Reference
 
 __all__ = ["compensate"]
 
@@ -34,13 +31,17 @@ __all__ = ["compensate"]
 )
 @click.option("--amplitude", type=float, help="Of the shape, um.")
 @click.option("--frequency", type=float, help="Of the shape, or of a raster's lines, Hz.")
-@click.option("--middle", type=float, default=0.0, show_default=True, help="Of the shape, um.")
-@click.option("--periods", type=float, default=3.0, show_default=True, help="Periods, or lines.")
+@click.option("--middle", type=float, help="Of the shape, um; default: 0.")
+@click.option("--periods", type=float, help="Periods, or lines; default: 3.")
+@click.option("--levels", type=int, help="Steps of a staircase to either end; default: 5.")
 @click.option(
-    "--levels", type=int, default=5, show_default=True, help="Steps of a staircase to either end."
+    "--interval", type=float, help="Sampling interval of a shape, s; default: the record's."
 )
 @click.option(
-    "--smooth", type=float, help="Smooths the reference, s (sd); default: a shape's 0.01 periods."
+    "--smooth",
+    "smoothed",
+    type=float,
+    help="Smooths the reference, s (SD); default: a shape's 0.01 periods.",
 )
 @click.option(
     "--command",
@@ -49,8 +50,9 @@ __all__ = ["compensate"]
     show_default=True,
     help="Inverse of the mean model, or least expected squared error.",
 )
+@hold_option
 @click.option("--limit", type=float, help="Of the error, um; says how probably it is kept.")
-@click.option("--from-rest", is_flag=True, help="The actuator starts demagnetised at zero volts.")
+@click.option("--from-rest", is_flag=True, help="The actuator starts demagnetized.")
 @voltage_option
 @slew_option
 @current_option
@@ -59,61 +61,32 @@ __all__ = ["compensate"]
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option
 def compensate(
-    folder: Path, shape: str | None, reference: Path | None, out: Path | None, **options: Any
+    folder: Path,
+    shape: str | None,
+    reference: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    **options: Any,
 ) -> int:
     """Write the voltage that makes a displacement, with the model of the run in FOLDER.
 
-    The displacement is in a file, or one of the usual shapes. What the voltage will do is predicted
-    with its error; beside it stands what a linear command would do.
+    The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
+    zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
+    voltage will do is predicted with its error; beside it stands what a linear command would do.
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
     from bwbayes.app.jobs.at_work import drawn
-    from bwbayes.app.jobs.compensate import compensate_draws, reference_of
+    from bwbayes.app.jobs.compensate import compensate_draws
 
     if (shape is None) == (reference is None):
         raise InputError("compensate: give either a shape or --reference")
-    problem, flat = drawn(folder)
-    interval = problem.record.interval
-    if shape is None:
-        asked = reference_of(reference, interval, options["smooth"])
-    else:
-        asked = _shaped(shape, interval, options)
-    made = compensate_draws(
-        problem,
-        flat,
-        asked,
-        command=cast("Choice", options["command"]),
-        from_rest=options["from_rest"],
-        voltage=options["voltage"],
-        slew=options["slew"],
-        current=options["current"],
-        capacitance=options["capacitance"],
-        nearest=options["nearest"],
-        limit=options["limit"],
-    )
-    files = made.save(out or folder / "compensation" / asked.name, overwrite=options["overwrite"])
+    made = compensate_draws(*drawn(folder), shape or reference, **options)
+    name = made.reference.name
+    files = made.save(out or folder / "compensation" / name, overwrite=overwrite)
     for remark in made.remarks:
         click.echo(f"bwbayes: {remark}", err=True)
     click.echo(repr(made))
     for path in files:
         click.echo(f"wrote {path}")
     return 0
-
-
-def _shaped(shape: str, interval: float, options: dict[str, Any]) -> Reference:
-    from bwbayes.control.wished import shaped
-
-    for name in ("amplitude", "frequency"):
-        if options[name] is None:
-            raise InputError(f"compensate: a {shape} needs --{name}; give it")
-    return shaped(
-        shape,
-        interval,
-        options["amplitude"],
-        options["frequency"],
-        middle=options["middle"],
-        periods=options["periods"],
-        levels=options["levels"],
-        smoothed=options["smooth"],
-    )

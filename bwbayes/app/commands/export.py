@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import click
 
-from bwbayes.app.commands.shared import FILE, overwrite_option
-
-if TYPE_CHECKING:
-    from bwbayes.model.linear import Hold
+from bwbayes.app.commands.shared import FILE, hold_option, overwrite_option
 
 __all__ = ["export"]
 
@@ -22,30 +18,27 @@ __all__ = ["export"]
     "--voltage",
     type=(float, float),
     metavar="LOW HIGH",
-    help="Lowest and highest voltage that the inverse may give, V; default: what was fitted.",
+    help="Lowest and highest voltage of the inverse, V; default: what was fitted, and 0 V.",
 )
 @click.option(
     "--rate", type=float, help="The controller's samples a second; default: the record's."
 )
-@click.option(
-    "--hold",
-    type=click.Choice(["first", "zero"]),
-    help="The voltage between samples: straight lines, or held; default: as in the record.",
-)
+@hold_option
 @overwrite_option
 def export(
     folder: Path,
     out: Path | None,
     voltage: tuple[float, float] | None,
     rate: float | None,
-    hold: str | None,
+    hold: str,
     overwrite: bool,
 ) -> int:
     """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
 
-    It is the posterior's mean. The C file needs math.h alone and does a sample a call.
+    It is the posterior's mean. The C file needs math.h alone and does a sample a call. 0 um is
+    where the demagnetized actuator stands at zero volts.
 
-    Example: bwbayes export results/ring_bender --rate 1000 --hold zero
+    Example: bwbayes export results/ring_bender --rate 1000
     """
     from bwbayes.app.jobs.export import export as write
 
@@ -54,7 +47,7 @@ def export(
         out,
         voltage=voltage,
         rate=rate,
-        hold=cast("Hold | None", hold),
+        hold=hold,
         overwrite=overwrite,
     )
     if made.without_inverse is not None:

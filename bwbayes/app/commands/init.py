@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,8 @@ import click
 from rich.console import Console
 from rich.markup import escape
 
-from bwbayes.errors import InputError
+from bwbayes.app.commands.shared import NamingOptions, naming_options
+from bwbayes.errors import ColumnsError, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
@@ -22,36 +24,19 @@ CONFIG = ".toml"
 
 @click.command()
 @click.argument("record", type=click.Path(path_type=Path))
-@click.option(
-    "--unit",
-    "units",
-    multiple=True,
-    metavar="QUANTITY=UNIT",
-    help="A column's unit, if its name does not say it: displacement=nm; -nm turns the sign.",
-)
-@click.option(
-    "--column",
-    "columns",
-    multiple=True,
-    metavar="QUANTITY=NAME",
-    help="Which column holds the time, voltage or displacement, if its name does not say it.",
-)
+@naming_options
 @click.option(
     "--out", type=click.Path(path_type=Path), help="The config; default: NAME-OF-RECORD.toml."
 )
-def init(record: Path, units: tuple[str, ...], columns: tuple[str, ...], out: Path | None) -> int:
-    """Look at a RECORD and write a config for it, with comments.
+def init(record: Path, naming: NamingOptions, out: Path | None) -> int:
+    """Write a commented config for RECORD.
 
     Example: bwbayes init my_record.csv --unit displacement=nm
     """
-    from bwbayes.app.config.proposal import propose
-
     out = out or record.with_suffix(CONFIG)
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    said = [dict(_pair("--unit", text) for text in units)]
-    said += [dict(_pair("--column", text) for text in columns)]
-    made = propose(record, out.parent, *said)
+    made = _proposed(record, out.parent, naming, "init")
     try:
         out.write_text(made.text, encoding="utf-8")
     except OSError as error:
@@ -59,7 +44,7 @@ def init(record: Path, units: tuple[str, ...], columns: tuple[str, ...], out: Pa
     console = Console()
     _show(made, console)
     console.print(
-        f"wrote {out}; look at the record with `bwbayes check {out}`, then `bwbayes run {out}`",
+        f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`",
         highlight=False,
         markup=False,
         soft_wrap=True,
@@ -67,39 +52,54 @@ def init(record: Path, units: tuple[str, ...], columns: tuple[str, ...], out: Pa
     return 0
 
 
-def config_or_proposal(path: Path, console: Console, *, refuse: bool = True) -> Config:
+def config_or_proposal(
+    path: Path, naming: NamingOptions, console: Console, command: str, *, refuse: bool = True
+) -> tuple[Config, bool]:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
+
+    Return the config, and whether it is a proposal.
 
     Raises
     ------
     InputError
         The file cannot be used; or, if that is to be refused, a fit of the record is pointless.
     """
-    from bwbayes.data.io.formats import SUFFIXES
+    from bwbayes.app.config.config import is_config, load
 
-    if path.suffix.lower() not in SUFFIXES:
-        from bwbayes.app.config.config import load
-
-        return load(path)
-    from bwbayes.app.config.proposal import propose
-
-    made = propose(path, path.parent)
+    if is_config(path):
+        config = load(path)
+        if naming.given:
+            raise InputError(
+                f"{path}: --column, --unit and --fs are for a record; in a config say columns, "
+                "units and fs under [record]"
+            )
+        return config, False
+    made = _proposed(path, path.parent, naming, command)
     if refuse and made.pointless is not None:
         raise InputError(
             f"{path}: {made.pointless}; if the record is right as it is, write a config with "
             f"`bwbayes init {path}` and run that"
         )
     _show(made, console)
-    held = "held_out" in made.config.validation
-    train = ", ".join(f"{a:g} to {b:g} s" for a, b in made.config.records["record"].train or ())
-    rest = "the rest is held out" if held else "nothing is held out"
+    train = ", ".join(f"{a:g} to {b:g}" for a, b in made.config.records["record"].train or ())
+    held = "the rest" if "held_out" in made.config.validation else "nothing"
     console.print(
-        f"fitting {train}; {rest}; `bwbayes init {path}` writes this as a config",
+        f"training on {train} s, holding out {held}; save this config with `bwbayes init {path}`",
         highlight=False,
         markup=False,
         soft_wrap=True,
     )
-    return made.config
+    return made.config, True
+
+
+def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> Proposal:
+    """Propose a config; of unknown columns say the command that settles them."""
+    from bwbayes.app.config.proposal import propose
+
+    try:
+        return propose(path, where, naming.naming())
+    except ColumnsError as error:
+        raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
 
 
 def _show(made: Proposal, console: Console) -> None:
@@ -108,12 +108,5 @@ def _show(made: Proposal, console: Console) -> None:
 
     show_remarks(made.remarks, console)
     for one in made.findings:
-        text = f"{one.kind}: {one.text}\n    what to do: {one.remedy}"
+        text = f"{one.kind}: {one.text}\n    fix: {one.remedy}"
         console.print(escape(text), highlight=False, soft_wrap=True)
-
-
-def _pair(option: str, text: str) -> tuple[str, str]:
-    quantity, equals, value = text.partition("=")
-    if not equals:
-        raise InputError(f"init: {option} {text}: write {option} displacement=..., with a value")
-    return quantity.strip(), value.strip()

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.shared import FILE, overwrite_option
+from bwbayes.app.commands.shared import FILE, NamingOptions, naming_options, overwrite_option
 from bwbayes.errors import InputError
 
 __all__ = ["predict"]
@@ -17,10 +17,14 @@ __all__ = ["predict"]
 @click.command()
 @click.argument("folder", type=FILE)
 @click.option("--record", type=FILE, help="A record to predict; measured or a voltage alone.")
+@naming_options
 @click.option("--signal", "waveform", help="A signal to predict instead, by its name.")
 @click.option("--from-rest", is_flag=True, help="The record starts from a demagnetised actuator.")
 @click.option(
-    "--lead-in", type=float, default=1.0, show_default=True, help="Estimates the offset, s."
+    "--lead-in",
+    type=float,
+    help="Length of the lead-in, s, that estimates initial state and offset; default: a quarter of "
+    "the record, and ten correlation times of the discrepancy at most.",
 )
 @click.option(
     "--lead-in-from", type=float, help="Where the lead-in begins, s; default: the record's start."
@@ -41,9 +45,10 @@ __all__ = ["predict"]
 def predict(
     folder: Path,
     record: Path | None,
+    naming: NamingOptions,
     waveform: str | None,
     from_rest: bool,
-    lead_in: float,
+    lead_in: float | None,
     lead_in_from: float | None,
     window: tuple[float, float] | None,
     same_offset: bool,
@@ -54,8 +59,8 @@ def predict(
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
 
-    Beside the bands, their scores (JSON) and a picture. Exit status 3: the bands do not hold on
-    the record.
+    Beside the bands, their scores (JSON) and a figure. Exit status 3: validation failed on the
+    record; 5: it is inconclusive.
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
@@ -69,7 +74,7 @@ def predict(
             "predict: --window is for a --record; what comes after the training record is "
             "predicted whole"
         )
-    if not 0 < lead_in < math.inf:
+    if lead_in is not None and not 0 < lead_in < math.inf:
         raise InputError(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
@@ -81,6 +86,7 @@ def predict(
         begin,
         out,
         Console(),
+        naming=naming.naming(),
         window=window,
         of=training,
         overwrite=overwrite,

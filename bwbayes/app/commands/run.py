@@ -9,7 +9,15 @@ import click
 from rich.console import Console
 
 from bwbayes.app.commands.init import config_or_proposal
-from bwbayes.app.commands.shared import FILE, executor_option, finish, quiet_option, workers_option
+from bwbayes.app.commands.shared import (
+    FILE,
+    NamingOptions,
+    executor_option,
+    finish,
+    naming_options,
+    quiet_option,
+    workers_option,
+)
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.inference.engine import Engine
 
@@ -22,6 +30,7 @@ __all__ = ["resume", "run"]
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
+@naming_options
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing run.")
@@ -31,6 +40,7 @@ __all__ = ["resume", "run"]
 def run(
     config: Path,
     record: Path | None,
+    naming: NamingOptions,
     out: Path | None,
     seed: int | None,
     overwrite: bool,
@@ -38,15 +48,16 @@ def run(
     how: str | None,
     quiet: bool,
 ) -> int:
-    """Sample a posterior and predict, from a CONFIG in TOML, or from a record without one.
+    """Fit a model to a record: sample the posterior, predict, write the report.
+
+    CONFIG is a config in TOML, or a record without one.
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     from bwbayes.app.running.run import start
     from bwbayes.app.screen import show_priors, show_remarks
-    from bwbayes.data.io.formats import SUFFIXES
 
-    chosen = config_or_proposal(config, Console(quiet=quiet))
+    chosen, is_proposal = config_or_proposal(config, naming, Console(quiet=quiet), "run")
     if record is not None:
         chosen = chosen.with_record(record)
     if seed is not None:
@@ -56,7 +67,7 @@ def run(
     folder = start(chosen, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
 
     def show(problem: Problem) -> None:
-        if config.suffix.lower() not in SUFFIXES:  # of a record alone they are shown already
+        if not is_proposal:  # of a record alone they are shown already
             show_remarks(problem.remarks, Console())
         show_priors(problem.posterior.prior, Console())
 

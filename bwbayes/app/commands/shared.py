@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
 
+from bwbayes.errors import InputError
+
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
+    from bwbayes.data.io.columns import Naming
     from bwbayes.inference.engine import Engine
+    from bwbayes.results.standing import Standing
 
 __all__ = [
     "BAD_INPUT",
     "DOES_NOT_HOLD",
     "FILE",
+    "INCONCLUSIVE",
     "INTERRUPTED",
     "NOT_CONVERGED",
+    "NamingOptions",
     "WithParts",
     "capacitance_option",
+    "conclude",
     "current_option",
     "executor_option",
     "finish",
+    "hold_option",
+    "naming_options",
     "overwrite_option",
     "quiet_option",
     "slew_option",
@@ -34,6 +45,7 @@ __all__ = [
 BAD_INPUT = 2
 DOES_NOT_HOLD = 3
 NOT_CONVERGED = 4
+INCONCLUSIVE = 5
 INTERRUPTED = 130
 
 
@@ -50,6 +62,71 @@ class WithParts(click.Command):
             formatter.write_dl([(kind, ", ".join(names)) for kind, names in PARTS.items()])
 
 
+@dataclass(frozen=True)
+class NamingOptions:
+    """What the command line says of a record's columns, units and sampling rate."""
+
+    columns: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    fs: float | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether it says anything."""
+        return bool(self.columns or self.units or self.fs is not None)
+
+    def naming(self) -> Naming:
+        """Return what it says.
+
+        Raises
+        ------
+        InputError
+            A text that is no pair, a quantity or a unit that does not exist.
+        """
+        # Here, because it is slow to load.
+        from bwbayes.data.io.columns import Naming
+
+        columns = dict(_pair("--column", text) for text in self.columns)
+        units = dict(_pair("--unit", text) for text in self.units)
+        return Naming(columns, units, self.fs)
+
+
+def _pair(option: str, text: str) -> tuple[str, str]:
+    quantity, equals, value = text.partition("=")
+    if not equals:
+        raise InputError(f"{option} {text}: write {option} displacement=..., with a value")
+    return quantity.strip(), value.strip()
+
+
+def naming_options[**P, R](command: Callable[P, R]) -> Callable[P, R]:
+    """Add the options that say which columns of a record are meant, as the argument `naming`."""
+
+    @wraps(command)
+    def with_naming(*args: Any, **kwargs: Any) -> R:
+        said = (kwargs.pop(name) for name in ("columns", "units", "fs"))
+        return command(*args, naming=NamingOptions(*said), **kwargs)  # type: ignore[arg-type]
+
+    for option in (
+        click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column."),
+        click.option(
+            "--unit",
+            "units",
+            multiple=True,
+            metavar="QUANTITY=UNIT",
+            help="A column's unit, if the file does not state it; -nm turns the sign.",
+        ),
+        click.option(
+            "--column",
+            "columns",
+            multiple=True,
+            metavar="QUANTITY=NAME",
+            help="The column of time, voltage or displacement: a name, or a number from 1 on.",
+        ),
+    ):
+        with_naming = option(with_naming)
+    return with_naming
+
+
 FILE = click.Path(path_type=Path)
 workers_option = click.option(
     "--workers", type=click.IntRange(1), help="Ensembles side by side; default: all cores."
@@ -59,6 +136,13 @@ executor_option = click.option(
     "how",
     metavar="KIND",
     help="local (default), threads, processes, dask, or dask://HOST:PORT.",
+)
+hold_option = click.option(
+    "--hold",
+    metavar="zoh|foh",
+    default="zoh",
+    show_default=True,
+    help="Voltage between samples: held, as a DAC does (zoh), or straight lines (foh).",
 )
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 voltage_option = click.option(
@@ -115,18 +199,19 @@ def finish(
         return INTERRUPTED
     if not quiet:
         show_result(result, folder, Console())
-    if result.failed:
-        first, *others = result.failed
-        more = f", and {len(others)} more" if others else ""
-        # The screen begins with all of them.
-        said = first.line if quiet else f"{first.name}{more}"
-        click.echo(f"DOES NOT HOLD: {said}; see {path}/report.html", err=True)
-        return DOES_NOT_HOLD
-    if result.outcome.converged:
-        return 0
-    click.echo(
-        f"NOT CONVERGED: {result.outcome.stop_reason}; no interval is given. Go on with "
-        f"`{going_on(path, load_run(folder))}`, and look at the traces in {path}/report.html",
-        err=True,
-    )
-    return NOT_CONVERGED
+    if not result.outcome.converged:
+        click.echo(
+            f"NOT CONVERGED: {result.outcome.stop_reason}; intervals are withheld. Resume with "
+            f"`{going_on(path, load_run(folder))}`, and look at the traces in {path}/report.html",
+            err=True,
+        )
+        return NOT_CONVERGED
+    # The screen begins with it.
+    return conclude(result.standing, say=quiet)
+
+
+def conclude(standing: Standing, *, say: bool = True) -> int:
+    """Say that the bands of a run do not hold, or that nobody knows; return the exit status."""
+    for line in standing.said if say else ():
+        click.echo(line, err=True)
+    return {True: 0, False: DOES_NOT_HOLD, None: INCONCLUSIVE}[standing.holds]

@@ -58,14 +58,22 @@ def track(
     """Say how well the actuator of the run in FOLDER would follow the paper's signals.
 
     On the virtual test stand, with every draw of the posterior for actuator: a linear command, the
-    mean model's inverse (feed-forward), a PID controller, and both together.
+    mean model's inverse (feed-forward), a PID controller, and both together. 0 um is where the
+    demagnetized actuator stands at zero volts; the default voltages are those fitted and 0 V.
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
     from bwbayes.app.jobs.track import Setup, show, track_run
 
     setup = Setup(
-        voltage, rate, delay, gain_margin, phase_margin, frequencies or None, amplitude, draws
+        voltage=voltage,
+        rate=rate,
+        delay=delay,
+        gain_margin=gain_margin,
+        phase_margin=phase_margin,
+        frequencies=frequencies or None,
+        amplitude=amplitude,
+        draws=draws,
     )
     made, files = track_run(folder, out, setup, overwrite=overwrite)
     if not quiet:

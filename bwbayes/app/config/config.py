@@ -39,6 +39,7 @@ __all__ = [
     "ValidationConfig",
     "checked",
     "dump",
+    "is_config",
     "load",
     "parse",
 ]
@@ -195,6 +196,23 @@ def load(path: str | Path) -> Config:
         reason = getattr(error, "strerror", None) or "is not UTF-8 text"
         raise InputError(f"{path}: {reason}; check the config's path") from None
     return parse(text, str(path))
+
+
+def is_config(path: Path) -> bool:
+    """Tell by its content whether a file is meant as a config, be it a faulty one."""
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            return False
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeError):
+        return path.suffix == ".toml"
+    rows = re.findall(r"^[-+\d.,;\s]*\d[-+\d.,;eE \t]*$", text, re.MULTILINE)
+    if path.suffix == ".toml" and 2 * len(rows) < len(text.splitlines()) + 1:
+        return True
+    try:
+        return bool(tomllib.loads(text))
+    except (ValueError, RecursionError):
+        return re.search(r"^\s*\[+[a-z]", text, re.MULTILINE) is not None
 
 
 def parse(text: str, where: str) -> Config:

@@ -13,10 +13,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from bwbayes.errors import suggestion
+from bwbayes.shown import brief
 
 __all__ = [
     "ANY",
@@ -24,6 +25,7 @@ __all__ = [
     "Key",
     "Positive",
     "Table",
+    "Texts",
     "described",
     "keys",
     "one_line",
@@ -77,11 +79,18 @@ ANY = "NAME"
 
 Positive = Annotated[float, Field(gt=0)]
 
+# A list of texts; a text stands for a list of one.
+Texts = Annotated[
+    list[str], BeforeValidator(lambda given: [given] if isinstance(given, str) else given)
+]
+
 KINDS = {str: "text", bool: "true or false", int: "whole number", float: "number", dict: "table"}
 
 
 class Table(BaseModel):
     """A table of a config: it knows its keys, and takes no others."""
+
+    __repr__ = brief
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -184,6 +193,8 @@ def _words(one: Any) -> str:
         return "one of " + ", ".join(f'"{value}"' for value in get_args(one))
     if get_origin(one) is list:
         inner = " or ".join(dict.fromkeys(_words(part) for part in _parts(get_args(one)[0])))
+        if inner == KINDS[str]:
+            return "text or list of texts"
         return f"list of {inner}s" if not inner.startswith("list of ") else "list of [start, stop]"
     if get_origin(one) is dict or (isinstance(one, type) and issubclass(one, BaseModel)):
         return KINDS[dict]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bwbayes.app.config.keys import Positive, Table, described
+from bwbayes.app.config.keys import Positive, Table, Texts, described
 
 __all__ = ["ActuatorConfig", "ModelConfig", "StandConfig", "StandModelConfig"]
 
@@ -22,7 +22,7 @@ class ActuatorConfig(Table):
         described("The hysteresis operator.", example='"prandtl-ishlinskii"'),
     ] = "bouc-wen"
     gain: Annotated[
-        list[str],
+        Texts,
         described(
             "Terms of the voltage without memory, about the middle of its range: the asymmetry of "
             "measured loops.",
@@ -62,7 +62,7 @@ class ActuatorConfig(Table):
         described("For duhem: whether there are no even terms (default: true).", example="false"),
     ] = None
     terms: Annotated[
-        list[str] | None,
+        Texts | None,
         described(
             "For bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all).",
             example='["b4", "b5"]',
@@ -85,14 +85,14 @@ class ModelConfig(ActuatorConfig):
         "discrepancy"
     )
     per_record: Annotated[
-        list[str],
+        Texts,
         described(
             "Parameters that each of several records has of its own, besides initial and offset.",
             example='["sensor_sd"]',
         ),
     ] = Field(default_factory=list)
     shared: Annotated[
-        list[str],
+        Texts,
         described(
             "Of initial and offset, what all of several records share.", example='["offset"]'
         ),

@@ -1,8 +1,9 @@
 """A config for a record that has none: ``bwbayes init`` writes it, ``bwbayes run my.csv`` runs it.
 
-:func:`propose` recognises the file's columns, looks at the record, and holds out its last quarter,
-or another part that the rest of the drive covers. What is wrong with the record and has a line of
-config as its remedy gets that line; what cannot be told from a record is asked in a comment.
+:func:`propose` recognizes the file's columns, looks at the record, and holds out a quarter of it
+that is like the rest: of every amplitude and rate that the drive has, in several windows if need
+be. What is wrong with the record and has a line of config as its fix gets that line; what cannot be
+told from a record is asked in a comment.
 """
 
 from __future__ import annotations
@@ -11,26 +12,39 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage, stats
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.data import Record, read_record
+from bwbayes.data import Record
 from bwbayes.data.inspection import Finding, inspect, isolated_outliers
-from bwbayes.data.io.checks import Table
-from bwbayes.data.io.columns import Naming, unit_in
+from bwbayes.data.io.checks import checked
+from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.formats import read_table
+from bwbayes.data.io.grid import decimals_of
+from bwbayes.data.io.table import Table
 from bwbayes.errors import InputWarning
 from bwbayes.model.registry import DYNAMICS
 
 __all__ = ["Proposal", "propose"]
 
-# Of the record's readings: what is held out, first choice first, and the fewest of either part.
-QUARTERS = ((0.75, 1.0), (0.5, 0.75))
+# A quarter is held out: of the whole record, or of each of so many equal parts; where it begins in
+# a part; and the fewest readings that are fitted or held out.
+PARTS = (1, 2, 3, 4, 5, 6, 8)
+BEGINNINGS = (0.75, 0.625, 0.5)
 FEWEST_FITTED, FEWEST_HELD_OUT = 100, 25
+
+# Windows are enough where no voltage and no rate is this much rarer or more frequent in them than
+# in the rest (a difference of distribution functions), and no more than twice that of the range is
+# missing.
+ALIKE = 0.15
+
+# Samples of which a drive's distribution is taken.
+SEEN = 20_000
 
 # Part of the voltages' range that a held-out drive may lie beyond the fitted one.
 SLACK = 0.02
@@ -62,12 +76,7 @@ class Proposal:
         return next((one for one in self.findings if one.kind in POINTLESS), None)
 
 
-def propose(
-    path: Path,
-    where: Path,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
-) -> Proposal:
+def propose(path: Path, where: Path, naming: Naming | None = None) -> Proposal:
     """Propose a config for a record.
 
     Parameters
@@ -76,23 +85,20 @@ def propose(
         The record's file.
     where
         The folder in which the config is going to be.
-    units
-        Units by quantity, where the names of the columns do not say them.
-    columns
-        Names of columns by quantity, where they are not to be recognised.
+    naming
+        Columns and units, where they are not to be recognized.
 
     Raises
     ------
     InputError
-        A column that is not recognised or has no unit, or a record that cannot be used.
+        A column that is not recognized or has no unit, or a record that cannot be used.
     """
+    naming = naming or Naming()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        record = read_record(path, columns=columns, units=units)
+        table = read_table(path, naming)
+        record = Record(**checked(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        table = read_table(path, Naming(columns or {}, units or {}))
     findings = tuple(_with_sign(one, path, table) for one in inspect(record))
     text = _text(path, where, table.naming, record, findings)
     return Proposal(text, parse(text, str(path)), record, findings, remarks)
@@ -102,8 +108,7 @@ def _with_sign(finding: Finding, path: Path, table: Table) -> Finding:
     """Return a finding; of a reversed sign with the command that turns it without a new file."""
     if finding.kind != "reversed sign":
         return finding
-    name = table.columns["displacement"].name
-    unit = table.naming.units.get("displacement") or unit_in(name, "displacement") or "um"
+    unit = table.columns["displacement"].unit
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
     here = (
         f'units = {{ displacement = "{turned}" }} under [record], or '
@@ -126,22 +131,21 @@ def _text(
         else:
             notes.append(f"#   what to do: {one.remedy}")
     held = _held_out(record)
-    first, last = _span(record)
-    train = [(first, last)] if held is None else _rest((first, last), held)
-    aside = [] if held is None else _spikes(record, held)
+    train = _rest(record, held)
+    aside = _spikes(record, held)
     if aside and not any(line.startswith("exclude") for line in lines["record"]):
         lines["record"].append(
-            f"exclude = {_windows(aside)}  # spikes in the part that is held out"
+            f"exclude = {_windows(record, aside)}  # spikes in the part that is held out"
         )
     file = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
     written = [
         *_facts(record),
-        *(notes or ["# Nothing wrong shows in it."]),
+        *(notes or ["# No issues found."]),
         "",
         "[record]",
         f"file = {_quoted(file)}",
         *_tables(naming),
-        f"train = {_windows(train)}  # s: the part that is fitted",
+        f"train = {_windows(record, train)}  # s: fitted",
         *lines["record"],
         *_start(record),
     ]
@@ -164,7 +168,7 @@ def _text(
         "# ess = 2000  # effective draws of every parameter",
         "",
     ]
-    if held is None:
+    if not held:
         written += [
             "# Too little of the record can be left out of the fit to hold bands against it:",
             "# [validation.another]",
@@ -173,7 +177,7 @@ def _text(
     else:
         written += [
             "[validation.held_out]",
-            f"window = {_windows([held])[1:-1]}  # s: not fitted; the bands are held against it",
+            f"window = {_windows(record, held)}  # s: held out, used to validate the bands",
         ]
     return "\n".join(written) + "\n"
 
@@ -208,64 +212,80 @@ def _start(record: Record) -> list[str]:
 def _tables(naming: Naming) -> list[str]:
     """Write which columns are meant, and their units."""
     both = {"columns": naming.columns, "units": naming.units}
-    return [
+    lines = [
         f"{key} = {{ {', '.join(f'{q} = {_quoted(name)}' for q, name in table.items())} }}"
         for key, table in both.items()
         if table
     ]
+    return lines if naming.fs is None else [*lines, f"fs = {naming.fs!r}"]
 
 
-def _span(record: Record) -> tuple[float, float]:
-    """Return the times (s) of the first reading and of the end of the last."""
+def _span(record: Record) -> tuple[int, int]:
+    """Return the first sample with a reading, and that after the last one."""
     first, last = np.flatnonzero(record.has_reading)[[0, -1]]
-    time = record.time
-    return float(time[first]), float(time[last]) + record.interval
+    return int(first), int(last) + 1
 
 
-def _held_out(record: Record) -> tuple[float, float] | None:
-    """Return a window (s) whose drive the rest of the record covers; None if there is none."""
-    begin, end = _span(record)
-    for part in QUARTERS:
-        edges = [_on_grid(record, begin + p * (end - begin)) for p in part]
-        held = record.window_slice(edges[0], edges[1])
-        kept = np.ones(record.samples, dtype=np.bool_)
-        kept[held] = False
-        readings = record.has_reading
-        if (readings & kept).sum() < FEWEST_FITTED or readings[held].sum() < FEWEST_HELD_OUT:
-            continue
-        fitted, other = record.voltage[kept], record.voltage[held]
-        slack = SLACK * float(np.ptp(fitted))
-        inside = other.min() >= fitted.min() - slack and other.max() <= fitted.max() + slack
-        assert record.displacement is not None
-        moves = np.ptp(other) > 0 and np.nanmax(record.displacement[held]) > np.nanmin(
-            record.displacement[held]
+def _held_out(record: Record) -> list[slice]:
+    """Return the windows of a quarter of the record whose drive is as the rest's, if there are any.
+
+    The fewest that are alike, or else those that come nearest to it.
+    """
+    first, last = _span(record)
+    candidates = []
+    for parts, begin in product(PARTS, BEGINNINGS):
+        edges = first + (last - first) / parts * np.add.outer(
+            np.arange(parts), [begin, begin + 0.25]
         )
-        if inside and moves:
-            return edges[0], edges[1]
-    return None
+        windows = [slice(*edge) for edge in np.rint(edges).astype(np.int64).tolist()]
+        difference = _difference(record, windows)
+        if difference <= ALIKE:
+            return windows
+        candidates.append((difference, windows))
+    difference, windows = min(candidates, key=lambda candidate: candidate[0])
+    return windows if difference < 1 else []
 
 
-def _spikes(record: Record, held: tuple[float, float]) -> list[tuple[float, float]]:
-    """Return a window (s) around each spike that is held out, where no fit sets it aside."""
-    times = record.time[isolated_outliers(record)]
-    inside = times[(held[0] <= times) & (times < held[1])].tolist()
-    return [(time, time + record.interval) for time in inside]
+def _difference(record: Record, windows: list[slice]) -> float:
+    """Return how far windows are from being like the record; 1 where they will not do."""
+    held = np.zeros(record.samples, dtype=np.bool_)
+    for window in windows:
+        held[window] = True
+    readings = record.has_reading
+    fitted, other = record.voltage[readings & ~held], record.voltage[readings & held]
+    if fitted.size < FEWEST_FITTED or other.size < FEWEST_HELD_OUT:
+        return 1.0
+    slack = SLACK * float(np.ptp(fitted))
+    inside = other.min() >= fitted.min() - slack and other.max() <= fitted.max() + slack
+    assert record.displacement is not None
+    if not inside or np.ptp(other) == 0 or np.ptp(record.displacement[readings & held]) == 0:
+        return 1.0
+    # A measured voltage is noisy, and its change noisier.
+    slow = ndimage.uniform_filter1d(record.voltage, max(1, record.samples // 500), mode="nearest")
+    drive = record.voltage, np.abs(np.gradient(slow))
+    some = slice(None, None, 1 + record.samples // SEEN)
+    differences = [stats.ks_2samp(x[some][held[some]], x[some][~held[some]])[0] for x in drive]
+    return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
 
 
-def _on_grid(record: Record, time: float) -> float:
-    """Return the time (s) of the nearest sample, without the noise of rounding."""
-    sample = round((time - record.start) / record.interval)
-    return float(f"{record.start + sample * record.interval:.9g}")
+def _rest(record: Record, held: list[slice]) -> list[slice]:
+    """Return the windows between those that are held out."""
+    first, last = _span(record)
+    edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last]
+    return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 
 
-def _rest(whole: tuple[float, float], held: tuple[float, float]) -> list[tuple[float, float]]:
-    parts = [(whole[0], held[0]), (held[1], whole[1])]
-    return [part for part in parts if part[1] > part[0]]
+def _spikes(record: Record, held: list[slice]) -> list[slice]:
+    """Return a window around each spike that is held out, where no fit sets it aside."""
+    spikes = isolated_outliers(record).tolist()
+    return [slice(s, s + 1) for s in spikes if any(w.start <= s < w.stop for w in held)]
 
 
-def _windows(windows: list[tuple[float, float]]) -> str:
-    texts = (f"[{float(f'{a:.9g}')}, {float(f'{b:.9g}')}]" for a, b in windows)
-    return f"[{', '.join(texts)}]"
+def _windows(record: Record, windows: list[slice]) -> str:
+    """Write windows of samples in s."""
+    digits = decimals_of(record.interval) + 1
+    edges = [[record.start + record.interval * s for s in (w.start, w.stop)] for w in windows]
+    return str([[round(edge, digits) for edge in window] for window in edges])
 
 
 def _quoted(text: str) -> str:

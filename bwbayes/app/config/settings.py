@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
-from bwbayes.app.config.keys import Positive, Table, described
+from bwbayes.app.config.keys import Positive, Table, Texts, described
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
@@ -28,6 +28,12 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=
 NotNegative = Annotated[float, Field(ge=0)]
 Window = Annotated[list[float], Field(min_length=2, max_length=2)]
 Windows = Annotated[list[Window], Field(min_length=1)]
+
+
+def _one_window(given: object) -> object:
+    """Take a single window for a list of one."""
+    alone = isinstance(given, list) and given and not any(isinstance(x, list) for x in given)
+    return [given] if alone else given
 
 
 class SignalConfig(Table):
@@ -83,7 +89,8 @@ class _Source(Table):
     file: Annotated[
         str | None,
         described(
-            "A record's file (.csv, .h5, .hdf5 or .mat), relative to the config; this or signal.",
+            "A record's file (text, HDF5, MATLAB, LVM or TDMS), relative to the config; this or "
+            "signal.",
             example='"my_record.csv"',
         ),
     ] = None
@@ -105,23 +112,28 @@ class _Source(Table):
     columns: Annotated[
         dict[str, str] | None,
         described(
-            "The file's columns by quantity, where their names are not like voltage_V.",
-            example='{ time = "t [ms]", voltage = "U_mV", displacement = "pos" }',
+            "The file's columns by quantity, where their names are not like voltage_V: names, the "
+            "ends of paths, or numbers counted from 1.",
+            example='{ time = "t [ms]", voltage = "U_mV", displacement = "3" }',
         ),
     ] = None
     units: Annotated[
         dict[str, str] | None,
         described(
-            "Units by quantity, where the columns' names lack them; a minus turns the sign.",
+            "Units by quantity, where the file does not state them; a minus turns the sign.",
             example='{ displacement = "nm" }',
         ),
+    ] = None
+    fs: Annotated[
+        Positive | None,
+        described("The file's sampling rate, in place of a time column.", unit="Hz", example="1e3"),
     ] = None
 
     @model_validator(mode="after")
     def _naming(self) -> Self:
         from bwbayes.data.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
-        Naming(self.columns or {}, self.units or {})
+        Naming(self.columns or {}, self.units or {}, self.fs)
         return self
 
 
@@ -169,7 +181,7 @@ class RecordConfig(_Source):
         ),
     ] = None
     remarks: Annotated[
-        list[str] | None,
+        Texts | None,
         described(
             "What was noted when the record's files were read; a run writes it and shows it again.",
             example='["my_record.csv:1: ignored columns: temperature_C"]',
@@ -189,10 +201,8 @@ class RecordConfig(_Source):
 
     @field_validator("train", "exclude", mode="before")
     @classmethod
-    def _one_window(cls, given: object) -> object:
-        """Take a single window for a list of one."""
-        alone = isinstance(given, list) and given and not any(isinstance(x, list) for x in given)
-        return [given] if alone else given
+    def _several(cls, given: object) -> object:
+        return _one_window(given)
 
     @model_validator(mode="after")
     def _one_source(self) -> RecordConfig:
@@ -280,11 +290,12 @@ class ValidationConfig(_Source):
     """Held-out data: a window of the training record, or another record."""
 
     window: Annotated[
-        Window | None,
+        Windows | None,
         described(
-            "The part of the training record that is held out, or of another record to judge.",
+            "Windows [start, stop] of the training record that are held out, judged together; or "
+            "the part of another record to judge.",
             unit="s",
-            example="[12.0, 16.0]",
+            example="[[6.0, 8.0], [14.0, 16.0]]",
         ),
     ] = None
     of: Annotated[
@@ -307,19 +318,24 @@ class ValidationConfig(_Source):
         ),
     ] = True
     lead_in: Annotated[
-        Positive,
+        Positive | None,
         described(
-            "How long the beginning of another record may tell its start and offset.",
+            "How long the beginning of another record, the lead-in, estimates its initial state "
+            "and offset; by default a quarter of the record, and ten correlation times of the "
+            "discrepancy at most.",
             unit="s",
             example="2.0",
         ),
-    ] = 1.0
+    ] = None
     lead_in_from: Annotated[
         float | None,
-        described(
-            "Where that beginning begins; by default with the record.", unit="s", example="0.5"
-        ),
+        described("Where the lead-in begins; by default with the record.", unit="s", example="0.5"),
     ] = None
+
+    @field_validator("window", mode="before")
+    @classmethod
+    def _several(cls, given: object) -> object:
+        return _one_window(given)
 
     @model_validator(mode="after")
     def _one_source(self) -> ValidationConfig:
@@ -328,6 +344,8 @@ class ValidationConfig(_Source):
             raise ValueError("give one of window, file and signal")
         if not self.another and self.lead_in_from is not None:
             raise ValueError("lead_in_from is for another record; give file or signal with it")
+        if self.another and self.window is not None and len(self.window) > 1:
+            raise ValueError("of another record one window is judged; give one")
         return self
 
     @property

@@ -19,7 +19,7 @@ from bwbayes.app.figures.style import (
     zigzag,
 )
 from bwbayes.arrays import FloatArray
-from bwbayes.control.compensation import Compensation, Played
+from bwbayes.control.predicted import Compensation, Played
 
 __all__ = ["draw_compensation", "draw_compensations"]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results.bands import Bands, Kind
+from bwbayes.results.bands import Bands, Kind, titled
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -110,8 +110,8 @@ def axis_label(parameter: Parameter) -> str:
 
 
 def title(bands: Bands) -> str:
-    """Return the bands' name, and whether their samples were fitted to."""
-    return f"{bands.name} ({'fitted' if bands.training else 'not fitted'})"
+    """Return the bands' name, and what they are of."""
+    return titled(bands.name, training=bands.training, separate=bands.separate)
 
 
 def starts(samples: int, most: int) -> IntArray:

@@ -1,26 +1,33 @@
 """From a record to a fit in Python: ``fit = bwbayes.fit(record, dynamics="lag", train=(0, 12))``.
 
 What :func:`fit` makes, ``bwbayes run`` makes too, by the same functions; :func:`open_run` reads
-what either has written, and :func:`resume_run` goes on with it.
+what either has written, and :func:`resume_run` goes on with it. :func:`compare` tells which of
+several models to take.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.limits import USUAL_MODELS
+from bwbayes.app.config.models import models_of
+from bwbayes.app.fit.compared import Compared, compared, named
 from bwbayes.app.fit.fitted import Fit, carried_on, to_know
-from bwbayes.app.fit.surroundings import Scratch, warn
+from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+from bwbayes.app.jobs.compare import Fitted, require_free, run_models
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
 from bwbayes.data import Record
+from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 
-__all__ = ["fit", "open_run", "resume_run"]
+__all__ = ["compare", "fit", "open_run", "resume_run"]
 
 
 def fit(
@@ -82,6 +89,104 @@ def fit(
     )
     warn([one for one in to_know(made) if one not in problem.remarks], 3)
     return made
+
+
+def compare(
+    *runs: Any,
+    models: str | Sequence[str] | None = None,
+    folder: str | Path | None = None,
+    overwrite: bool = False,
+    future: bool = True,
+    workers: int | None = None,
+    executor: Any = None,
+    progress: bool = True,
+    **keys: Any,
+) -> Compared:
+    """Compare models of the same readings, to tell which one to take.
+
+    To a record each model is fitted first; fits and runs that exist are compared as they are.
+
+    Parameters
+    ----------
+    runs
+        What :func:`fit` takes: a record, its file, or a list or dict of several records; or two or
+        more fits and folders of runs.
+    models
+        Models to fit to a record, as on the command line: an operator, then gain, creep, dynamics
+        and noise after plus signs; in one text with semicolons between them, or in a list. By
+        default seven usual ones.
+    folder
+        Where page, table and numbers go, and the runs of the models: after an interruption those
+        that are there go on. By default nothing is left but the comparison.
+    overwrite
+        Replace what is in the folder already.
+    future
+        Whether to predict the later half of the training readings from the earlier ones too, which
+        takes short fits.
+    workers, executor, progress
+        As in :func:`fit`.
+    keys
+        The keys of a config, as in :func:`fit`; the same for all models.
+
+    Raises
+    ------
+    InputError
+        A model that does not exist, fits of different readings, or what no fit can use.
+
+    Examples
+    --------
+    Two models of a record, and fits that exist::
+
+        comparison = bwbayes.compare(record, models="bouc-wen; maxwell-slip + quadratic")
+        comparison.recommended, comparison.against
+        comparison = bwbayes.compare(fit, other_fit, "results/bender")
+    """
+    scratch = Scratch() if folder is None else None
+    path = scratch.path / "comparison" if scratch is not None else Path(str(folder))
+    require_free(path, overwrite)
+    given = runs[0] if len(runs) == 1 else list(runs)
+    listed = given if isinstance(given, list | tuple) else [given]
+    if any(isinstance(one, Fit) or _is_folder(one) for one in listed):
+        for name in [*keys] if models is None else ["models"]:
+            raise InputError(f"compare: {name}: fits are compared as they are; leave it out")
+        if len(listed) < 2:
+            raise InputError("compare: one fit alone; give two or more, or a record")
+        fits = [_finished(one) for one in listed]
+    else:
+        config, records = config_of(given, keys, "compare")
+        named_models = USUAL_MODELS if models is None else models
+        text = named_models if isinstance(named_models, str) else "; ".join(named_models)
+        fits = run_models(
+            config,
+            Path(),
+            models_of(text, config.model),
+            path,
+            console_of(progress),
+            workers,
+            executor,
+            given=records,
+            overwrite=overwrite,
+        )
+    made = compared(fits, future=future, workers=workers, executor=executor)
+    if scratch is None:
+        made.save(path)
+    return replace(made, _scratch=scratch)
+
+
+def _is_folder(given: Any) -> bool:
+    return isinstance(given, str | Path) and Path(given).is_dir()
+
+
+def _finished(given: Any) -> Fitted:
+    """Return a fit, or the run in a folder under the folder's name."""
+    if isinstance(given, Fit):
+        return named(given)
+    if not _is_folder(given):
+        raise InputError(
+            f"compare: {given if isinstance(given, str | Path) else type(given).__name__}: is "
+            "neither a fit nor the folder of a run; give a list of those alone, or records alone"
+        )
+    return replace(named(open_run(given)), name=Path(given).name)
 
 
 def open_run(folder: str | Path) -> Fit:

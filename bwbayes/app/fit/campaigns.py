@@ -28,6 +28,7 @@ from bwbayes.errors import InputError
 from bwbayes.population.next_specimen import next_specimen
 from bwbayes.population.population import Population
 from bwbayes.results.start import Start
+from bwbayes.shown import head
 
 __all__ = ["Campaign", "campaign"]
 
@@ -91,7 +92,7 @@ class Campaign:
         return open_run(self.folder.run(name))
 
     def predict(
-        self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float = 1.0
+        self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float | None = None
     ) -> Prediction:
         """Predict a specimen that was not measured, along a record or a planned voltage.
 
@@ -127,6 +128,9 @@ class Campaign:
         return figures["parameters"]
 
     def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
         ended = ", ".join(f"{n} {status}" for status, n in self.result.counts.items() if n)
         lines = [f"{len(self.result.rows)} records: {ended}"]
         lines += [f"{name}: {why}" for name, why in self.short.items()]

@@ -1,4 +1,4 @@
-"""Fits compared, as Python users have it: what ``fit.compare(other)`` returns.
+"""Fits compared, as Python users have it: what ``bwbayes.compare`` and ``fit.compare`` return.
 
 It shows itself as ``bwbayes compare`` does on screen: what is recommended, what speaks against it,
 the numbers of the models and their differences.
@@ -7,7 +7,7 @@ the numbers of the models and their differences.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from io import StringIO
 from pathlib import Path
@@ -15,15 +15,18 @@ from typing import Any, Protocol
 
 from rich.console import Console
 
+from bwbayes.app.fit.surroundings import Scratch
 from bwbayes.app.jobs.compare import Fitted, compare, require_same, write
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.screen import show_comparison
 from bwbayes.comparison.choice import Comparison
 from bwbayes.comparison.table import table
+from bwbayes.results.result import Result
 from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
+from bwbayes.shown import head
 
-__all__ = ["Compared", "Finished", "compared"]
+__all__ = ["Compared", "Finished", "compared", "named"]
 
 
 class Finished(Protocol):
@@ -41,6 +44,10 @@ class Finished(Protocol):
     def outcome(self) -> Outcome:
         """How the sampling ended."""
 
+    @property
+    def result(self) -> Result:
+        """What came of it."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compared:
@@ -51,6 +58,7 @@ class Compared:
 
     comparison: Comparison
     _runs: tuple[Fitted, ...]
+    _scratch: Scratch | None = None
 
     @property
     def recommended(self) -> str | None:
@@ -84,43 +92,55 @@ class Compared:
         return Path(folder)
 
     def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
         said = StringIO()
         console = Console(file=said, width=110, force_jupyter=False, color_system=None)
         show_comparison(self.comparison, None, console)
         return said.getvalue().rstrip()
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def named(fit: Finished) -> Fitted:
+    """Return a fit under the name of its config, or of its operator."""
+    config = fit.problem.config
+    name = config.name or config.model.hysteresis
+    return Fitted(name, fit.problem, fit.chain, fit.outcome, fit.result.standing)
 
 
 def compared(
-    fits: Sequence[Finished], *, future: bool = True, workers: int | None = None
+    runs: Sequence[Fitted],
+    *,
+    future: bool = True,
+    workers: int | None = None,
+    executor: Any = None,
 ) -> Compared:
-    """Compare fits, named as their configs are, or by number where that is not enough.
+    """Compare fits; those of one name by number.
 
     Parameters
     ----------
-    fits
+    runs
         Fits of the same readings, of different models.
     future
         Whether to predict the later half of the training readings from the earlier ones too, which
         takes short fits.
     workers
         Ensembles of those side by side; by default one a core.
+    executor
+        Where they run, as in :func:`bwbayes.fit`.
 
     Raises
     ------
     InputError
         Fits of different readings.
     """
-    names = [fit.problem.config.name or fit.problem.config.model.hysteresis for fit in fits]
-    if len(set(names)) < len(names):
-        names = [f"{name} {number}" for number, name in enumerate(names, start=1)]
-    runs = tuple(
-        Fitted(name, fit.problem, fit.chain, fit.outcome)
-        for name, fit in zip(names, fits, strict=True)
-    )
+    if len({run.name for run in runs}) < len(runs):
+        runs = [replace(run, name=f"{run.name} {n}") for n, run in enumerate(runs, start=1)]
     for one in runs[1:]:
         require_same(runs[0], one)
-    made = compare(runs, Console(quiet=True), workers=workers, with_future=future)
-    return Compared(made, runs)
+    quiet = Console(quiet=True)
+    made = compare(runs, quiet, workers=workers, how=executor, with_future=future)
+    return Compared(made, tuple(runs))

@@ -17,12 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bwbayes.app.fit.advice import Advice
+from bwbayes.app.fit.advice import Advice, require_converged
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
-from bwbayes.app.jobs.compensate import Compensated, compensate_draws
-from bwbayes.app.jobs.export import export_draws
-from bwbayes.app.jobs.track import Setup, track_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.page import template
 from bwbayes.app.running.folder import RunFolder
@@ -41,26 +38,25 @@ from bwbayes.app.screen import (
     score_texts,
     show_result,
 )
-from bwbayes.control.exported import Exported
-from bwbayes.control.tracking import Tracking
 from bwbayes.data import Record, read_record
-from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.results.loops import Loops
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
+from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
 from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
+from bwbayes.shown import head
 
 if TYPE_CHECKING:
     import xarray
 
 __all__ = ["Fit", "carried_on", "to_know"]
 
-# Whether bands hold, in a word.
-HELD = {True: "yes", False: "NO", None: "unknown"}
+# How the validation of bands came out, in a word.
+HELD = {True: "passed", False: "FAILED", None: "inconclusive"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,7 +77,7 @@ class Fit(Advice):
     Notes
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
-    :class:`~bwbayes.errors.NotConvergedError`. The draws stay, and :meth:`resume` goes on.
+    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` goes on.
     """
 
     problem: Problem
@@ -98,11 +94,8 @@ class Fit(Advice):
 
     @property
     def holds(self) -> bool | None:
-        """Whether all bands hold on their readings; None if none of them can tell."""
-        answers = [verdict.holds for verdict in self.verdicts.values()]
-        if False in answers:
-            return False
-        return True if True in answers else None
+        """Whether all bands hold on their readings; None if that is inconclusive anywhere."""
+        return self.result.standing.holds if self.converged else None
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
@@ -206,7 +199,7 @@ class Fit(Advice):
         window: tuple[float, float] | None = None,
         from_rest: bool = False,
         own_offset: bool = True,
-        lead_in: float = 1.0,
+        lead_in: float | None = None,
         lead_in_from: float | None = None,
         after: bool = False,
         of: str | None = None,
@@ -223,7 +216,7 @@ class Fit(Advice):
             Start and stop in s of the part that is predicted and judged; by default all of it.
         from_rest, own_offset, lead_in, lead_in_from, after, of
             What is known of its start, as of a config's [validation.NAME]; see
-            :class:`~bwbayes.results.start.Start`. With ``after`` what comes after the lead-in is a
+            :class:`bwbayes.Start`. With ``after`` what comes after the lead-in is a
             forecast.
 
         Raises
@@ -249,34 +242,8 @@ class Fit(Advice):
         name = name or "prediction"
         made = predict_another(self.problem, result.flat_draws, other, start, name, window, of)
         warn([f"{name}: {remark}" for remark in made.remarks], 3)
-        if made.verdict is not None and made.verdict.holds is False:
-            warn([made.verdict.line], 3)
+        warn(Standing.of([made.verdict] if made.verdict else []).said, 3)
         return made
-
-    def compensate(self, reference: Any, **options: Any) -> Compensated:
-        """Return the voltage for a displacement that is asked for, and what is promised of it.
-
-        All is as of :func:`bwbayes.app.jobs.compensate.compensate_draws`.
-        """
-        made = compensate_draws(self.problem, self._converged().flat_draws, reference, **options)
-        warn(made.remarks, 3)
-        return made
-
-    def export(self, folder: str | Path, **options: Any) -> Exported:
-        """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
-
-        Options and errors are those of :func:`bwbayes.app.jobs.export.export_draws`. What is
-        returned has the ``linear`` part as a discrete ``scipy.signal`` system.
-        """
-        draws = self._converged().flat_draws
-        return export_draws(self.problem, draws, Path(folder), **options)[0]
-
-    def track(self, **options: Any) -> Tracking:
-        """Say how well a closed loop would follow, with and without the model.
-
-        Options are the fields of :class:`bwbayes.app.jobs.track.Setup`.
-        """
-        return track_draws(self.problem, self._converged().flat_draws, Setup(**options))
 
     def resume(
         self,
@@ -314,12 +281,7 @@ class Fit(Advice):
 
     def _converged(self) -> Result:
         """Return the result, or refuse."""
-        if not self.outcome.converged:
-            steps = 2 * self.problem.config.sampling.steps
-            raise NotConvergedError(
-                f"not converged: {self.outcome.stop_reason}; no interval is given. Go on with "
-                f"fit.resume(steps={steps}), and look at fit.plot.trace()"
-            )
+        require_converged(self)
         return self.result
 
     @property
@@ -328,11 +290,13 @@ class Fit(Advice):
             record.origin for record in self.problem.records.values()
         )
         if not self.converged:
-            return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; no interval is given"
-        known = {True: "its bands hold", False: "its bands DO NOT HOLD", None: "bands not judged"}
-        return f"{name}: converged, {known[self.holds]}"
+            return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
+        return f"{name}: converged, validation {self.result.standing.status}"
 
     def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
         said = StringIO()
         console = Console(file=said, width=110, force_jupyter=False, color_system=None)
         console.print(self._title, highlight=False, markup=False, soft_wrap=True)
@@ -343,7 +307,7 @@ class Fit(Advice):
         scores = self.result.scores
         return template("fit.html.j2").render(
             title=self._title,
-            failed=[verdict.line for verdict in self.result.failed],
+            standing=self.result.standing,
             parameter_columns=PARAMETER_COLUMNS,
             parameters=list(parameter_rows(self.result)),
             score_columns=list(SCORE_COLUMNS),
@@ -384,7 +348,7 @@ def carried_on(
 
 def to_know(made: Fit) -> list[str]:
     """Return what the command line would print of a finished run."""
-    lines = [*made.remarks, *(verdict.line for verdict in made.result.failed)]
+    lines = [*made.remarks, *made.result.standing.said]
     if not made.converged:
-        lines.append(f"not converged: {made.outcome.stop_reason}; no interval is given")
+        lines.append(f"NOT CONVERGED: {made.outcome.stop_reason}; intervals are withheld")
     return lines

@@ -28,6 +28,7 @@ from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
+from bwbayes.shown import brief
 
 __all__ = ["Plots"]
 
@@ -39,6 +40,8 @@ class Plots:
     ``converged`` returns the result, or raises a
     :class:`~bwbayes.errors.NotConvergedError` where nothing may be said of an interval.
     """
+
+    __repr__ = brief
 
     problem: Problem
     result: Result

@@ -14,7 +14,7 @@ from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.model.operator import Span
 from bwbayes.sampling.sampler import draws
 
-__all__ = ["drawn", "limits_of", "refuse_existing"]
+__all__ = ["command_limits", "drawn", "limits_of", "refuse_existing"]
 
 
 def drawn(path: Path) -> tuple[Problem, FloatArray]:
@@ -50,6 +50,15 @@ def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
     return Span(low, high)
 
 
+def command_limits(problem: Problem, given: tuple[float, float] | None) -> Span:
+    """Return the voltages that a command may use: those given, or zero and all fitted ones, V.
+
+    Errors are those of :func:`limits_of`.
+    """
+    low, high = limits_of(problem, given)
+    return Span(low, high) if given else Span(min(low, 0.0), max(high, 0.0))
+
+
 def refuse_existing(files: list[Path], overwrite: bool) -> None:
     """Refuse to replace a file, unless that is asked for.
 
@@ -60,4 +69,4 @@ def refuse_existing(files: list[Path], overwrite: bool) -> None:
     """
     for target in files:
         if target.exists() and not overwrite:
-            raise InputError(f"{target}: exists; choose another folder, or give --overwrite")
+            raise InputError(f"{target}: exists; choose another folder, or give `overwrite=True`")

@@ -85,13 +85,17 @@ def experiment(problem: Problem) -> Experiment:
         Its voltage shows no loop, or its prior leaves hardly anything.
     """
     problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
-    windows = {n: v.window for n, v in problem.validations.items() if v.window is not None}
+    windows = {
+        f"{name} {i}" if i else name: window
+        for name, v in problem.validations.items()
+        for i, window in enumerate(v.windows)
+    }
     others = {
         name: OtherRecord(v.record, v.start, v.judged, v.of)
         for name, v in problem.validations.items()
         if v.record is not None
     }
-    belongs = {name: problem.validations[name].of for name in windows}
+    belongs = {name: problem.validations[name.partition(" ")[0]].of for name in windows}
     return Experiment(problem.posterior, problem.plan, windows, others, belongs=belongs)
 
 
@@ -213,12 +217,12 @@ def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
     except ValueError:
         raise InputError(
             f"{folder.replicates}: does not say how many replicates were requested; "
-            "start again with --overwrite"
+            "start again with `overwrite=True`"
         ) from None
     if request.of != identity:
         raise InputError(
             f"{folder.replicates}: these are replicates of another config or record than the "
-            "folder's; restore that, or start again with --overwrite"
+            "folder's; restore that, or start again with `overwrite=True`"
         )
     return request
 

@@ -33,6 +33,7 @@ from bwbayes.population.population import FEWEST, population
 from bwbayes.population.specimen import Specimen
 from bwbayes.results.outputs import write_summary
 from bwbayes.results.replicates import as_done
+from bwbayes.results.standing import Standing
 
 __all__ = ["carry_on", "config_text", "start"]
 
@@ -213,11 +214,9 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
     if not numbers["converged"]:
         reason = f"{numbers['stop_reason']}; go on with `{numbers['go_on']}`"
         return Row(file.stem, file.name, "not converged", reason, numbers)
-    failed = [name for name, one in numbers["validation"].items() if one.get("holds") is False]
-    if failed:
-        reason = f"bands do not hold: {', '.join(failed)}"
-        return Row(file.stem, file.name, "does not hold", reason, numbers)
-    return Row(file.stem, file.name, "done", "", numbers)
+    standing = Standing.read(numbers)
+    status = standing.status if standing.holds else f"validation {standing.status}"
+    return Row(file.stem, file.name, status, "; ".join(standing.lines), numbers)
 
 
 def _write(folder: CampaignFolder, campaign: CampaignResult) -> None:

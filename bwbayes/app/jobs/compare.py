@@ -11,8 +11,10 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -40,25 +42,34 @@ from bwbayes.inference.noise import noise_model
 from bwbayes.inference.table import Table
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.results.bands import Bands
-from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.outputs import write_summary
 from bwbayes.results.prediction import predict_record, predict_windows, thinned
 from bwbayes.results.scores import score
-from bwbayes.results.verdict import Background, assess
+from bwbayes.results.standing import Standing
 from bwbayes.sampling.sampler import Outcome, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["Fitted", "compare", "compare_models", "compare_runs", "require_same", "write"]
+__all__ = [
+    "Fitted",
+    "compare",
+    "compare_models",
+    "compare_runs",
+    "require_free",
+    "require_same",
+    "run_models",
+    "write",
+]
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A run to compare: its name, problem, chain and outcome."""
+    """A run to compare: its name, problem, chain and outcome, and whether its bands hold."""
 
     name: str
     problem: Problem
     chain: ChainFile
     outcome: Outcome
+    standing: Standing = field(default_factory=Standing)
 
 
 def compare_runs(
@@ -80,13 +91,14 @@ def compare_runs(
     """
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise InputError("compare: the same run is there twice; leave one out")
-    _require_free(out, overwrite)
+    require_free(out, overwrite)
     names = [folder.name for folder in folders]
     if len(set(names)) < len(names):
         names = [str(folder) for folder in folders]
     runs = []
     for name, path in zip(names, folders, strict=True):
-        runs.append(Fitted(name, *finished(RunFolder.open(path))))
+        folder = RunFolder.open(path)
+        runs.append(Fitted(name, *finished(folder), folder.standing()))
         require_same(runs[0], runs[-1])
     made = compare(runs, console, workers=workers, how=how, with_future=with_future)
     write(made, runs, out)
@@ -107,19 +119,41 @@ def compare_models(
 ) -> Comparison:
     """Run a config with each of the models, in folders below ``out``, and compare them.
 
-    The config's files are relative to the folder ``where``. Runs that are there already, of the
-    same config, are gone on with.
+    All is as of :func:`run_models`; page, table and numbers go to ``out``.
+    """
+    require_free(out, overwrite)
+    runs = run_models(config, where, models, out, console, workers, how, overwrite=overwrite)
+    made = compare(runs, console, workers=workers, how=how, with_future=with_future)
+    write(made, runs, out)
+    return made
+
+
+def run_models(
+    config: Config,
+    where: Path,
+    models: Mapping[str, ModelConfig],
+    out: Path,
+    console: Console,
+    workers: int | None = None,
+    how: Any = None,
+    *,
+    given: Mapping[str, Record] | None = None,
+    overwrite: bool = False,
+) -> list[Fitted]:
+    """Run a config with each of the models, in folders below ``out``.
+
+    The config's files are relative to the folder ``where``, and ``given`` are its records that are
+    in memory. Runs that are there already, of the same config, are gone on with.
 
     Raises
     ------
     InputError
         The config, its records or a folder cannot be used, or a folder has another run.
     """
-    _require_free(out, overwrite)
-    _, wholes = joined(config, training_records(config, where, {})[0])
+    _, wholes = joined(config, training_records(config, where, given or {})[0])
     records = list(wholes.values())
     problems = {
-        name: resolve(_with_model(config, model, name, records), where)
+        name: resolve(_with_model(config, model, name, records), where, given)
         for name, model in models.items()
     }
     runs = []
@@ -128,11 +162,9 @@ def compare_models(
         console.print(f"{name} ...", highlight=False)
         if not folder.summary.is_file():
             go_on(folder, console, workers=workers, how=how)
-        runs.append(Fitted(name, *finished(folder)))
+        runs.append(Fitted(name, *finished(folder), folder.standing()))
         require_same(runs[0], runs[-1])
-    made = compare(runs, console, workers=workers, how=how, with_future=with_future)
-    write(made, runs, out)
-    return made
+    return runs
 
 
 def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
@@ -161,17 +193,24 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
         folder = RunFolder.open(path)
         if folder.config.read_text(encoding="utf-8") != dump(problem.config):
             raise InputError(
-                f"{path}: holds another run; choose another folder with --out, or give --overwrite"
+                f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )
         return folder
     path.parent.mkdir(parents=True, exist_ok=True)
     return RunFolder.create(path, problem, overwrite)
 
 
-def _require_free(out: Path, overwrite: bool) -> None:
+def require_free(out: Path, overwrite: bool) -> None:
+    """Refuse a folder that has a comparison, unless it may be replaced.
+
+    Raises
+    ------
+    InputError
+        It has one.
+    """
     target = out / "comparison.json"
     if target.exists() and not overwrite:
-        raise InputError(f"{target}: exists; choose another folder with --out, or give --overwrite")
+        raise InputError(f"{target}: exists; choose another folder, or give `overwrite=True`")
 
 
 def require_same(one: Fitted, other: Fitted) -> None:
@@ -205,7 +244,7 @@ def _held_out(problem: Problem) -> dict[str, object]:
     """Return what is held out, by name, so that it can be compared."""
     return {
         name: (
-            one.window,
+            one.windows,
             None if one.record is None else one.record.sha256,
             replace(one.start, hold=None),
             one.judged,
@@ -251,13 +290,14 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
     sampled, density = draws(posterior, run.chain), log_densities(run.chain)
     flat = sampled.reshape(-1, sampled.shape[-1])
     bands = tuple(one for one in held_out(problem, flat) if one.measured is not None)
-    windows = {name: list(problem.held_out(name).values()) for name in problem.records}
+    full = max(one.extent for one in posterior.datasets)
+    windows = {name: list(chain(*problem.held_out(name).values())) for name in problem.records}
     log_prior = posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
     return replace(
         plain,
         held_out=bands,
-        scores={one.name: score(one, scoring(seed, one)) for one in bands},
-        not_holding=_not_holding(problem, flat, bands),
+        scores={one.name: score(one, scoring(seed, one), full) for one in bands},
+        standing=run.standing,
         joint=joint_log_score(posterior, flat, windows, generator(seed, "joint"))
         if any(windows.values())
         else None,
@@ -267,18 +307,6 @@ def candidate(run: Fitted, pool: Executor, *, with_future: bool = True) -> Candi
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
         log_likelihood=float(np.max(density.ravel() - log_prior)),
     )
-
-
-def _not_holding(problem: Problem, flat: FloatArray, bands: Sequence[Bands]) -> tuple[str, ...]:
-    """Return the names of the bands that do not hold."""
-    background = Background.of(problem.posterior, flat)
-    verdicts = {
-        one.name: assess(
-            one, background, beyond=beyond_training(problem.posterior, one.voltage, one.interval)
-        )
-        for one in bands
-    }
-    return tuple(name for name, v in verdicts.items() if v is not None and v.holds is False)
 
 
 def held_out(problem: Problem, flat: FloatArray) -> list[Bands]:
@@ -320,4 +348,4 @@ def write(comparison: Comparison, runs: Sequence[Fitted], out: Path) -> None:
             writer.writerows(flat)
         write_summary(out / "comparison.json", numbers(comparison))
     except OSError as error:
-        raise InputError(f"{out}: {error.strerror}; choose another folder with --out") from None
+        raise InputError(f"{out}: {error.strerror}; choose another folder") from None

@@ -12,17 +12,21 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.compensation import draw_compensation, draw_compensations
-from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.report.compensation_report import render
 from bwbayes.arrays import FloatArray
-from bwbayes.control.compensation import Choice, Compensation, compensate
-from bwbayes.control.wished import Reference
+from bwbayes.control.compensation import compensate
+from bwbayes.control.predicted import Choice, Compensation
+from bwbayes.control.wished import SHAPES, Reference, shaped
 from bwbayes.data.io.formats import read_reference, write_record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.linear import parse_hold
 from bwbayes.results.extrapolation import beyond_training
 from bwbayes.results.outputs import write_summary
 from bwbayes.results.prediction import thinned
@@ -37,9 +41,13 @@ FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.h
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensated(Compensation):
-    """A command, what is promised of it, and how to look at it and keep it.
+    """A command, its predicted errors, and how to look at it and keep it.
 
-    Fields as of :class:`~bwbayes.control.compensation.Compensation`.
+    ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
+    ``smoothed``; ``compensated`` what it does, ``linear`` what a command without compensation does:
+    the ``rms`` and ``largest`` error (draws,), um, with ``bands`` of the displacement. ``between``
+    is how far the displacement leaves straight lines between samples, um, and ``difference`` the
+    largest difference, V, from the other ``command`` that could have been taken.
     """
 
     @classmethod
@@ -106,6 +114,7 @@ def compensate_draws(
     reference: Any,
     *,
     command: Choice = "mean",
+    hold: str = "zoh",
     from_rest: bool = False,
     voltage: tuple[float, float] | None = None,
     slew: float | None = None,
@@ -115,6 +124,11 @@ def compensate_draws(
     limit: float | None = None,
     interval: float | None = None,
     smoothed: float | None = None,
+    amplitude: float | None = None,
+    frequency: float | None = None,
+    middle: float | None = None,
+    periods: float | None = None,
+    levels: int | None = None,
 ) -> Compensated:
     """Return the command for a reference from draws, with what is promised of it.
 
@@ -125,27 +139,52 @@ def compensate_draws(
     flat
         Its draws, (draws, free), parameters in their own units; a thousand of them are used.
     reference
-        A :class:`~bwbayes.control.wished.Reference`, a file, or displacements (samples,), um, at
-        the record's sampling interval or the given ``interval``, s.
-    command, from_rest, nearest, limit
-        As of :func:`~bwbayes.control.compensation.compensate`.
+        As of :func:`reference_of`.
+    command
+        ``"mean"``, the inverse of the mean model; or ``"expected"``, the voltage whose squared
+        error, expected over the draws, is least.
+    hold
+        What the command does between samples: ``"zoh"``, it is held, as a DAC does (zero-order
+        hold); ``"foh"``, it goes in straight lines (first-order hold), as the output of a generator
+        that interpolates does. It need not be that of the record.
+    from_rest
+        The actuator starts demagnetized; otherwise it has waited at zero volts, in a state of its
+        hysteresis that nothing tells.
     voltage, slew, current, capacitance
-        Limits of the amplifier: lowest and highest voltage, V, by default those of all records
-        fitted; its fastest change, V/s, and the largest current, A, into the actuator's
+        Limits of the amplifier: lowest and highest voltage, V, by default zero and those of all
+        records fitted; its fastest change, V/s, and the largest current, A, into the actuator's
         capacitance, F, by default any.
+    nearest
+        Give the nearest command where the limits do not allow for the one that is asked for.
+    limit
+        Of the error, um: the probability that it is kept is given.
     interval, smoothed
-        Sampling interval, and sd of a smoothing, s, of displacements.
+        Sampling interval, s, by default that of the record, and SD of a smoothing, s; a file has an
+        interval of its own.
+    amplitude, frequency, middle, periods, levels
+        Of a shape: um and Hz, which it needs; um (default: 0); how many periods or lines (default:
+        3), and steps of a staircase from the middle to either end (default: 5).
 
     Raises
     ------
     InputError
         A reference that cannot be read or reached.
     """
-    span = limits_of(problem, voltage)
+    span = command_limits(problem, voltage)
     fastest = math.inf if slew is None else slew
     limits = Limits(span.low, span.high, fastest, current, capacitance)
     alone = next(iter(problem.posterior.each(flat)))
-    asked = reference_of(reference, interval or problem.record.interval, smoothed)
+    asked = reference_of(
+        reference,
+        problem.record.interval,
+        interval=interval,
+        smoothed=smoothed,
+        amplitude=amplitude,
+        frequency=frequency,
+        middle=middle,
+        periods=periods,
+        levels=levels,
+    )
     seed = problem.config.seed
     made = compensate(
         alone.posterior,
@@ -153,26 +192,67 @@ def compensate_draws(
         asked,
         generator(seed, f"compensate {asked.name}"),
         command=command,
+        hold=parse_hold(hold),
         from_rest=from_rest,
         limits=limits,
         nearest=nearest,
         limit=limit,
     )
     far = beyond_training(alone.posterior, made.voltage, asked.interval)
-    return Compensated.of(replace(made, remarks=(*made.remarks, *far)))
+    return Compensated.of(replace(made, remarks=(*made.remarks, *(one.line for one in far))))
 
 
-def reference_of(given: Any, interval: float, smoothed: float | None = None) -> Reference:
-    """Return a reference that is one already, or read from a file, or made of displacements.
+def reference_of(given: Any, default: float, **options: Any) -> Reference:
+    """Return a reference: one that is made already, a shape, a file's, or displacements.
+
+    Parameters
+    ----------
+    given
+        A reference; the name of a shape; a file; or displacements (samples,), um.
+    default
+        Sampling interval, s, where neither the file nor ``options`` say it.
+    options
+        ``interval``, ``smoothed`` and those of :func:`~bwbayes.control.wished.shaped`; what is None
+        is not given.
 
     Raises
     ------
     InputError
-        It cannot be used.
+        It is none of these or cannot be used, or options that it cannot have.
     """
+    options = {name: value for name, value in options.items() if value is not None}
+    shapes = ", ".join(SHAPES)
+    if isinstance(given, str) and given in SHAPES:
+        for name, unit in (("amplitude", "um"), ("frequency", "Hz")):
+            if name not in options:
+                raise InputError(f"{given}: has no {name}; give it, in {unit}")
+        return shaped(given, **{"interval": default, **options})
+    kind, allowed = "displacements take", {"smoothed", "interval"}
+    if isinstance(given, Reference):
+        kind, allowed = "one that is made already takes", set()
+    elif isinstance(given, str | Path):
+        kind, allowed = "a file takes", {"smoothed"}
+    for name in options:
+        if name not in allowed:
+            raise InputError(f"reference: {kind} no {name}; leave it out, or give one of {shapes}")
     if isinstance(given, Reference):
         return given
-    name = "reference"
+    smoothed = options.get("smoothed", 0.0)
     if isinstance(given, str | Path):
-        given, interval = read_reference(name := str(given))
-    return Reference(given, interval, Path(name).stem, smoothed or 0.0)
+        path = Path(given)
+        if isinstance(given, str) and not path.suffix and not path.exists():
+            raise InputError(
+                f"reference: {given!r} is neither a shape nor a file; {suggestion(given, SHAPES)}"
+            )
+        values, interval = read_reference(path)
+        return Reference(values, interval, path.stem, smoothed)
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(())
+    if values.ndim == 0:
+        raise InputError(
+            f"reference: {type(given).__name__} is none; give one of {shapes}, a file, or "
+            "displacements in um"
+        )
+    return Reference(values, options.get("interval", default), smoothed=smoothed)

@@ -99,7 +99,7 @@ def design(
     """
     refuse_existing([out / name for name in FILES], overwrite)
     if (parameter is None) == (drive is None):
-        raise InputError("design: give either --parameter or --drive")
+        raise InputError("design: give either a parameter or a drive")
     problem, flat = drawn(path)
     amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
     signals = candidates_of(candidates, problem, amplifier)
@@ -153,7 +153,7 @@ def write(asked: Asked, made: Sequence[Promise], out: Path) -> None:
             },
         )
     except OSError as error:
-        raise InputError(f"{out}: {error.strerror}; choose another folder with --out") from None
+        raise InputError(f"{out}: {error.strerror}; choose another folder") from None
 
 
 def design_draws(

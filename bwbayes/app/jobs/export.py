@@ -1,7 +1,8 @@
 """``bwbayes export``: the posterior's mean model for a controller, as JSON and as C.
 
 Two files come of it: ``model.json`` has the parts, all coefficients with units, and the linear part
-as matrices; ``actuator.c`` is the model and its inverse, one sample a call.
+as matrices; ``actuator.c`` is the model and its inverse, one sample a call. In both 0 um is where
+the demagnetized actuator stands at zero volts.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import Exported, exported
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Hold
+from bwbayes.model.linear import Hold, parse_hold
 
 __all__ = ["at_rate", "export", "export_draws"]
 
@@ -42,7 +43,7 @@ def export_draws(
     *,
     voltage: tuple[float, float] | None = None,
     rate: float | None = None,
-    hold: Hold | None = None,
+    hold: str = "zoh",
     overwrite: bool = False,
 ) -> tuple[Exported, list[Path]]:
     """Write the mean model of draws for a controller; return it, and the files.
@@ -56,12 +57,14 @@ def export_draws(
     folder
         Where the files go.
     voltage
-        Lowest and highest that the inverse may give, V; by default those of the record.
+        Lowest and highest that the inverse may give, V; by default zero and those of all records
+        fitted.
     rate
         The controller's samples a second; by default the record's.
     hold
-        ``"zero"`` if the voltage is held between samples, ``"first"`` if it goes straight; by
-        default as in the record.
+        What the voltage does between samples, whatever it did in the record: ``"zoh"``, it is held,
+        as a controller's DAC does (zero-order hold); ``"foh"``, it goes in straight lines, for a
+        model beside a measured voltage (first-order hold).
     overwrite
         Whether files may be replaced.
 
@@ -75,14 +78,14 @@ def export_draws(
     # Of several records the first: what belongs to a record matters little to a controller.
     one = posterior.datasets[0]
     theta = one.table.actuator(posterior.table.of(posterior.prior.theta(flat), one.name))
-    actuator = at_rate(one.actuator, rate, hold)
+    actuator = at_rate(one.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    made = exported(name, actuator, theta.mean(axis=0), limits_of(problem, voltage), sds)
+    made = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
     return made, _written(made, folder, overwrite)
 
 
-def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuator:
+def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
     """Return an actuator at a controller's pace: so many samples a second, with this hold.
 
     Raises
@@ -93,7 +96,7 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold | None) -> Actuat
     if rate is not None and not 0 < rate <= LARGEST_RATE:
         raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")
     interval = actuator.interval if rate is None else 1 / rate
-    return replace(actuator, interval=interval, hold=hold or actuator.hold)
+    return replace(actuator, interval=interval, hold=hold)
 
 
 def _written(made: Exported, folder: Path, overwrite: bool) -> list[Path]:
@@ -106,5 +109,5 @@ def _written(made: Exported, folder: Path, overwrite: bool) -> list[Path]:
         numbers.write_text(f"{text}\n", encoding="utf-8")
         code.write_text(made.c_code(), encoding="ascii")
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; choose another place with --out") from None
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
     return [numbers, code]

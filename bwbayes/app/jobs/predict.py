@@ -6,7 +6,9 @@ verdict (JSON) and a picture (PNG). No file is replaced unless that is asked for
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -20,18 +22,21 @@ from bwbayes.app.running.predictions import (
     training_record,
 )
 from bwbayes.app.running.run import finished
-from bwbayes.app.screen import show_scores, show_verdicts
+from bwbayes.app.screen import show_scores, show_standing
 from bwbayes.data import Record, read_record
+from bwbayes.data.io.columns import Naming
 from bwbayes.data.waveforms import signal
-from bwbayes.errors import InputError
+from bwbayes.errors import ColumnsError, InputError
 from bwbayes.results.outputs import write_bands, write_summary
 from bwbayes.results.prediction import Start
+from bwbayes.results.standing import Standing
 from bwbayes.sampling.sampler import draws
 
 __all__ = ["DOES_NOT_HOLD", "predict"]
 
 DOES_NOT_HOLD = 3
 NOT_CONVERGED = 4
+INCONCLUSIVE = 5
 
 
 def predict(
@@ -42,6 +47,7 @@ def predict(
     out: Path | None,
     console: Console,
     *,
+    naming: Naming | None = None,
     window: tuple[float, float] | None = None,
     of: str | None = None,
     overwrite: bool = False,
@@ -63,7 +69,7 @@ def predict(
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
     for target in (table, numbers, picture):
         if target.exists() and not overwrite:
-            raise InputError(f"{target}: exists; choose another name, or give --overwrite")
+            raise InputError(f"{target}: exists; choose another name, or give `overwrite=True`")
     problem, chain, outcome = finished(folder)
     if not outcome.converged:
         click.echo(
@@ -71,15 +77,15 @@ def predict(
         )
         return NOT_CONVERGED
     of = training_record(problem, of)
-    other = _record(problem, of, record, waveform)
+    other = _record(problem, of, path, record, naming or Naming(), waveform)
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     if record is None and start.after:
         bands = predict_after(problem, flat, other.voltage, name, of)
     else:
         bands = predict_another(problem, flat, other, start, name, window, of)
     scores, verdict = bands.scores, bands.verdict
-    if verdict is not None:
-        show_verdicts([verdict], console)
+    standing = Standing.of([verdict] if verdict else [])
+    show_standing(standing, console)
     for remark in bands.remarks:
         click.echo(f"bwbayes: {name}: {remark}", err=True)
     try:
@@ -88,21 +94,32 @@ def predict(
         write_summary(numbers, bands.numbers())
         save_one(bands.plot(), picture)
     except OSError as error:
-        raise InputError(f"{table}: {error.strerror}; choose another place with --out") from None
+        raise InputError(f"{table}: {error.strerror}; choose another place") from None
     if scores is not None and verdict is not None:
         show_scores({name: scores}, console, {name: verdict})
     for target in (table, numbers, picture):
         console.print(f"wrote {target}", highlight=False, soft_wrap=True)
-    if verdict is not None and verdict.holds is False:
-        click.echo(f"DOES NOT HOLD: {name}; see {picture}", err=True)
-        return DOES_NOT_HOLD
-    return 0
+    return {True: 0, False: DOES_NOT_HOLD, None: INCONCLUSIVE}[standing.holds]
 
 
-def _record(problem: Problem, of: str, path: Path | None, waveform: str | None) -> Record:
+def _record(
+    problem: Problem,
+    of: str,
+    folder: Path,
+    path: Path | None,
+    naming: Naming,
+    waveform: str | None,
+) -> Record:
     """Read the record, or sample the signal as the training record was sampled."""
     if path is not None:
-        return read_record(path, need_displacement=False)
+        known: dict[str, Any] = {"columns": naming.columns, "units": naming.units, "fs": naming.fs}
+        try:
+            return read_record(path, need_displacement=False, **known)
+        except ColumnsError as error:
+            command = (
+                f"bwbayes predict {shlex.quote(str(folder))} --record {shlex.quote(str(path))}"
+            )
+            raise error.in_command(command) from None
     assert waveform is not None
     interval = problem.records[of].interval
     _, voltage = signal(waveform).sample(1 / interval)

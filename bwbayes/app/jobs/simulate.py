@@ -48,7 +48,7 @@ def simulate(
     beside = out.with_name(f"{out.stem}.truth{out.suffix}")
     for path in (out, beside, parameters):
         if path.exists() and not overwrite:
-            raise InputError(f"{path}: exists; choose another name, or give --overwrite")
+            raise InputError(f"{path}: exists; choose another name, or give `overwrite=True`")
     amplitude, frequency, duration = sine
     waveform = Waveform(Sine(amplitude, frequency), duration) if signal == "sine" else named(signal)
     kind = cast("Literal['none', 'process', 'structural']", discrepancy)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.tracking import draw_tracking
-from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
 from bwbayes.app.jobs.export import at_rate
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.report.track_report import render
@@ -37,14 +37,14 @@ SHORT = ("linear", "feed-forward", "PID", "both")
 LONGEST_DELAY = 100
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Setup:
     """A loop around a fitted actuator.
 
     Parameters
     ----------
     voltage
-        Lowest and highest of the amplifier, V; by default those of all records fitted.
+        Lowest and highest of the amplifier, V; by default zero and those of all records fitted.
     rate
         Samples a second.
     delay
@@ -101,7 +101,7 @@ def track_draws(problem: Problem, flat: FloatArray, setup: Setup) -> Tracking:
     theta = posterior.table.of(posterior.prior.theta(every), one.name)
     some = theta[: setup.draws]
     actuator = at_rate(one.actuator, setup.rate, "zero")
-    stand = Stand(limits_of(problem, setup.voltage), setup.delay)
+    stand = Stand(command_limits(problem, setup.voltage), setup.delay)
     wishes = Wishes(setup.robustness, setup.frequencies, setup.amplitude)
     return track(
         actuator,
@@ -148,7 +148,7 @@ def track_run(
         save_one(draw_tracking(made), files[2])
         files[3].write_text(render(name, made, files[2].read_bytes()), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; choose another place with --out") from None
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
     return made, files
 
 

@@ -175,5 +175,5 @@ def _moved(one: ValidationConfig, parts: Mapping[str, tuple[str, float]]) -> Val
     root, shift = parts[one.of]
     window = one.window
     if window is not None and not one.another:
-        window = [edge + shift for edge in window]
+        window = [[edge + shift for edge in part] for part in window]
     return one.model_copy(update={"of": root, "window": window})

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 from bwbayes.app.config.config import ALONE, Config, RecordConfig
@@ -37,8 +38,9 @@ from bwbayes.app.problem.records import (
     windows_of,
 )
 from bwbayes.app.problem.stand import recoverable
+from bwbayes.arrays import IntArray
 from bwbayes.data import Record
-from bwbayes.data.inspection import Finding
+from bwbayes.data.inspection import Finding, isolated_outliers
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -48,9 +50,10 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.table import JointTable
 from bwbayes.model.distributions import Distribution
-from bwbayes.results.extrapolation import beyond_training
+from bwbayes.results.extrapolation import Extrapolation, beyond_training
 from bwbayes.results.prediction import Start
 from bwbayes.sampling.sampler import SamplingPlan, best_together
+from bwbayes.shown import brief
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
 
@@ -63,14 +66,14 @@ MADE_UP_FOR = ("one amplitude", "few readings")
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out data: a window (slice) of a training record, or another record and its start.
+    """Held-out data: windows (slices) of a training record, or another record and its start.
 
     ``judged`` is the window in s of another record that is judged, if not all of it. ``of`` is the
-    training record that the window is of, or whose own parameters another record takes where
+    training record that the windows are of, or whose own parameters another record takes where
     nothing tells its own.
     """
 
-    window: slice | None = None
+    windows: tuple[slice, ...] = ()
     record: Record | None = None
     start: Start = field(default_factory=Start)
     judged: tuple[float, float] | None = None
@@ -84,6 +87,8 @@ class Problem:
     ``records`` are those that are fitted, by name; ``findings`` what is wrong with each;
     ``defaults`` what the default priors of these records would be, by the parameters' name.
     """
+
+    __repr__ = brief
 
     config: Config
     records: Mapping[str, Record]
@@ -118,23 +123,29 @@ class Problem:
         every = {name: one.record for name, one in self.validations.items()}
         return {name: record for name, record in every.items() if record is not None}
 
-    def windows(self, record: str) -> dict[str, slice]:
+    def extrapolations(self, name: str) -> list[Extrapolation]:
+        """Return in what the drive of the band of that name leaves the training data."""
+        validation = self.validations.get(name)
+        if validation is None:
+            return []
+        record = validation.record or self.records[validation.of]
+        windows = validation.windows
+        window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
+        return beyond_training(self.posterior, record.voltage, record.interval, window)
+
+    def windows(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record by the names of their bands, fitted ones first.
 
         Those of one record alone are called "training", those of several as their record is.
         """
-        one = self.posterior.alone(record).only
+        training = self.posterior.alone(record).only.training
         name = "training" if len(self.records) == 1 else record
-        windows = {
-            name if len(one.training) == 1 else f"{name}-{i + 1}": window
-            for i, window in enumerate(one.training)
-        }
-        return windows | self.held_out(record)
+        return {name: training, **self.held_out(record)}
 
-    def held_out(self, record: str) -> dict[str, slice]:
+    def held_out(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record that were held out, by name."""
         every = self.validations.items()
-        return {name: v.window for name, v in every if v.window is not None and v.of == record}
+        return {name: v.windows for name, v in every if v.windows and v.of == record}
 
 
 def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
@@ -168,7 +179,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         name: tuple(
             one
             for one in findings_of(
-                record, (*windows[name].training, *windows[name].held_out.values())
+                record, [*windows[name].training, *chain(*windows[name].held_out.values())]
             )
             if len(fitted) == 1 or one.kind not in MADE_UP_FOR
         )
@@ -177,14 +188,25 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     remarks = [*said]
     remarks += [f"{name}: {finding}" for name, every in findings.items() for finding in every]
     remarks += [text for name, other in others.items() for text in unlike(config, name, other)]
-    posterior, defaults = _posterior(config, fitted, windows)
     aside = {name: one.outliers for name, one in config.records.items()}
-    if config.model.outliers and None in aside.values():
-        spoilt = outliers(posterior, generator(config.seed, "outliers"))
-        for name in [name for name, times in aside.items() if times is None]:
-            aside[name] = fitted[name].time[spoilt[name]].tolist()
-            fitted[name] = fitted[name].without(spoilt[name])
-        posterior = posterior.with_readings({n: readings_of(one) for n, one in fitted.items()})
+    unjudged = [name for name, times in aside.items() if times is None]
+    if config.model.outliers and unjudged:
+        # Their ranges would make the default priors, so these are made anew without them.
+        every = dict(fitted)
+
+        def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
+            fitted.update({n: every[n].without(rows[n]) for n in unjudged if n in rows})
+            return _posterior(config, fitted, windows)[0]
+
+        spoilt = outliers(
+            posterior_without,
+            generator(config.seed, "outliers"),
+            {name: isolated_outliers(every[name], ends=True) for name in unjudged},
+        )
+        for name in unjudged:
+            aside[name] = every[name].time[spoilt[name]].tolist()
+            fitted[name] = every[name].without(spoilt[name])
+    posterior, defaults = _posterior(config, fitted, windows)
     several = len(fitted) > 1
     remarks += [
         (f"{name}: " if several else "") + _set_aside(times)
@@ -192,14 +214,9 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         if times is not None
     ]
     validations = _validations(config, windows, others)
-    for name, one in validations.items():
-        other = one.record or fitted[one.of]
-        voltage = other.voltage[one.window or slice(None)]
-        leaving = beyond_training(posterior, voltage, other.interval)
-        remarks += [f"{name}: {remark}" for remark in leaving]
     first = posterior.datasets[0]
     truth = (recoverable(stand, first.actuator) if stand else {}) | config.truth
-    return Problem(
+    problem = Problem(
         _explicit(config, posterior, truth, aside, said),
         fitted,
         posterior,
@@ -209,6 +226,9 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         defaults,
         findings,
     )
+    for name in validations:
+        remarks += [f"{name}: {one.line}" for one in problem.extrapolations(name)]
+    return replace(problem, remarks=tuple(remarks))
 
 
 def _posterior(
@@ -255,9 +275,9 @@ def _validations(
     for name, v in config.validation.items():
         of = v.of or next(iter(windows))
         if v.another:
-            judged = None if v.window is None else (v.window[0], v.window[1])
+            judged = None if v.window is None else (v.window[0][0], v.window[0][1])
             start = start_of(config, name)
-            validations[name] = Validation(None, others[name], start, judged, of)
+            validations[name] = Validation((), others[name], start, judged, of)
         else:
             validations[name] = Validation(windows[of].held_out[name], of=of)
     return validations
@@ -323,7 +343,7 @@ def _explicit(
         name: v.model_copy(
             update={
                 "file": f"records/{name}.h5",
-                **dict.fromkeys(("signal", "voltage_is", "columns", "units")),
+                **dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs")),
             }
         )
         if v.another

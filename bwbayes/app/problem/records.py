@@ -20,7 +20,8 @@ from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.stand import planned, stand_of
 from bwbayes.data import Record, read_record
 from bwbayes.data.inspection import Finding, inspect
-from bwbayes.data.record import Window, require_readable
+from bwbayes.data.io.formats import require_readable
+from bwbayes.data.record import Window
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import (
     Carrier,
@@ -31,7 +32,7 @@ from bwbayes.data.waveforms import (
     Waveform,
     signal,
 )
-from bwbayes.errors import InputError
+from bwbayes.errors import ColumnsError, InputError
 from bwbayes.results.prediction import Start
 
 __all__ = [
@@ -54,7 +55,7 @@ class Windows:
     """The windows of one training record, as slices: to fit, and held out by name."""
 
     training: tuple[slice, ...]
-    held_out: Mapping[str, slice]
+    held_out: Mapping[str, tuple[slice, ...]]
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
@@ -91,7 +92,7 @@ def training_records(
     commands: dict[str, Waveform] = {}
     for name, source in config.records.items():
         if source.file is not None:
-            read[name] = _read(source, folder, given.get(name))
+            read[name] = _read(source, folder, given.get(name), place_of(name))
         else:
             assert source.signal is not None
             commands[name] = sampled_waveform(source.signal)
@@ -128,17 +129,23 @@ def _cut(source: RecordConfig, record: Record, place: str) -> Record:
     return record
 
 
-def _read(source: RecordConfig | ValidationConfig, folder: Path, given: Record | None) -> Record:
+def _read(
+    source: RecordConfig | ValidationConfig, folder: Path, given: Record | None, place: str
+) -> Record:
     """Return the record that is given, or else read the source's file."""
     if given is not None:
         return replace(given, voltage_is=source.voltage_is or given.voltage_is)
     assert source.file is not None
-    return read_record(
-        folder / source.file,
-        voltage_is=source.voltage_is,
-        columns=source.columns,
-        units=source.units,
-    )
+    try:
+        return read_record(
+            folder / source.file,
+            voltage_is=source.voltage_is,
+            columns=source.columns,
+            units=source.units,
+            fs=source.fs,
+        )
+    except ColumnsError as error:
+        raise error.within(place) from None
 
 
 def other_record(
@@ -151,7 +158,7 @@ def other_record(
     """Return the record of a validation: from memory, a file, or the virtual stand."""
     source = config.validation[name]
     if source.file is not None:
-        record = _read(source, folder, given)
+        record = _read(source, folder, given, f"validation.{name}")
         if given is not None:
             require_readable(record, f"validation.{name}")
     else:
@@ -169,7 +176,7 @@ def other_record(
         raise InputError(f"validation.{name}.lead_in: {error}") from None
     if source.window is not None:
         try:
-            record.window_slice(source.window[0], source.window[1])
+            record.window_slice(*source.window[0])
         except InputError as error:
             raise InputError(f"validation.{name}.{error}") from None
     return record
@@ -208,7 +215,7 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
     """
     source, place = config.records[name], place_of(name)
     held_out = {
-        n: v.window
+        f"validation.{n}.window": sorted((window[0], window[1]) for window in v.window)
         for n, v in config.validation.items()
         if v.window and not v.another and v.of in (name, None)
     }
@@ -216,28 +223,30 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
         train = [whole(record)]
     else:
         train = [(window[0], window[1]) for window in source.train]
-    for where, edges in (
-        *((f"{place}.train", one) for one in train),
-        *((f"validation.{n}.window", (one[0], one[1])) for n, one in held_out.items()),
-    ):
+    given = {f"{place}.train": train, **held_out}
+    for where, window in [(key, window) for key in given for window in given[key]]:
         try:
-            record.window_slice(*edges)
+            record.window_slice(*window)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
     try:
-        split = record.split(train, [(window[0], window[1]) for window in held_out.values()])
+        split = record.split(train, [window for windows in held_out.values() for window in windows])
     except InputError as error:
         raise InputError(str(error).replace("record.train", f"{place}.train")) from None
-    parts = [(f"{place}.train", window) for window in split.training]
-    parts += [(f"validation.{n}.window", w) for n, w in zip(held_out, split.held_out, strict=True)]
-    for where, part in parts:
-        if not record.has_reading[part].any():
-            begin, end = record.time[part][[0, -1]]
-            raise InputError(
-                f"{where}: no readings from {begin:g} to {end:g} s; choose another window, or see "
-                f"start, exclude and decimate in [{place}]"
-            )
-    return Windows(split.training, dict(zip(held_out, split.held_out, strict=True)))
+    slices = {
+        where: tuple(record.window_slice(*window) for window in windows)
+        for where, windows in held_out.items()
+    }
+    for where, parts in {f"{place}.train": split.training, **slices}.items():
+        for part in parts:
+            if not record.has_reading[part].any():
+                begin, end = record.time[part][[0, -1]]
+                raise InputError(
+                    f"{where}: no readings from {record.clock(begin)} to {record.clock(end)} s; "
+                    f"choose another window, or see start, exclude and decimate in [{place}]"
+                )
+    names = [where.removeprefix("validation.").removesuffix(".window") for where in slices]
+    return Windows(split.training, dict(zip(names, slices.values(), strict=True)))
 
 
 def require_different(records: Mapping[str, Record], windows: Mapping[str, Windows]) -> None:

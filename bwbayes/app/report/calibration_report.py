@@ -129,7 +129,7 @@ def _percent(pair: Sequence[float]) -> str:
 
 def _facts(problem: Problem, numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     model, plan = problem.config.model, problem.plan
-    held_out = [v.window for v in problem.validations.values() if v.window is not None]
+    held_out = [window for v in problem.validations.values() for window in v.windows]
     judged = sum(window.stop - window.start for window in held_out)
     windows = [window for one in problem.posterior.datasets for window in one.training]
     fitted = sum(window.stop - window.start for window in windows)

@@ -17,6 +17,7 @@ def render(comparison: Comparison, problem: Problem) -> str:
     """Return the page of a comparison; ``problem`` is that of any of its runs."""
     less = list(differences(comparison))
     return template("comparison.html.j2").render(
+        run_standing=comparison.standing,
         recommended=comparison.recommended,
         lines=comparison.lines,
         against=comparison.against,

@@ -12,15 +12,12 @@ from bwbayes.app.report.page import Table, picture, template
 from bwbayes.results.bands import LEVELS
 
 if TYPE_CHECKING:
-    from bwbayes.control.compensation import Compensation
+    from bwbayes.control.predicted import Compensation
 
 __all__ = ["render"]
 
 # How an actuator starts of which nothing is known.
-ANYHOW = "waited at the first voltage, after any drive"
-
-# How an actuator starts of which nothing is known.
-ANYHOW = "waited at the first voltage, after any drive"
+ANYHOW = "waited at zero volts, after any drive"
 
 CAPTIONS = {
     "tracking": (
@@ -30,8 +27,8 @@ CAPTIONS = {
     ),
     "error": (
         "Error",
-        "Left: the tracking error with its 95 % bands; dotted, the limit. Right: what its rms may "
-        "be, with the discrepancy, over the draws.",
+        "Left: the tracking error, to the reference as requested, with its 95 % bands; dotted, the "
+        "limit. Right: what its rms may be, with the discrepancy, over the draws.",
     ),
     "loops": (
         "Before and after",
@@ -55,6 +52,13 @@ def render(made: Compensation, pictures: Mapping[str, bytes]) -> str:
     if made.limit is not None:
         texts = [f"{summary[one]['probability_below_limit']:.3f}" for one in both]
         rows.append((f"Probability that the error stays below {made.limit:g} µm", *texts, ""))
+    if made.reference.moved > 0:
+        for key, title in (("rms_um", "Rms of the error"), ("largest_um", "Largest error")):
+            values = [summary[one]["to_smoothed_reference"][key] for one in both]
+            texts = [f"{one['mean']:.3g}" for one in values]
+            rows.append((f"{title} to the smoothed reference, mean", *texts, "µm"))
+            texts = [_span(one["95"]) for one in values]
+            rows.append((f"{title} to the smoothed reference, 95 % interval", *texts, "µm"))
     return template("compensation.html.j2").render(
         name=made.reference.name,
         summary=summary,
@@ -69,7 +73,10 @@ def _facts(made: Compensation, summary: Mapping[str, Any]) -> list[tuple[str, st
     other = summary["other_command"]
     chosen = {"mean": "inverse of the mean model", "expected": "least expected squared error"}
     rest = {"mean": "expected", "expected": "mean"}[made.command]
-    between = {"zero": "held", "first": "straight lines"}[made.hold]
+    between = {
+        "zero": "held until the next sample, as a DAC does (zero-order hold)",
+        "first": "straight lines (first-order hold)",
+    }[made.hold]
     return [
         (
             "Reference",
@@ -80,12 +87,18 @@ def _facts(made: Compensation, summary: Mapping[str, Any]) -> list[tuple[str, st
         (
             "The other command",
             f"{chosen[rest]}: differs by up to {other['largest_difference_V']:.3g} V, and leaves "
-            f"{other['expected_rms_um']:.4g} µm (rms expected over the draws, without the "
-            f"discrepancy) where this one leaves "
-            f"{summary['compensated']['expected_rms_um']:.4g} µm",
+            f"{made.other:.4g} µm (rms expected over the draws, without the discrepancy, to the "
+            "reference as smoothed) where this one leaves "
+            f"{made.compensated.smoothed.expected:.4g} µm",
         ),
         ("Voltage between samples", between),
-        ("Start", "demagnetised at zero volts" if made.from_rest else ANYHOW),
+        (
+            "Displacement between samples",
+            f"up to {made.between:.3g} µm from a straight line; errors are those at the samples, "
+            "just before the voltage changes",
+        ),
+        ("Start", "demagnetized at zero volts" if made.from_rest else ANYHOW),
+        ("0 µm", "where the actuator stands at zero volts as the command begins"),
     ]
 
 

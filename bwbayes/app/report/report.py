@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from bwbayes.app.figures.style import title
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
 from bwbayes.app.report.page import Picture, Plots, picture, template
-from bwbayes.app.report.words import covered
+from bwbayes.app.report.words import covered, error_text
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
-from bwbayes.results.verdict import Verdict
+from bwbayes.results.standing import Standing
 
 __all__ = ["render"]
 
@@ -64,7 +65,8 @@ def render(
         name=result.name,
         about=_about(result),
         converged=converged,
-        failed=[_verdict(verdict) for verdict in result.failed],
+        standing=result.standing,
+        open=[v for v in result.verdicts.values() if v.holds is result.standing.holds],
         headline=_headline(result),
         answers=list(_answers(result, held_out_first)),
         stop_reason=result.outcome.stop_reason,
@@ -125,12 +127,9 @@ def _span(bands: Bands) -> str:
 
 def _headline(result: Result) -> str:
     """Return what may be said of a converged run none of whose bands fail."""
-    holding = [verdict for verdict in result.verdicts.values() if verdict.holds]
-    if any(not verdict.training for verdict in holding):
-        return "Converged, and the bands hold on readings that were not fitted"
-    if holding:
-        return "Converged, and the bands hold on the readings that were fitted"
-    return "Converged"
+    if any(not verdict.training for verdict in result.verdicts.values()):
+        return "Converged; validation passed on held-out data"
+    return "Converged; validation passed on the training data" if result.verdicts else "Converged"
 
 
 def _answers(result: Result, every: list[Bands]) -> Iterator[dict[str, str]]:
@@ -140,25 +139,13 @@ def _answers(result: Result, every: list[Bands]) -> Iterator[dict[str, str]]:
         scores = result.scores[bands.name]
         verdict = result.verdicts.get(bands.name)
         yield {
-            "where": f"{bands.name} ({_span(bands)}, {'' if bands.training else 'not '}fitted)",
+            "where": f"{title(bands)}, {_span(bands)}",
+            "status": Standing.of([verdict] if verdict else []).status,
             "coverage": covered(scores, "sensor", LEVEL),
             "width": f"{scores.width_um[LEVEL]:.2f} µm",
-            "error": f"{100 * scores.nrmse:.2f} %",
+            "error": error_text(scores),
             "most": f"{scores.max_error_um:.2f} µm",
-            "unsure": "; ".join(verdict.reasons) if verdict and verdict.holds is None else "",
         }
-
-
-def _verdict(verdict: Verdict) -> dict[str, Any]:
-    """Return a verdict that says no, in words."""
-    cause = verdict.cause
-    return {
-        "name": verdict.name,
-        "what": "fitted" if verdict.training else "not fitted",
-        "reasons": verdict.reasons,
-        "cause": cause.text if cause else tables.UNKNOWN,
-        "remedy": cause.remedy if cause else tables.UNKNOWN,
-    }
 
 
 def _circumstances(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from bwbayes.app.figures.style import title, unit_text
 from bwbayes.app.report.page import Table
-from bwbayes.app.report.words import covered, digits, symbol
+from bwbayes.app.report.words import covered, digits, error_text, symbol
 from bwbayes.inference.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.results.bands import LEVELS
@@ -164,13 +164,13 @@ def validation(result: Result, summary: Summary) -> Table:
     judged = [bands for bands in result.bands if bands.name in result.scores]
     judged.sort(key=lambda bands: bands.training)
     columns = [
-        [("Holds", _held(result, bands.name)), *_scores(result.scores[bands.name])]
+        [("Validation", _held(result, bands.name)), *_scores(result.scores[bands.name])]
         for bands in judged
     ]
     rows = [[row[0][0], *(text for _, text in row)] for row in zip(*columns, strict=True)]
     kept = {bands.name: summary["validation"][bands.name] for bands in judged}
     titles = ["Quantity", *(title(bands) for bands in judged)]
-    return Table("validation", "How the bands did on readings", titles, rows, records=_flat(kept))
+    return Table("validation", "Band validation", titles, rows, records=_flat(kept))
 
 
 def loops(result: Result, summary: Summary) -> Table | None:
@@ -257,12 +257,12 @@ def _held(result: Result, name: str) -> str:
     verdict = result.verdicts.get(name)
     if verdict is None:
         return UNKNOWN
-    return {True: "yes", False: "NO", None: "cannot be told"}[verdict.holds]
+    return {True: "passed", False: "FAILED", None: "inconclusive"}[verdict.holds]
 
 
 def _scores(scores: Scores) -> Iterator[tuple[str, str]]:
     """Yield titles and texts of one column of the scores, the levels from the widest band."""
-    yield "NRMSE of the mean", f"{100 * scores.nrmse:.2f} %"
+    yield "NRMSE of the mean", error_text(scores)
     yield "Largest error of the mean", f"{scores.max_error_um:.2f} µm"
     yield "CRPS", f"{scores.crps_um:.3f} µm"
     for level in sorted(LEVELS, reverse=True):

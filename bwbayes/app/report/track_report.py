@@ -49,6 +49,7 @@ def render(name: str, tracking: Tracking, png: bytes) -> str:
             ("delay", f"in samples, from a reading to the command that answers it: {stand.delay}"),
             ("DAC", f"steps of {stand.amplifier.step:.3g} V, {stand.amplifier.slew:.3g} V/s"),
             ("ADC", f"steps of {stand.sensor.step:.3g} µm"),
+            ("0 µm", "where the demagnetized actuator stands at zero volts"),
         ],
     )
 

@@ -12,7 +12,10 @@ from markupsafe import Markup
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.scores import Scores
 
-__all__ = ["Symbol", "covered", "digits", "symbol"]
+__all__ = ["Symbol", "covered", "digits", "error_text", "symbol"]
+
+# A range is another where it differs by more than this part.
+OTHER_RANGE = 0.05
 
 
 class Symbol(NamedTuple):
@@ -72,3 +75,11 @@ def covered(scores: Scores, kind: str, level: int) -> str:
         return ""
     text = f"{100 * share[level]:.1f}"
     return f"{text} %" if error is None else f"{text} ± {100 * error[level]:.1f} %"
+
+
+def error_text(scores: Scores) -> str:
+    """Write the NRMSE, of the training range too where that is another than the record's own."""
+    text, full = f"{100 * scores.nrmse:.2f}%", scores.nrmse_full
+    if full is None or abs(full - scores.nrmse) <= OTHER_RANGE * scores.nrmse:
+        return text
+    return f"{text} ({100 * full:.2f}% of the training range)"

@@ -101,12 +101,13 @@ def assemble(
         for name, one in series.items()
         for remark in innovations.remarks(one)
     ]
-    verdicts = judged(problem, bands, Background.of(posterior, flat), series, followed)
+    background = Background.of(posterior, flat)
+    verdicts = judged(problem, bands, background, series, followed)
     return replace(
         result,
         bands=bands,
         scores={
-            one.name: score(one, scoring(problem.config.seed, one))
+            one.name: score(one, scoring(problem.config.seed, one), background.extent)
             for one in bands
             if one.name in verdicts
         },
@@ -119,5 +120,10 @@ def assemble(
         replicated={
             one.name: replicated(posterior, chosen, source, one.name) for one in posterior.datasets
         },
-        remarks=(*result.remarks, *agreement.remarks(compared), *odd),
+        remarks=(
+            *result.remarks,
+            *agreement.remarks(compared),
+            *odd,
+            *(f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes),
+        ),
     )

@@ -111,11 +111,11 @@ class CampaignFolder:
             if begun.config.read_text(encoding="utf-8") != config or begun.origin() != origin:
                 raise InputError(
                     f"{path}: is a campaign of another config or other records; choose another "
-                    "folder with --out, or give --overwrite"
+                    "folder, or give `overwrite=True`"
                 )
             return begun
         if path.exists() and any(path.iterdir()) and not folder.journal.is_file():
-            raise InputError(f"{path}: is not a campaign's folder; choose another with --out")
+            raise InputError(f"{path}: is not a campaign's folder; choose another")
         draft = path.absolute().with_name(f".{path.name}.partial")
         try:
             shutil.rmtree(draft, ignore_errors=True)
@@ -128,7 +128,7 @@ class CampaignFolder:
             draft.rename(path)
         except OSError as error:
             reason = error.strerror or error
-            raise InputError(f"{path}: {reason}; choose another folder with --out") from None
+            raise InputError(f"{path}: {reason}; choose another folder") from None
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return folder
@@ -144,9 +144,7 @@ class CampaignFolder:
         """
         folder = cls(path)
         if not (folder.journal.is_file() and folder.config.is_file()):
-            raise InputError(
-                f"{path}: no campaign here; start one with `bwbayes campaign FOLDER --out {path}`"
-            )
+            raise InputError(f"{path}: no campaign here; give the folder of one")
         return folder
 
     def origin(self) -> Origin:
@@ -163,7 +161,7 @@ class CampaignFolder:
         except ValidationError:
             raise InputError(
                 f"{self.journal}: does not say which records it is about; start again with "
-                "--overwrite"
+                "`overwrite=True`"
             ) from None
 
     def finished(self) -> dict[str, Finished]:

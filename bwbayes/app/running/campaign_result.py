@@ -14,11 +14,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from bwbayes.population.population import Among, Population
+from bwbayes.shown import brief
 
 __all__ = ["CampaignResult", "Row", "summary", "table"]
 
 # How a record ended, in the order in which they matter, and the exit status of each.
-STATUSES = {"refused": 2, "not converged": 4, "does not hold": 3, "done": 0}
+STATUSES = {
+    "refused": 2,
+    "not converged": 4,
+    "validation failed": 3,
+    "validation inconclusive": 5,
+    "passed": 0,
+}
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,8 @@ class CampaignResult:
     ``untold`` says why there is none.
     """
 
+    __repr__ = brief
+
     rows: tuple[Row, ...]
     population: Population | None
     untold: str = ""
@@ -59,7 +68,7 @@ class CampaignResult:
 
     @property
     def exit_status(self) -> int:
-        """The status of the command: 2 records were refused, else 4, 3 or 0 as of a run."""
+        """The status of the command: 2 if records were refused, else 4, 3, 5 or 0 as of a run."""
         return next((s for name, s in STATUSES.items() if self.counts[name]), 0)
 
     @property

@@ -165,7 +165,7 @@ def cluster(address: str | None, workers: int | None) -> Iterator[Cluster]:
         import distributed  # noqa: PLC0415
     except ImportError:
         raise InputError(
-            "--executor dask: distributed is not installed; install bwbayes[dask]"
+            "executor dask: distributed is not installed; install bwbayes[dask]"
         ) from None
     # What a person has to know is said in one line; the rest is for those who run the cluster.
     for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.core"):
@@ -189,7 +189,7 @@ def cluster(address: str | None, workers: int | None) -> Iterator[Cluster]:
             client = distributed.Client(local or f"tcp://{address}", timeout=PATIENCE)
         except (OSError, TimeoutError, ValueError):
             raise InputError(
-                f"--executor dask://{address}: no scheduler there; start one with `dask scheduler`"
+                f"executor dask://{address}: no scheduler there; start one with `dask scheduler`"
             ) from None
         try:
             _require_workers(client, address)
@@ -207,14 +207,14 @@ def _require_workers(client: Any, address: str | None) -> None:
         every: dict[str, str] = client.run(_version)
     except TimeoutError:
         raise InputError(
-            f"--executor dask://{address}: the scheduler has no worker; start some with "
+            f"executor dask://{address}: the scheduler has no worker; start some with "
             f"`dask worker {address} --nthreads 1`"
         ) from None
     own = _version()
     other = next(((name, text) for name, text in every.items() if text != own), None)
     if other is not None:
         raise InputError(
-            f"--executor dask://{address}: the worker {other[0]} has {other[1] or 'no bwbayes'}, "
+            f"executor dask://{address}: the worker {other[0]} has {other[1] or 'no bwbayes'}, "
             f"here is {own}; install the same"
         )
 

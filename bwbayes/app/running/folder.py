@@ -7,6 +7,7 @@ refuses a second writer.
 
 from __future__ import annotations
 
+import json
 import shutil
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.lock import only_writer
 from bwbayes.data import write_record
 from bwbayes.errors import InputError
+from bwbayes.results.standing import Standing
 
 __all__ = ["CalibrationFolder", "RunFolder"]
 
@@ -28,11 +30,17 @@ class RunFolder:
 
     path: Path
 
-    # What it holds, the file that only such a folder has at its start, and the commands for it.
+    # What it holds, the file that only such a folder has at its start, and what begins it and goes
+    # on with it.
     KIND: ClassVar[str] = "run"
     MARK: ClassVar[str | None] = None
-    BEGIN: ClassVar[str] = "bwbayes run CONFIG --out"
-    GO_ON: ClassVar[str] = "bwbayes resume"
+    BEGIN: ClassVar[str] = "bwbayes.fit(RECORD, folder={path!r})"
+    GO_ON: ClassVar[str] = "bwbayes.resume_run({path!r})"
+
+    @property
+    def resuming(self) -> str:
+        """What goes on with it, for messages."""
+        return f"`{self.GO_ON.format(path=str(self.path))}`"
 
     @property
     def config(self) -> Path:
@@ -49,6 +57,18 @@ class RunFolder:
         """The run's numbers."""
         return self.path / "summary.json"
 
+    def standing(self) -> Standing:
+        """Return whether the bands of the run hold.
+
+        Raises
+        ------
+        InputError
+            The run is not finished.
+        """
+        if not self.summary.is_file():
+            raise InputError(f"{self.path}: is not finished; resume it: `{self.GO_ON} {self.path}`")
+        return Standing.read(json.loads(self.summary.read_text(encoding="utf-8")))
+
     @classmethod
     def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
         """Make the folder of a new run, whole or not at all; ``mark`` goes into its mark.
@@ -59,15 +79,15 @@ class RunFolder:
             It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
         if path.name == "..":
-            raise InputError(f"{path}: is not a valid folder name; choose one with --out")
+            raise InputError(f"{path}: is not a valid folder name; choose another")
         if path.exists():
             if not overwrite:
                 raise InputError(
-                    f"{path}: exists; go on with `{cls.GO_ON} {path}`, choose another folder "
-                    "with --out, or give --overwrite"
+                    f"{path}: exists; go on with {cls(path).resuming}, choose another folder, or "
+                    "give `overwrite=True`"
                 )
             if not cls(path)._may_go():
-                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another with --out")
+                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
         draft = path.absolute().with_name(f".{path.name}.partial")
         try:
             shutil.rmtree(draft, ignore_errors=True)
@@ -83,7 +103,7 @@ class RunFolder:
             draft.rename(path)
         except OSError as error:
             reason = error.strerror or error
-            raise InputError(f"{path}: {reason}; choose another folder with --out") from None
+            raise InputError(f"{path}: {reason}; choose another folder") from None
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return cls(path)
@@ -105,7 +125,7 @@ class RunFolder:
             raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
         if folder.config.is_file() and folder._has_records():
             raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
-        raise InputError(f"{where}; start one with `{cls.BEGIN} {path}`")
+        raise InputError(f"{where}; start one with `{cls.BEGIN.format(path=str(path))}`")
 
     def _has_records(self) -> bool:
         """Tell a folder that was made from one that holds a config alone."""
@@ -133,8 +153,8 @@ class CalibrationFolder(RunFolder):
 
     KIND: ClassVar[str] = "calibration"
     MARK: ClassVar[str] = "replicates.jsonl"
-    BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out"
-    GO_ON: ClassVar[str] = "bwbayes calibrate --resume"
+    BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out {path}"
+    GO_ON: ClassVar[str] = "bwbayes calibrate --resume {path}"
 
     @property
     def replicates(self) -> Path:

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from bwbayes.app.figures import draw_alone
 from bwbayes.app.problem.problem import Problem, generator
-from bwbayes.app.screen import show_scores, show_verdicts
+from bwbayes.app.screen import show_scores, show_standing
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
@@ -39,8 +39,10 @@ from bwbayes.results.prediction import (
 )
 from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores, as_summary, score
+from bwbayes.results.standing import Standing
 from bwbayes.results.transient import Transient
 from bwbayes.results.verdict import Background, Verdict, assess
+from bwbayes.shown import head
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +56,7 @@ class Prediction(Bands):
 
     ``scores`` and ``verdict`` hold the bands against the readings and are None without any;
     ``remarks`` say where the drive leaves what was fitted. All else is as of
-    :class:`~bwbayes.results.bands.Bands`.
+    :class:`bwbayes.Bands`.
     """
 
     scores: Scores | None = None
@@ -110,18 +112,21 @@ class Prediction(Bands):
         }
 
     def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
         said = StringIO()
         console = Console(file=said, width=100, force_jupyter=False, color_system=None)
         console.print(self._title, highlight=False, markup=False, soft_wrap=True)
         if self.scores is not None and self.verdict is not None:
-            show_verdicts([self.verdict], console)
+            show_standing(Standing.of([self.verdict]), console)
             show_scores({self.name: self.scores}, console, {self.name: self.verdict})
-        for remark in self.remarks:
+        for remark in (*self.remarks, *(self.verdict.notes if self.verdict else ())):
             console.print(f"note: {remark}", highlight=False, markup=False, soft_wrap=True)
         return said.getvalue().rstrip()
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
+        return f"<pre>{escape(str(self))}</pre>"
 
     @property
     def _title(self) -> str:
@@ -167,15 +172,16 @@ def predict_another(
         A lead-in or window that does not fit into the record.
     """
     posterior, seed = problem.posterior, problem.config.seed
-    remarks = tuple(beyond_training(posterior, record.voltage, record.interval))
+    far = beyond_training(posterior, record.voltage, record.interval)
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"predict {record.sha256}")
     of = training_record(problem, of)
     alone, its = posterior.alone(of), posterior.its(chosen, of)
     bands = predict_record(alone, its, record, start, source, name, window)
-    verdict = assess(bands, Background.of(posterior, flat), beyond=remarks)
-    scores = None if verdict is None else score(bands, scoring(seed, bands))
-    return Prediction.of(bands, scores, verdict, remarks)
+    background = Background.of(posterior, flat)
+    verdict = assess(bands, background, beyond=far)
+    scores = None if verdict is None else score(bands, scoring(seed, bands), background.extent)
+    return Prediction.of(bands, scores, verdict, tuple(one.line for one in far))
 
 
 def predict_after(
@@ -189,11 +195,13 @@ def predict_after(
     """
     posterior, seed, of = problem.posterior, problem.config.seed, training_record(problem, of)
     record = problem.records[of]
-    remarks = tuple(beyond_training(posterior, voltage, record.interval))
+    whole = np.concatenate([record.voltage, voltage])
+    far = beyond_training(posterior, whole, record.interval, slice(record.samples, None))
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
     alone, its = posterior.alone(of), posterior.its(chosen, of)
-    return Prediction.of(forecast(alone, its, record, voltage, source, name), remarks=remarks)
+    bands = forecast(alone, its, record, voltage, source, name)
+    return Prediction.of(bands, remarks=tuple(one.line for one in far))
 
 
 def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> FloatArray:
@@ -207,8 +215,10 @@ def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> FloatA
     if len(problem.records) > 1:
         raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
     values = np.full(problem.record.samples, np.nan)
-    for name, window in problem.windows(*problem.records).items():
-        values[window] = bands[name].residuals
+    for name, windows in problem.windows(*problem.records).items():
+        whole = slice(windows[0].start, windows[-1].stop)
+        residuals = bands[name].residuals
+        values[whole] = np.where(np.isfinite(residuals), residuals, values[whole])
     return values
 
 
@@ -267,7 +277,7 @@ def judged(
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for one in bands:
-        far = beyond_training(problem.posterior, one.voltage, one.interval)
+        far = problem.extrapolations(one.name)
         record = records.get(one.name) if one.training else None
         start, transient, drift = None, None, None
         # Of several training windows the first one holds the start.

@@ -181,7 +181,7 @@ def redraw(folder: RunFolder) -> Result:
     with folder.locked(), one_thread():
         if not folder.summary.is_file():
             raise InputError(
-                f"{folder.path}: the run is not finished; go on with `bwbayes resume {folder.path}`"
+                f"{folder.path}: the run is not finished; go on with {folder.resuming}"
             )
         seconds = json.loads(folder.summary.read_text(encoding="utf-8"))["wall_s"]
         problem, chain, outcome = finished(folder)
@@ -202,7 +202,7 @@ def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
     chain = ChainFile.read(folder.chain)
     _require_its_own(folder.chain, problem, chain.attributes())
     if chain.blocks("sampling") == 0:
-        raise InputError(f"{folder.path}: no draws yet; go on with `bwbayes resume {folder.path}`")
+        raise InputError(f"{folder.path}: no draws yet; go on with {folder.resuming}")
     as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
     with executor(1) as pool:
         return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
@@ -221,7 +221,7 @@ def _chain(
                 chain.close()
                 raise InputError(
                     f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
-                    f'engine = "{begun}" in {folder.config}, or resume with --engine {now}'
+                    f'engine = "{begun}" in {folder.config}, or resume with `engine="{now}"`'
                 )
             console.print(f"going on with the {now} engine a chain begun with {begun}")
         return chain

@@ -1,29 +1,36 @@
-"""What the columns of a file are: their quantities and units, from their names or as one is told.
+"""Which columns of a file hold time, voltage and displacement, and in which units.
 
-The package's own names carry quantity and unit, ``voltage_mV`` for instance. A :class:`Naming`
-says which columns of a file with other names are meant, and in which units; where it says none,
-the unit is read from the name itself, as in ``t [ms]``, ``pos (nm)`` or ``U_mV``, and a column that
-can be nothing else is recognised by its name: :meth:`Naming.completed`.
+Every reader turns its file into series of numbers; :func:`choose` takes those that are meant. The
+package's own names carry quantity and unit (``voltage_mV``); other names are recognized by their
+word (``t [ms]``, ``pos``), or else by their unit, where they can mean nothing else; a
+:class:`Naming` settles the rest. What is still open is one :class:`ColumnsError`: all of it, with
+the series that there are.
 """
 
 from __future__ import annotations
 
-import contextlib
-import difflib
 import re
 import warnings
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from bwbayes.errors import InputError, InputWarning, one_line
+import numpy as np
 
-__all__ = ["COMMON_NAMES", "UNITS", "Naming", "missing", "recognised", "say_guesses", "unit_in"]
+from bwbayes.data.io.series import Series, Source, require_real
+from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 
-# Powers of ten that lead from a column's unit to s, V and um. Both micro signs of Unicode count.
-_TIME = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
-_VOLTAGE = {"V": 0, "mV": -3, "kV": 3, "uV": -6, "µV": -6, "μV": -6}
-_LENGTH = {"um": 0, "µm": 0, "μm": 0, "nm": -3, "mm": 3, "m": 6}
-UNITS = {"time": _TIME, "voltage": _VOLTAGE, "displacement": _LENGTH, "truth": _LENGTH}
+__all__ = [
+    "COMMON_NAMES",
+    "QUANTITIES",
+    "Naming",
+    "choose",
+    "is_own",
+    "power_of",
+    "unit_in",
+]
+
+QUANTITIES = ("time", "voltage", "displacement")
 COMMON_NAMES = {
     "time": "time_s",
     "voltage": "voltage_V",
@@ -31,15 +38,34 @@ COMMON_NAMES = {
     "truth": "truth_um",
 }
 
+# Units: a prefix's power of ten and a base unit, and the power that leads from it to s, V or um.
+_PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
+_BASES = {"time": ("s", 0), "voltage": ("V", 0), "displacement": ("m", 6), "truth": ("m", 6)}
+_COMMON_UNITS = {
+    "time": ("s", "ms", "us"),
+    "voltage": ("V", "mV", "kV"),
+    "displacement": ("um", "nm", "mm", "m"),
+}
+# Units that are written out.
+_WRITTEN_PREFIXES = {"": "", "pico": "p", "nano": "n", "micro": "u", "milli": "m", "kilo": "k"}
+_WRITTEN_UNITS = {
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+}
+
 # What other people call the quantities, in lower case and without a unit.
 WORDS = {
-    "time": ("t", "time", "timestamp", "sec", "seconds", "zeit"),
+    "time": ("t", "time", "timestamp", "sec", "seconds", "zeit", "x_value", "elapsed time"),
     "voltage": ("u", "v", "volt", "volts", "voltage", "drive", "command", "input", "spannung"),
     "displacement": (
         *("x", "y", "z", "pos", "position", "disp", "displacement", "stroke", "deflection"),
         *("sensor", "output", "weg", "auslenkung"),
     ),
 }
+
+# Series that a message lists, and that are looked at for it.
+_MOST_LISTED, _MOST_LOADED = 12, 40
 
 
 @dataclass(frozen=True)
@@ -49,123 +75,61 @@ class Naming:
     Parameters
     ----------
     columns
-        The name that a column has in the file by quantity, "time", "voltage" or "displacement";
-        the others go by the package's own names.
+        The column of a quantity, "time", "voltage" or "displacement": its name, the end of its
+        path, or its number, counted from 1. The others are recognized.
     units
-        The unit of a column by quantity, where its name does not say it or says another. A minus
-        before it turns the sign: ``"-um"`` is a displacement that the sensor counts backwards.
+        The unit of a quantity, where the file does not state it or states another. A minus before
+        it turns the sign: ``"-um"`` is a displacement that the sensor counts backwards.
+    fs
+        The sampling rate, Hz, in place of a time column.
 
     Raises
     ------
     InputError
-        A quantity that does not exist, a unit that it cannot have, or one column for two
-        quantities.
+        A quantity that does not exist, a unit that it cannot have, one column for two quantities,
+        or a rate that is none.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    fs: float | None = None
 
     def __post_init__(self) -> None:
         for key, table in (("columns", self.columns), ("units", self.units)):
             for quantity in table:
-                if quantity not in WORDS:
-                    known = ", ".join(WORDS)
+                if quantity not in QUANTITIES:
+                    known = ", ".join(QUANTITIES)
                     raise InputError(f"{key}: no quantity {quantity!r}; write {known}")
         for quantity, unit in self.units.items():
-            if unit.removeprefix("-") not in UNITS[quantity]:
-                known = ", ".join(UNITS[quantity])
-                raise InputError(f"units: {quantity} in {unit!r} is unknown; write one of {known}")
+            if power_of(unit.removeprefix("-"), quantity) is None:
+                known = ", ".join(_COMMON_UNITS[quantity])
+                raise InputError(
+                    f"units: {quantity} in {unit!r} is unknown; write {known}, or with another SI "
+                    "prefix"
+                )
         if self.units.get("time", "").startswith("-"):
             raise InputError("units: time does not run backwards; remove the minus")
         if len(set(self.columns.values())) < len(self.columns):
             raise InputError("columns: two quantities have the same column; give each its own")
-
-    def require_in(self, names: Collection[str]) -> None:
-        """Refuse columns that a file with columns of these names does not have.
-
-        Raises
-        ------
-        ValueError
-            With the text ``problem; what to do``, which names the nearest column.
-        """
-        for quantity, name in self.columns.items():
-            if name not in names:
-                near = difflib.get_close_matches(name, names, 1, 0.4)
-                hint = f"did you mean {near[0]!r}?" if near else f"there are {_listed(names)}"
-                raise ValueError(f"no column {name!r} for the {quantity}; {hint}")
-
-    def completed(self, names: Collection[str]) -> Naming:
-        """Return this naming with what it leaves open recognised among a file's columns.
-
-        The columns that are named here and the package's own names come first.
-
-        Raises
-        ------
-        ValueError
-            With the text ``problem; what to do``: a column that is named and missing, or one that
-            is recognised and has no unit, or none that is known.
-        """
-        self.require_in(names)
-        known = dict(self.columns)
-        for name in names:
-            with contextlib.suppress(ValueError):
-                known.setdefault(self.of(name)[0], name)
-        rest = [name for name in names if name not in known.values()]
-        more = {q: name for q, name in recognised(rest).items() if q not in known}
-        for name in rest:
-            quantity, _, unit = name.strip().lower().rpartition("_")
-            if quantity in WORDS and quantity not in {*known, *more}:
-                written = ", ".join(UNITS[quantity])
-                raise ValueError(f"{name}: unknown unit {unit!r}; write one of {written}")
-        for quantity, name in more.items():
-            if quantity not in self.units and unit_in(name, quantity) is None:
-                raise ValueError(f"{name}: {_no_unit(quantity)}")
-        return Naming({**self.columns, **more}, self.units) if more else self
-
-    def of(self, name: str) -> tuple[str, int, int]:
-        """Return the quantity of a column of this name, its unit's power of ten, and its sign.
-
-        Raises
-        ------
-        ValueError
-            With the text ``problem; what to do`` if the column is none that counts.
-        """
-        for quantity, column in self.columns.items():
-            if column == name.strip():
-                return quantity, *self._unit(name, quantity)
-        quantity, power = _own(name, self.units)
-        if quantity in self.columns:
-            raise ValueError(f"the {quantity} is in {self.columns[quantity]!r}; remove one")
-        if quantity in self.units:
-            return quantity, *self._unit(name, quantity)
-        return quantity, power, 1
-
-    def _unit(self, name: str, quantity: str) -> tuple[int, int]:
-        """Return the power of ten and the sign of a column's unit."""
-        unit = self.units.get(quantity) or unit_in(name, quantity)
-        if unit is None:
-            raise ValueError(_no_unit(quantity))
-        return UNITS[quantity][unit.removeprefix("-")], -1 if unit.startswith("-") else 1
+        if self.fs is not None and not 0 < self.fs < np.inf:
+            raise InputError(f"fs: {self.fs:g} Hz is no sampling rate; give a number above 0")
+        if self.fs is not None and "time" in self.columns:
+            raise InputError("fs: takes the place of the time column; give one of the two")
 
 
-def _no_unit(quantity: str) -> str:
-    example = f'units = {{ {quantity} = "{next(iter(UNITS[quantity]))}" }}'
-    return (
-        f"no unit of the {quantity} in its name; write it there, or say {example} "
-        f"(bwbayes init: --unit {quantity}={next(iter(UNITS[quantity]))})"
-    )
-
-
-def missing(quantity: str, rest: Collection[str]) -> str:
-    """Return what to do about a quantity that no column has; ``rest`` are the file's others."""
-    if not rest:
-        return f"{COMMON_NAMES[quantity]}: missing; add it"
-    near = difflib.get_close_matches(COMMON_NAMES[quantity], rest, 1)
-    name = near[0] if near else "..."
-    return (
-        f"which column is the {quantity}? There are {_listed(rest)}; "
-        f'say columns = {{ {quantity} = "{name}" }} (bwbayes init: --column {quantity}={name})'
-    )
+def power_of(unit: str, quantity: str) -> int | None:
+    """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
+    base, shift = _BASES[quantity]
+    for written, prefix in _WRITTEN_PREFIXES.items():
+        rest = unit.lower().removeprefix(written)
+        if unit.lower().startswith(written) and rest in _WRITTEN_UNITS:
+            unit = prefix + _WRITTEN_UNITS[rest]
+            break
+    if unit.lower() in ("micron", "microns"):
+        unit = "um"
+    if not unit.endswith(base) or unit.removesuffix(base) not in _PREFIXES:
+        return None
+    return _PREFIXES[unit.removesuffix(base)] + shift
 
 
 def unit_in(name: str, quantity: str) -> str | None:
@@ -177,54 +141,187 @@ def unit_in(name: str, quantity: str) -> str | None:
     if ending is None:
         return None
     unit = next(part for part in ending.groups() if part is not None).strip()
-    return unit if unit in UNITS[quantity] else None
+    return unit if power_of(unit, quantity) is not None else None
 
 
-def recognised(names: Collection[str]) -> dict[str, str]:
-    """Guess which of a file's columns hold time, voltage and displacement, by quantity.
+def choose(
+    source: Source, naming: Naming, needed: Collection[str] = QUANTITIES
+) -> dict[str, tuple[Series, str]]:
+    """Return the series of each quantity, and its unit.
 
-    A column counts by the word before its unit, or else by its unit; a quantity that no column or
-    more than one may be is left out.
+    Raises
+    ------
+    ColumnsError
+        A column that is needed and not known, or one whose unit is not.
+    InputError
+        A column that is named and not there.
+
+    Warns
+    -----
+    InputWarning
+        If a column is recognized by nothing but its unit.
     """
-    by_word = {q: [n for n in names if _word(n) in words] for q, words in WORDS.items()}
-    guessed = {q: some[0] for q, some in by_word.items() if len(some) == 1}
-    for quantity in WORDS:
-        rest = [n for n in names if n not in guessed.values()]
-        some = [n for n in rest if unit_in(n, quantity)]
-        if quantity not in guessed and not by_word[quantity] and len(some) == 1:
-            guessed[quantity] = some[0]
-    return guessed
-
-
-def say_guesses(where: str, given: Naming, used: Naming) -> None:
-    """Warn of columns that were recognised by nothing but their units."""
-    more = {q: name for q, name in used.columns.items() if q not in given.columns}
-    guesses = [f"{q} is {name!r}" for q, name in more.items() if _word(name) not in WORDS[q]]
-    if guesses:
-        remark = f"{where}: taken by its unit: {', '.join(guesses)}; if not, say `columns`"
+    chosen = {q: _named(source, name, q) for q, name in naming.columns.items()}
+    clocked = naming.fs is not None or source.interval is not None
+    settled = {*chosen, *(["time"] if naming.fs is not None else [])}
+    long = [s for s in source.series if s.size > 1] or source.series
+    by_unit = []
+    for rank in (_by_own_name, _by_word, _by_unit):
+        for quantity in (*QUANTITIES, "truth"):
+            taken = [series.name for series in chosen.values()]
+            fitting = [s for s in long if s.name not in taken and rank(s, quantity)]
+            if quantity in settled or not fitting:
+                continue
+            settled.add(quantity)
+            fitting = _alike(fitting, chosen)
+            if len(fitting) == 1:  # several leave it open, whatever their units are
+                chosen[quantity] = fitting[0]
+                # Of seconds there is no doubt.
+                by_unit += [quantity] if rank is _by_unit and quantity != "time" else []
+    columns = [q for q in needed if q not in chosen and not (q == "time" and clocked)]
+    units = {q: _unit(s, q, naming) for q, s in chosen.items()}
+    unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
+    if columns or unknown:
+        raise _open(source, naming, chosen, columns, unknown)
+    if by_unit:
+        said = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
+        remark = f"{source.path}: taken by its unit: {said}; if not, say `columns`"
         warnings.warn(one_line(remark), InputWarning, stacklevel=3)
+    return {quantity: (chosen[quantity], unit) for quantity, unit in units.items() if unit}
 
 
-def _word(name: str) -> str:
-    """Return what a column's name says besides a unit, in lower case."""
-    units = [unit_in(name, quantity) for quantity in WORDS]
-    unit = next((unit for unit in units if unit), None)
+def _named(source: Source, name: str, quantity: str) -> Series:
+    """Return the series that a naming means."""
+    exact = [s for s in source.series if s.name == name.strip()]
+    ending = [s for s in source.series if s.label == name.strip()]
+    for some in (exact, ending):
+        if len(some) == 1:
+            return some[0]
+    number = int(name) if name.strip().isdecimal() else 0
+    if 1 <= number <= len(source.series) and not exact and not ending:
+        return source.series[number - 1]
+    problem = "several columns" if exact or ending else "no column"
+    raise InputError(
+        f"{source.path}: {problem} {name!r} for the {quantity}; choose one of "
+        f"{_listed(exact or ending or source.series)}"
+    )
+
+
+def is_own(name: str, quantity: str) -> bool:
+    """Tell whether a name is the package's own for a quantity, as ``voltage_mV`` is."""
+    word, _, unit = name.strip().rpartition("_")
+    return word.lower() == quantity and power_of(unit, quantity) is not None
+
+
+def _by_own_name(series: Series, quantity: str) -> bool:
+    return is_own(series.label, quantity)
+
+
+def _by_word(series: Series, quantity: str) -> bool:
+    """Tell whether a series is called as a quantity is, and has no other quantity's unit."""
+    if quantity == "truth" or _is_truth(series):
+        return False
+    name = series.label.strip()
+    units = {q: _stated(series, q) for q in QUANTITIES}
+    if any(units.values()) and units[quantity] is None:
+        return False
+    unit = unit_in(name, quantity)
     bare = name if unit is None else re.sub(rf"[\s_/.\-\[(]*{re.escape(unit)}[\])\s]*$", "", name)
-    return bare.strip().lower()
+    return bare.strip().lower() in WORDS[quantity] or name.lower().rpartition("_")[0] == quantity
 
 
-def _own(name: str, units: Mapping[str, str]) -> tuple[str, int]:
-    """Return quantity and power of ten of one of the package's own names."""
-    quantity, _, unit = name.strip().rpartition("_")
-    known = UNITS.get(quantity.lower())
-    bare = name.strip().lower()
-    if known is not None and unit in known:
-        return quantity.lower(), known[unit]
-    if bare in units:
-        return bare, 0
-    raise ValueError("not one of the package's own names; say it under `columns`")
+def _by_unit(series: Series, quantity: str) -> bool:
+    """Tell whether a series has a unit of a quantity."""
+    return not _is_truth(series) and quantity != "truth" and _stated(series, quantity) is not None
 
 
-def _listed(names: Collection[str]) -> str:
-    shown = list(names)[:10]
-    return ", ".join(map(repr, shown)) + (", ..." if len(names) > 10 else "")
+def _is_truth(series: Series) -> bool:
+    return is_own(series.label, "truth")
+
+
+def _stated(series: Series, quantity: str) -> str | None:
+    """Return the unit that a file states for a series, if it is one of the quantity."""
+    if series.unit and power_of(series.unit, quantity) is not None:
+        return series.unit
+    return unit_in(series.label, quantity)
+
+
+def _unit(series: Series, quantity: str, naming: Naming) -> str | None:
+    return naming.units.get(quantity) or _stated(series, quantity)
+
+
+def _alike(some: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
+    """Keep the series that stand beside those that are chosen, and are as long, if any do."""
+    for key in ("group", "size"):
+        known = [getattr(series, key) for series in chosen.values() if series.name]
+        fitting = [s for s in some if known and getattr(s, key) == known[0]]
+        some = fitting or some
+    return some
+
+
+def _open(
+    source: Source,
+    naming: Naming,
+    chosen: Mapping[str, Series],
+    columns: Sequence[str],
+    unknown: Sequence[str],
+) -> ColumnsError:
+    """Return the error that names all that is open, and guesses it."""
+    where = str(source.path)
+    if source.first_line is not None and source.first_line > 1:
+        where += f":{source.first_line - 1}"
+    taken = [series.name for series in chosen.values()]
+    sizes = {series.size for series in chosen.values()}
+    rest = [s for s in source.series if s.name not in taken and s.size in (sizes or {s.size})]
+    moving = [s for s in rest[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
+    rest = _alike(moving or rest, chosen)
+    guess_columns, guess_units = dict(naming.columns), dict(naming.units)
+    for quantity in unknown:
+        guess_units[quantity] = _COMMON_UNITS[quantity][0]
+    for quantity in columns:
+        fitting = [s for s in rest if _stated(s, quantity)] or rest
+        if fitting:
+            # One without a name goes by its number.
+            guess_columns[quantity] = fitting[0].name.removeprefix("column ")
+            rest = [s for s in rest if s.name != fitting[0].name]
+        if not fitting or _unit(fitting[0], quantity, naming) is None:
+            guess_units.setdefault(quantity, _COMMON_UNITS[quantity][0])
+    lost = [q for q in columns if q not in guess_columns]
+    there = _listed(source.series)
+    if lost:
+        instead = " (or give the sampling rate, fs)" if "time" in lost else ""
+        raise InputError(
+            f"{where}: no column for the {' and the '.join(lost)}; add it{instead}. {there}"
+        )
+    questions = [f"which column is the {', which the '.join(columns)}"] if columns else []
+    if unknown:
+        questions.append(
+            f"which unit has {', which '.join(f'{chosen[q].name!r} ({q})' for q in unknown)}"
+        )
+    problem = f"{where}: {', and '.join(questions)}? {there}"
+    return ColumnsError(problem, guess_columns, guess_units)
+
+
+def _listed(series: Sequence[Series]) -> str:
+    """List series of equal length with their ranges, the most usual length first."""
+    extents = {s.name: _extent(s) for s in series[:_MOST_LOADED]}
+    numbers = [s for s in series if np.isfinite(extents.get(s.name, (np.nan,))).all()]
+    parts = []
+    for size, _ in Counter(s.size for s in numbers).most_common():
+        alike = [s for s in numbers if s.size == size]
+        ranges = [(s.name, *extents[s.name]) for s in alike[:_MOST_LISTED]]
+        texts = [f"{name!r} ({low:.4g} to {high:.4g})" for name, low, high in ranges]
+        more = ", ..." if len(alike) > _MOST_LISTED else ""
+        parts.append(f"{size} values each: {', '.join(texts)}{more}")
+    return f"There are {'; '.join(parts)}" if parts else "There are no series of numbers"
+
+
+def _extent(series: Series) -> tuple[float, float]:
+    """Return the least and the largest number of a series; nan if it has none."""
+    try:
+        values = np.asarray(series.load())
+        require_real(series.name, values.dtype.kind)
+    except ValueError:
+        return np.nan, np.nan
+    values = values[np.isfinite(values)]
+    return (values.min() + 0.0, values.max() + 0.0) if values.size else (np.nan, np.nan)

@@ -1,44 +1,48 @@
-"""Read and write records by the file's suffix: ``.csv``, ``.txt``, ``.h5``, ``.hdf5``, ``.mat``.
+"""Read and write records: text of any kind, HDF5, MATLAB and LabVIEW files.
 
-The noise-free displacement of a simulated record travels with it: in a second text file
-``NAME.truth.csv`` beside ``NAME.csv``, or as ``truth_um`` inside the binary formats.
+What a file is, its content says, not its suffix. Records are written by the suffix: ``.csv``,
+``.txt``, ``.h5``, ``.hdf5``, ``.mat``. The noise-free displacement of a simulated record travels
+with it: in a second text file ``NAME.truth.csv`` beside ``NAME.csv``, or as ``truth_um`` inside the
+binary formats.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.io.checks import (
-    Table,
-    VoltageIs,
-    checked,
-    checked_reference,
-    require_voltage_is,
-)
-from bwbayes.data.io.columns import Naming, say_guesses
-from bwbayes.data.io.hdf5 import read_hdf5, write_hdf5
+from bwbayes.data.io.checks import VoltageIs, checked, checked_reference, require_voltage_is
+from bwbayes.data.io.columns import QUANTITIES, Naming
+from bwbayes.data.io.hdf5 import is_hdf5, read_hdf5, write_hdf5
+from bwbayes.data.io.labview import read_tdms
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.data.io.text import read_csv, write_csv
+from bwbayes.data.io.series import Source
+from bwbayes.data.io.table import Table, table_of
+from bwbayes.data.io.text import read_text, write_text
+from bwbayes.data.io.vectors import array_table
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning
 
-__all__ = ["SUFFIXES", "read_record", "read_reference", "read_table", "write_record"]
+__all__ = [
+    "SUFFIXES",
+    "read_record",
+    "read_reference",
+    "read_source",
+    "read_table",
+    "require_readable",
+    "write_record",
+]
 
 _TEXT = (".csv", ".txt")
-_READERS: dict[str, Callable[[Path, Naming], Table]] = {
-    ".csv": read_csv,
-    ".txt": read_csv,
-    ".h5": read_hdf5,
-    ".hdf5": read_hdf5,
-    ".mat": read_mat,
-}
-SUFFIXES = tuple(_READERS)
+_BINARY = (".h5", ".hdf5", ".mat")
+# What a folder of records is searched for.
+SUFFIXES = (*_TEXT, *_BINARY, ".lvm", ".tdms")
 
 
 def read_record(
@@ -48,25 +52,30 @@ def read_record(
     need_displacement: bool = True,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    fs: float | None = None,
 ) -> Record:
     """Read and check a record.
 
     Parameters
     ----------
     path : path
-        The suffix says the format. Columns carry their units in their names: `time_s`,
-        `voltage_V`, `displacement_um`, or with other SI prefixes; time must be uniform. Other names
-        are recognised where they can mean nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``.
+        Text of any layout, HDF5, MATLAB, LabVIEW's LVM or TDMS; the content says which. Columns
+        may carry their units in their names, `time_s`, `voltage_V`, `displacement_um` or with other
+        SI prefixes; time must be uniform. Other names are recognized where they can mean nothing
+        else: ``t [ms]``, ``U_mV``, ``pos (nm)``.
     voltage_is : "command", "output" or None
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
         False also accepts a planned voltage without a displacement.
     columns : dict
-        Names of the columns in the file by quantity, where they are not to be recognised:
-        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "pos"}``.
+        The columns by quantity, where they are not to be recognized: their names, the ends of
+        their paths in the file, or their numbers, counted from 1:
+        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "3"}``.
     units : dict
-        Units by quantity, ``{"displacement": "nm"}``, where the names do not say them; ``"-nm"``
+        Units by quantity, ``{"displacement": "nm"}``, where the file does not state them; ``"-nm"``
         turns the sign.
+    fs : float, Hz
+        The sampling rate, in place of a time column.
 
     Raises
     ------
@@ -83,9 +92,8 @@ def read_record(
     path = Path(path)
     if voltage_is is not None:
         require_voltage_is(voltage_is)
-    naming = Naming(columns or {}, units or {})
-    table = read_table(path, naming)
-    say_guesses(str(path), naming, table.naming)
+    needed = QUANTITIES if need_displacement else ("time", "voltage")
+    table = read_table(path, Naming(columns or {}, units or {}, fs), needed)
     record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() in _TEXT and truth_path.exists():
@@ -104,19 +112,52 @@ def read_reference(path: str | Path) -> tuple[FloatArray, float]:
     InputError
         For every problem, in one line, as of :func:`read_record`.
     """
-    return checked_reference(read_table(Path(path), Naming()))
+    return checked_reference(read_table(Path(path), Naming(), ("time", "displacement")))
 
 
-def read_table(path: str | Path, naming: Naming) -> Table:
-    """Read a file's columns as they stand in it, with the naming that they were recognised by.
+def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> Table:
+    """Read the columns of a file that count, with the naming that they were recognized by.
 
     Raises
     ------
     InputError
-        The file cannot be read, or a column cannot be told.
+        The file cannot be read, or a column that is needed is not known.
     """
-    path = Path(path)
-    return _opened(path, lambda: _READERS[path.suffix.lower()](path, naming))
+    return table_of(read_source(Path(path)), naming, needed)
+
+
+def read_source(path: Path) -> Source:
+    """Read what a file holds.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; give the file in it")
+        if not path.exists():
+            raise InputError(f"{path}: does not exist; check the path")
+        if not path.is_file():
+            raise InputError(f"{path}: is not a regular file; give one")
+        with path.open("rb") as file:  # a file without permission says so in every format
+            begin = file.read(8)
+        if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+            return read_mat(path)
+        if is_hdf5(path):
+            return read_hdf5(path)
+        if begin.startswith(b"TDSm"):
+            return read_tdms(path)
+        if begin.startswith(b"PK") or begin.startswith(b"\xd0\xcf\x11\xe0"):
+            raise InputError(f"{path}: a workbook or an archive; export it as CSV")
+        if path.suffix.lower() in _BINARY:
+            raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+        return read_text(path)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read ({error}); check the file") from error
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
@@ -131,7 +172,10 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
         If the suffix is unknown or the place cannot be written to.
     """
     path = Path(path)
-    suffix = _known_suffix(path)
+    suffix = path.suffix.lower()
+    if suffix not in (*_TEXT, *_BINARY):
+        known = ", ".join((*_TEXT, *_BINARY))
+        raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {known}")
     if suffix == ".mat":
         _write_whole(path, lambda part: write_mat(record, part, mat_version))
     elif suffix not in _TEXT:
@@ -139,36 +183,30 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
     else:
         truth_path = _truth_path(path)
         truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
-        _write_whole(path, lambda part: write_csv(record, part))
+        _write_whole(path, lambda part: write_text(record, part))
         if record.truth is not None:
             truth = replace(record, displacement=record.truth)
-            _write_whole(truth_path, lambda part: write_csv(truth, part))
+            _write_whole(truth_path, lambda part: write_text(truth, part))
 
 
-def _known_suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _READERS:
-        raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {', '.join(_READERS)}")
-    return suffix
+def require_readable(record: Record, where: str) -> None:
+    """Refuse a record that could be written to a file and not be read back.
 
-
-def _opened[T](path: Path, read: Callable[[], T]) -> T:
-    """Return what is read from a file, and say what keeps it from being opened."""
-    try:
-        if path.is_dir():
-            raise InputError(f"{path}: is a directory; give the file in it")
-        _known_suffix(path)
-        if not path.exists():
-            raise InputError(f"{path}: does not exist; check the path")
-        if not path.is_file():
-            raise InputError(f"{path}: is not a regular file; give one")
-        with path.open("rb"):  # so that a file without permission says so in every format
-            pass
-        return read()
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read ({error}); check the file") from error
+    Raises
+    ------
+    InputError
+        As for a file that is called ``where``.
+    """
+    arrays = {
+        "time": record.time,
+        "voltage": record.voltage,
+        "displacement": record.displacement,
+        "truth": record.truth,
+    }
+    table = array_table(where, arrays, {}, {"interval_s": repr(record.interval)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        checked(table, need_displacement=record.displacement is not None)
 
 
 def _truth_path(path: Path) -> Path:

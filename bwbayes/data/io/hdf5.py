@@ -1,8 +1,9 @@
-"""Records in HDF5: datasets named like the columns, ``time_s``, ``voltage_V``, ``displacement_um``.
+"""Records in HDF5 files: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
-The datasets stand at the root or in one group; the attributes ``voltage_is``, ``origin`` and
-``interval_s`` stand beside them, and a simulated record has the dataset ``truth_um``. Other
-datasets are passed over.
+Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
+says a dataset's unit, columns of a table or matrix are series of their own, ``table.u`` and
+``log[2]``. The attributes ``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``
+may stand beside the datasets, and a simulated record has the dataset ``truth_um``.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 from collections.abc import Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,52 +19,58 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.data.io.checks import Table, named_table
-from bwbayes.data.io.columns import Naming
+from bwbayes.data.io.series import Series, Source, vectors
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
-__all__ = ["check_lists", "datasets", "group_table", "read_hdf5", "record_arrays", "write_hdf5"]
+__all__ = ["is_hdf5", "read_hdf5", "record_arrays", "write_hdf5"]
 
 # Marks in an HDF5 file: its beginning, a heap of names, a collection of texts; and the number that
 # ends a list of free blocks.
 _SIGNATURE, _HEAP, _COLLECTION = b"\x89HDF\r\n\x1a\n", b"HEAP", b"GCOL\1\0\0\0"
 _NO_BLOCK = 1
 
-_NOTES = ("voltage_is", "origin", "interval_s")
+_NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
+_UNITS = ("unit", "units", "Unit", "Units")
 
 
-def read_hdf5(path: Path, naming: Naming) -> Table:
-    """Return the columns of an HDF5 file that ``naming`` says.
+def is_hdf5(path: Path) -> bool:
+    """Tell whether a file is an HDF5 file."""
+    return bool(h5py.is_hdf5(path))
+
+
+def read_hdf5(path: Path) -> Source:
+    """Return the series of numbers in an HDF5 file.
 
     Raises
     ------
     InputError
-        If it is not an HDF5 file, is damaged, or has datasets other than real vectors.
+        The file is damaged.
     """
-    if not h5py.is_hdf5(path):
-        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
     try:
         check_lists(path)
         with h5py.File(path, "r") as file:
-            group = _group_of_columns(path, file)
-            notes = {key: _text(group.attrs[key]) for key in _NOTES if key in group.attrs}
-            return group_table(path, group, naming, notes)
-    except InputError:
-        raise
+            series: list[Series] = []
+            notes = {}
+            for group in _groups(file, set()):
+                name = group.name.strip("/")
+                beside = f"{name}/" if name else ""
+                notes[beside] = {k: _text(group.attrs[k]) for k in _NOTES if k in group.attrs}
+                for leaf, dataset in _datasets(group):
+                    unit = next((_text(dataset.attrs[k]) for k in _UNITS if k in dataset.attrs), "")
+                    load = partial(_loaded, path, dataset.name)
+                    series += vectors(beside, leaf, dataset.shape, dataset.dtype, load, unit)
+            return Source(path, tuple(series), notes)
     except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
         raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it again") from error
 
 
-def group_table(path: Path, group: Any, naming: Naming, notes: dict[str, str]) -> Table:
-    """Return the columns among the datasets of an open HDF5 group."""
-    names = tuple(datasets(group))
-    return named_table(
-        *(path, names, naming),
-        lambda name: int(group[name].size or 0),
-        lambda name: group[name][()],
-        notes,
-    )
+def _loaded(path: Path, name: str) -> Any:
+    try:
+        with h5py.File(path, "r") as file:
+            return file[name][()]
+    except Exception as error:
+        raise InputError(f"{path}: {name}: damaged ({_brief(error)}); write it again") from error
 
 
 def write_hdf5(record: Record, path: Path) -> None:
@@ -77,6 +85,8 @@ def write_hdf5(record: Record, path: Path) -> None:
         if record.origin:
             file.attrs["origin"] = np.bytes_(record.origin.encode())
         file.attrs["interval_s"] = record.interval
+        if record.time_offset:
+            file.attrs["time_offset_s"] = record.time_offset
     path.write_bytes(content.getbuffer())
 
 
@@ -91,28 +101,30 @@ def record_arrays(record: Record) -> dict[str, Any]:
     return {name: values for name, values in arrays.items() if values is not None}
 
 
-def _group_of_columns(path: Path, file: Any) -> Any:
-    """Return the root if it holds datasets, else the only group that holds some."""
-    objects = (file, *(file[name] for name in _linked(file)))
-    groups = [group for group in objects if isinstance(group, h5py.Group) and any(datasets(group))]
-    if not groups or groups[0] == file:
-        return file
-    if len(groups) > 1:
-        names = ", ".join(repr(group.name) for group in groups[:5])
-        raise InputError(f"{path}: several groups hold records ({names}); keep one per file")
-    return groups[0]
+def _groups(group: Any, passed: set[int]) -> Iterator[Any]:
+    """Yield a group and all below it, each once, but for MATLAB's own."""
+    address = h5py.h5o.get_info(group.id).addr
+    if address in passed:
+        return
+    passed.add(address)
+    yield group
+    for name in _linked(group):
+        if not name.startswith("#") and isinstance(group[name], h5py.Group):
+            yield from _groups(group[name], passed)
 
 
-def datasets(group: Any) -> Iterator[str]:
-    """Yield the names of the datasets in a group whose numbers are in this very file.
+def _datasets(group: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and datasets of a group whose numbers are in this very file.
 
     Links to other files, and numbers stored in other files, are passed over unopened: a stranger's
-    file could name any file or device of this machine.
+    file could name any file or device of this machine. So are MATLAB's texts and empty arrays.
     """
     for name in _linked(group):
         dataset = group[name]
-        if isinstance(dataset, h5py.Dataset) and not (dataset.external or dataset.is_virtual):
-            yield name
+        if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+            continue
+        if dataset.attrs.get("MATLAB_class") != b"char" and "MATLAB_empty" not in dataset.attrs:
+            yield name, dataset
 
 
 def _linked(group: Any) -> list[str]:

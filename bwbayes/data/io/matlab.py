@@ -1,8 +1,9 @@
-"""Records in MATLAB files: variables ``time_s``, ``voltage_V``, ``displacement_um``.
+"""Records in MATLAB files: variables ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
 Version 5 (MATLAB's ``save`` with ``-v6`` or ``-v7``) goes through SciPy, version 7.3 is HDF5; the
-rare version 4 is refused. Vectors may be rows or columns; ``voltage_is`` and ``origin`` are
-character variables, ``interval_s`` is a number, and other variables are passed over unread.
+rare version 4 is refused. Vectors may be rows or columns; those in a struct are named by their
+path, ``log.Ux`` or ``log.Y(2).Data``, columns of a matrix ``log[2]``. ``voltage_is`` and ``origin``
+are character variables, ``interval_s`` and ``time_offset_s`` are numbers.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -21,9 +24,8 @@ import numpy as np
 import scipy.io
 from scipy.io.matlab import MatReadWarning, matfile_version
 
-from bwbayes.data.io.checks import MAXIMUM_SAMPLES, Table, named_table
-from bwbayes.data.io.columns import Naming
-from bwbayes.data.io.hdf5 import check_lists, datasets, group_table, record_arrays
+from bwbayes.data.io.hdf5 import read_hdf5, record_arrays
+from bwbayes.data.io.series import MAXIMUM_SAMPLES, Series, Source, vectors
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
@@ -31,6 +33,7 @@ __all__ = ["MatVersion", "read_mat", "write_mat"]
 
 MatVersion = Literal["5", "7.3"]
 
+_TEXTS, _NUMBERS = ("voltage_is", "origin"), ("interval_s", "time_offset_s")
 _USERBLOCK = 512  # bytes before the HDF5 part of a version 7.3 file
 
 # Codes of the version 5 format: types of elements, and classes of arrays.
@@ -38,22 +41,26 @@ _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS_AND_TEXT = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
 _COMPLEX = 0x0800
 _LARGEST_ELEMENT = 16 * MAXIMUM_SAMPLES  # bytes that a compressed element may unpack to
-_PLAIN_CODES = {4, *range(6, 16)}
-_PLAIN_CLASSES = {"double", "single", "char", "logical"} | {
-    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+_PLAIN_CODES, _NESTED_CODES = {4, *range(6, 16)}, {1, 2}
+_KINDS = {"double": "f8", "single": "f4", "char": "U1", "logical": "?"} | {
+    f"{sign}int{bits}": f"{sign[:1] or 'i'}{bits // 8}"
+    for sign in ("", "u")
+    for bits in (8, 16, 32, 64)
 }
 
 
-def read_mat(path: Path, naming: Naming) -> Table:
-    """Return the columns of a MATLAB file, version 5 or 7.3, that ``naming`` says.
+def read_mat(path: Path) -> Source:
+    """Return the series of numbers in a MATLAB file, version 5 or 7.3.
 
     Raises
     ------
     InputError
-        If it is not a MATLAB file, is damaged, or has variables other than real vectors.
+        It is of another version, or is damaged.
     """
+    if h5py.is_hdf5(path):
+        return replace(read_hdf5(path), notes={"": _notes_7_3(path)})
     try:
-        return _read_7_3(path, naming) if h5py.is_hdf5(path) else _read_5(path, naming)
+        return _read_5(path)
     except InputError:
         raise
     except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
@@ -66,13 +73,15 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     """Write a record as column vectors of a MATLAB file, every number exactly."""
     texts = {"voltage_is": record.voltage_is, "origin": record.origin}
     arrays = record_arrays(record) | {"interval_s": np.array([record.interval])}
+    if record.time_offset:
+        arrays["time_offset_s"] = np.array([record.time_offset])
     if version == "5":
         scipy.io.savemat(path, arrays | texts, appendmat=False, oned_as="column")
     else:
         _write_7_3(path, arrays, texts)
 
 
-def _read_5(path: Path, naming: Naming) -> Table:
+def _read_5(path: Path) -> Source:
     if matfile_version(path, appendmat=False)[0] != 1:
         raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
     _check_elements(path.read_bytes())
@@ -80,24 +89,42 @@ def _read_5(path: Path, naming: Naming) -> Table:
         # SciPy warns of a variable that it cannot read or that comes twice; here that is an error.
         warnings.simplefilter("error", MatReadWarning)
         variables = scipy.io.whosmat(path, appendmat=False)
-        shapes = {name: shape for name, shape, _ in variables}
-        classes = {name: kind for name, _, kind in variables}
 
         def load(name: str) -> Any:
-            if classes[name] not in _PLAIN_CLASSES:
-                raise InputError(f"{path}: {name}: is of class {classes[name]}; store real numbers")
             return scipy.io.loadmat(path, appendmat=False, variable_names=[name])[name]
 
+        series: list[Series] = []
         notes = {}
-        for key in ("voltage_is", "origin", "interval_s"):
-            if math.prod(shapes.get(key, (0,))) > 0:
-                notes[key] = _first(load(key))
-        names = tuple(shapes)
-        return named_table(path, names, naming, lambda name: math.prod(shapes[name]), load, notes)
+        for name, shape, kind in variables:
+            if name in (*_TEXTS, *_NUMBERS) and math.prod(shape) > 0:
+                notes[name] = _first(load(name))
+            elif kind in ("struct", "cell"):
+                series += _walked(name, load(name))
+            elif kind in _KINDS:
+                series += vectors("", name, shape, np.dtype(_KINDS[kind]), partial(load, name))
+    return Source(path, tuple(series), {"": notes})
+
+
+def _walked(path: str, value: Any) -> Iterator[Series]:
+    """Yield the series of numbers in a struct or a cell array."""
+    if not isinstance(value, np.ndarray):
+        return
+    if not value.dtype.hasobject:
+        group, _, leaf = path.rpartition(".")
+        group += "." * bool(group)
+        yield from vectors(group, leaf, value.shape, value.dtype, lambda: value)
+        return
+    for number, element in enumerate(value.ravel(order="F"), start=1):
+        place = f"{path}({number})" if value.size > 1 else path
+        if value.dtype.names is None:
+            yield from _walked(place, element)
+        else:
+            for name in value.dtype.names:
+                yield from _walked(f"{place}.{name}", element[name])
 
 
 def _check_elements(data: bytes) -> None:
-    """Raise a ValueError unless all plain arrays consist of the elements that belong to them.
+    """Raise a ValueError unless all arrays consist of the elements that belong to them.
 
     SciPy 1.18 takes the types of elements on trust, and an unknown one ends the whole process.
     """
@@ -108,15 +135,27 @@ def _check_elements(data: bytes) -> None:
             ((kind, body),) = _elements(unpacked, order)  # noqa: PLW2901
         if kind != _MATRIX:
             raise ValueError(f"unknown element {kind}")
-        inner = list(_elements(body, order))
-        (flags,) = struct.unpack_from(f"{order}I", inner[0][1])
-        if flags & 0xFF not in _PLAIN_CODES:
-            continue
-        # Flags, dimensions, name and real part; an imaginary part if the flags say so.
-        if len(inner) != (5 if flags & _COMPLEX else 4):
-            raise ValueError("parts of an array are missing")
-        if not {kind for kind, _ in inner} <= _NUMBERS_AND_TEXT:
-            raise ValueError("unknown type of data")
+        _check_matrix(body, order)
+
+
+def _check_matrix(body: bytes, order: str, *, nested: bool = False) -> None:
+    inner = list(_elements(body, order))
+    if not inner:  # an empty array in a struct
+        return
+    (flags,) = struct.unpack_from(f"{order}I", inner[0][1])
+    if flags & 0xFF in _NESTED_CODES:
+        for kind, content in inner:
+            if kind == _MATRIX:
+                _check_matrix(content, order, nested=True)
+    elif flags & 0xFF not in _PLAIN_CODES:
+        if nested:  # it would be read with the struct that it is in
+            raise ValueError("an object in a struct")
+        return
+    # Flags, dimensions, name and real part; an imaginary part if the flags say so.
+    elif len(inner) != (5 if flags & _COMPLEX else 4):
+        raise ValueError("parts of an array are missing")
+    if not {kind for kind, _ in inner} - {_MATRIX} <= _NUMBERS_AND_TEXT:
+        raise ValueError("unknown type of data")
 
 
 def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
@@ -140,18 +179,19 @@ def _first(values: Any) -> str:
     return repr(float(value)) if np.asarray(value).dtype.kind in "iuf" else str(value)
 
 
-def _read_7_3(path: Path, naming: Naming) -> Table:
-    check_lists(path)
+def _notes_7_3(path: Path) -> dict[str, str]:
+    notes = {}
     with h5py.File(path, "r") as file:
-        names = set(datasets(file))
-        notes: dict[str, str] = {}
-        for key in ("voltage_is", "origin"):
-            if key in names and "MATLAB_empty" not in file[key].attrs:
-                codes = np.asarray(file[key][()], dtype="<u2")
-                notes[key] = codes.tobytes().decode("utf-16-le", errors="replace")
-        if "interval_s" in names:
-            notes["interval_s"] = _first(file["interval_s"][()])
-        return group_table(path, file, naming, notes)
+        for key in (*_TEXTS, *_NUMBERS):
+            if not isinstance(file.get(key, getlink=True), h5py.HardLink):
+                continue
+            values = np.asarray(file[key][()])
+            if key in _NUMBERS:
+                notes[key] = _first(values)
+            elif "MATLAB_empty" not in file[key].attrs and values.dtype.kind == "u":
+                codes = values.astype("<u2").tobytes()
+                notes[key] = codes.decode("utf-16-le", errors="replace")
+    return notes
 
 
 def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> None:

@@ -1,99 +1,120 @@
-"""Records as text: ``time_s,voltage_V,displacement_um``, one sample per line.
+"""Text files: columns of numbers, with a header above them or without one.
 
-Lines ``# key: value`` may stand above the header; ``voltage`` (command or output), ``origin`` and
-``interval_s`` are understood, others are comments. Where semicolons or tabs separate the columns of
-the header, they do so below it too, and a comma there is a decimal comma. An empty cell or ``nan``
-in the displacement is a missing reading; columns of other quantities are ignored, with a remark.
-NumPy's C parser reads the numbers; only when it fails does a slow pass look for the line that is
-wrong, and says what is wrong with it.
+Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
+have decimal commas. The numbers are looked for, and the line above them names the columns; a second
+line may hold their units. What stands above the header is skipped with a remark, but for lines
+``# key: value`` of which ``voltage`` (command or output), ``origin``, ``interval_s`` and
+``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is a missing reading.
+A line that cannot be read is named with its number.
 """
 
 from __future__ import annotations
 
-import math
+import csv
 import re
 import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import partial
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
+from charset_normalizer import from_bytes
+from numpy.typing import NDArray
 
-from bwbayes.arrays import FloatArray
-from bwbayes.data.io.checks import AT_EVERY_SAMPLE, Column, Table
-from bwbayes.data.io.columns import Naming, missing, recognised
+from bwbayes.data.io.columns import QUANTITIES, power_of
+from bwbayes.data.io.labview import is_lvm, plain_lvm
+from bwbayes.data.io.series import Series, Source
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["read_csv", "write_csv"]
+__all__ = ["read_text", "write_text"]
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?nan|[+-]?inf", re.IGNORECASE)
+_SEPARATORS = ("\t", ";", ",", "|", " ")
 _EXAMPLE = "time_s,voltage_V,displacement_um"
-_SEPARATORS = {";": "semicolons", "\t": "tabs"}
-# Lines below the first in which a header is looked for.
-_MOST_ABOVE = 50
+
+# Lines that show how a file is laid out, lines of numbers that end a header, and lines above the
+# numbers that may be one.
+_PROBED, _IN_A_ROW, _ABOVE = 60, 3, 6
+
+# What text is written in that is not UTF-8, as far as its bytes can tell.
+_ENCODINGS = ["cp1252", "cp932", "gb18030", "cp1251", "utf_16_le", "utf_16_be"]
+_MICRO = re.compile(rb"\xb5[msV]")  # as Windows writes a unit in cp1252
 
 
-class _Header(NamedTuple):
-    """A column's name, its quantity ("" if it is none that counts), power of ten, and sign."""
+class _Layout(NamedTuple):
+    """How the numbers stand in a text: separator, fields of a line, and the first line's index."""
 
-    name: str
-    quantity: str
-    power: int
-    sign: int
+    separator: str
+    fields: int
+    first: int
 
 
-def read_csv(path: Path, naming: Naming) -> Table:
-    """Return the columns of a text file that ``naming`` says.
+def read_text(path: Path) -> Source:
+    """Return the columns of a text file.
 
     Raises
     ------
     InputError
-        If the file is not UTF-8 text with a header of known columns above lines of numbers; the
-        text names the line and the column.
+        It is not text, holds no numbers, or a line has another number of fields; the text names
+        the line.
+
+    Warns
+    -----
+    InputWarning
+        If lines above the header are skipped.
     """
-    text = _decoded(path, path.read_bytes())
-    header_line, header, body, notes = _header_and_body(path, text)
-    _refuse_lines_above(path, header_line, header, body)
-    separator = _separator(header)
-    names = _cells(f"{path}:{header_line}:", header, separator)
-    if separator != ",":
-        body = body.translate({ord(","): ".", ord(separator): ","})
-    try:
-        naming = naming.completed(names)
-    except ValueError as error:
-        raise InputError(f"{path}:{header_line}: {error}") from None
-    columns = _header_columns(f"{path}:{header_line}:", names, naming)
-    ended = body.endswith("\n")
-    body = body.rstrip("\n ")
-    if not body:
-        raise InputError(f"{path}:{header_line}: no samples below the header; add them")
-    lines = body.split("\n")
-    values = _numbers(lines, columns)
-    if values is None:
-        raise _fault(f"{path}:", lines, columns, header_line + 1, ended)
-    if not ended and columns[-1].quantity and _looks_cut(lines):
-        last = header_line + len(lines)
-        name = columns[-1].name
-        raise InputError(f"{path}:{last}: {name}: the last line is cut off; remove it")
-    extra = [column.name for column in columns if not column.quantity]
-    if extra:
-        some = ", ".join(extra[:10]) + (", ..." if len(extra) > 10 else "")
-        remark = f"{path}:{header_line}: ignored columns: {some}"
+    text = _decoded(path)
+    notes: dict[str, str] = {}
+    if is_lvm(text):
+        text, notes = plain_lvm(path, text)
+    lines = text.split("\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    layout = _layout(path, lines)
+    names, units, header = _header(path, lines, layout)
+    above = lines[: layout.first if header is None else header]
+    for line in above:
+        key, colon, value = line.strip(" #").partition(":")
+        if line.startswith("#") and colon:
+            key = key.strip().lower()
+            notes["voltage_is" if key == "voltage" else key] = value.strip()
+    skipped = [line for line in above if line.strip() and not line.startswith("#")]
+    if skipped:
+        plural = "s" if len(skipped) > 1 else ""
+        remark = f"{path}:1: {len(skipped)} line{plural} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
-    known = [column for column in columns if column.quantity]
-    return Table(
+    body = lines[layout.first :]
+    if not text.endswith("\n") and _is_cut(body, layout.separator):
+        raise InputError(f"{path}:{len(lines)}: the last line is cut off; remove it")
+    _check_fields(path, body, layout, len(names))
+    frame, decimal = _parsed(path, body, layout)
+    series = [
+        Series(
+            name,
+            len(body),
+            partial(_numbers, path, frame[column], decimal, name, layout.first + 1),
+            unit,
+        )
+        for column, (name, unit) in enumerate(zip(names, units, strict=True))
+        if column < layout.fields
+    ]
+    interval = notes.pop("dt", None)
+    return Source(
         path,
-        {c.quantity: Column(c.name, values[:, i], c.power, c.sign) for i, c in enumerate(known)},
-        notes,
-        first_line=header_line + 1,
-        names=tuple(names),
-        naming=naming,
+        tuple(series),
+        {"": notes},
+        layout.first + 1,
+        None if interval is None else float(interval),
     )
 
 
-def write_csv(record: Record, path: Path) -> None:
+def write_text(record: Record, path: Path) -> None:
     """Write a record as text, all floats with the shortest digits that give them back exactly."""
     columns = {"time_s": record.time, "voltage_V": record.voltage}
     if record.displacement is not None:
@@ -103,217 +124,218 @@ def write_csv(record: Record, path: Path) -> None:
         if record.origin:
             file.write(f"# origin: {record.origin}\n")
         file.write(f"# interval_s: {record.interval!r}\n")
-        file.write(",".join(columns) + "\n")
-        texts = [map(_text, column.tolist()) for column in columns.values()]
-        file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
+        if record.time_offset:
+            file.write(f"# time_offset_s: {record.time_offset!r}\n")
+        pd.DataFrame(columns).to_csv(file, index=False, lineterminator="\n")
 
 
-def _text(value: float) -> str:
-    return "" if math.isnan(value) else repr(value)
-
-
-def _decoded(path: Path, data: bytes) -> str:
-    """Return the text without a byte order mark and with line ends as on Unix."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise InputError(f"{path}: the text is UTF-16; save it as UTF-8")
+def _decoded(path: Path) -> str:
+    """Return a file's text with line ends as on Unix, whatever its encoding is."""
+    data = path.read_bytes()
+    if not data.strip():
+        raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and a line a sample")
     try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        byte = f"0x{data[error.start]:02x}"
-        raise InputError(f"{path}:{line}: byte {byte} is not UTF-8; save it as UTF-8") from error
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
+        encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        text = "\0"
     if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise InputError(f"{path}:{line}: NUL byte; is the file binary or UTF-16? Save it as UTF-8")
-    return text
-
-
-def _header_and_body(path: Path, text: str) -> tuple[int, str, str, dict[str, str]]:
-    """Return the header's line number, the header, the text below it, and the notes above it."""
-    notes: dict[str, str] = {}
-    offset = line = 0
-    while offset < len(text):
-        end = text.find("\n", offset)
-        end = len(text) if end < 0 else end
-        content = text[offset:end].strip(" ")
-        offset, line = end + 1, line + 1
-        if content.startswith("#"):
-            key, _, value = content[1:].partition(":")
-            key = key.strip().lower()
-            notes["voltage_is" if key == "voltage" else key] = value.strip()
-        elif content:
-            return line, content, text[offset:], notes
-    raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and one line per sample")
-
-
-def _separator(line: str) -> str:
-    return next((one for one in _SEPARATORS if one in line), ",")
-
-
-def _refuse_lines_above(path: Path, number: int, first: str, body: str) -> None:
-    """Refuse text above the header, which many programs write: a title, a date, an operator."""
-    below = body.split("\n", _MOST_ABOVE)[:_MOST_ABOVE]
-    headers = [
-        number + i
-        for i, line in enumerate([first, *below])
-        if len(recognised(line.split(_separator(line)))) > 1
-    ]
-    if headers and headers[0] > number:
-        raise InputError(
-            f"{path}:{number}: the header is in line {headers[0]}; remove the lines above it, or "
-            "begin them with #"
-        )
-
-
-def _cells(where: str, header: str, separator: str) -> list[str]:
-    """Return the names in a header."""
-    if separator not in header and len(header.split()) > 1:
-        raise InputError(f"{where} blanks separate the columns; separate them by commas")
-    names = [cell.strip().strip('"') for cell in header.split(separator)]
-    if all(_NUMBER.fullmatch(name.replace(",", ".")) for name in names):
-        raise InputError(f"{where} the header is missing; write {_EXAMPLE} above the numbers")
-    return names
-
-
-def _header_columns(where: str, names: list[str], naming: Naming) -> list[_Header]:
-    """Return what stands in the header; columns of other quantities only beside all that count."""
-    columns: list[_Header] = []
-    for number, name in enumerate(names, start=1):
-        shown = _quoted(name)[1:-1] or f"column {number}"
+        # The part that is not numbers tells the encoding, and stands at the beginning.
+        best = from_bytes(data[:4000], cp_isolation=_ENCODINGS).best()
+        encoding = "cp1252" if _MICRO.search(data[:4000]) else best.encoding if best else "ascii"
         try:
-            quantity, power, sign = naming.of(name)
-        except ValueError as error:
-            if name in naming.columns.values():
-                raise InputError(f"{where} {shown}: {error}") from None
-            quantity, power, sign = "", 0, 1
-        if quantity == "truth":
-            raise InputError(f"{where} {name}: unknown column; keep the truth in a .truth file")
-        if quantity and quantity in [column.quantity for column in columns]:
-            raise InputError(f"{where} {name}: second {quantity} column; remove one")
-        columns.append(_Header(name if quantity else shown, quantity, power, sign))
-    # A column of another quantity is most likely the missing one.
-    quantities = [column.quantity for column in columns]
-    rest = [column.name for column in columns if not column.quantity]
-    for quantity in ("time", "voltage", "displacement"):
-        if rest and quantity not in quantities:
-            raise InputError(f"{where} {missing(quantity, rest)}")
-    return columns
+            text = data.decode(encoding)
+        except UnicodeDecodeError:
+            raise InputError(
+                f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV"
+            ) from None
+        if encoding == "cp1252" and "\0" in text:
+            raise InputError(f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV")
+    return text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _numbers(lines: list[str], columns: list[_Header]) -> FloatArray | None:
-    """Return the numbers of the known columns, (samples, known).
-
-    None if any is wrong, not finite, or missing where it may not be.
-    """
-    known = [number for number, column in enumerate(columns) if column.quantity]
-    if any(line.count(",") != len(columns) - 1 for line in lines):
-        return None
-    try:
-        values = _parsed(lines, known)
-    except ValueError:
-        places = [n for n in known if columns[n].quantity == "displacement"]
-        try:
-            values = _parsed([_with_nan(line, places) for line in lines], known)
-        except ValueError:
-            return None
-    may_miss = np.array([columns[number].quantity == "displacement" for number in known])
-    if (
-        values.shape[0] != len(lines)
-        or not (np.isfinite(values) | (np.isnan(values) & may_miss)).all()
-    ):
-        return None
-    return values
+def _cells(line: str, separator: str) -> list[str]:
+    """Split a line."""
+    if separator == " ":
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
 
 
-def _parsed(lines: list[str], known: list[int]) -> FloatArray:
-    values: FloatArray = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, usecols=known)
-    return values
-
-
-def _with_nan(line: str, places: list[int]) -> str:
-    """Return the line with nan in the empty cells at these places."""
-    cells = line.split(",")
-    for place in places:
-        cells[place] = cells[place].strip() or "nan"
-    return ",".join(cells)
-
-
-def _fault(
-    where: str, lines: list[str], columns: list[_Header], first_line: int, ended: bool
-) -> InputError:
-    """Return the error that names the first line that cannot be read."""
-    for number, line in enumerate(lines, start=first_line):
-        fault = _fault_in_line(line, columns)
-        if fault is None:
+def _layout(path: Path, lines: Sequence[str]) -> _Layout:
+    """Find how the numbers stand in a text: most lines in its middle and at its end are such."""
+    middle = len(lines) // 2
+    probed = [*lines[middle : middle + _PROBED], *lines[-_PROBED:]]
+    rows = [line for line in probed if line.strip() and not line.startswith("#")]
+    best, found = 0.0, ("", 0, np.zeros(0, dtype=np.int64))
+    for separator in _SEPARATORS:
+        split = [_cells(line, separator) for line in rows]
+        fields = Counter(map(len, split)).most_common(1)[0][0] if split else 0
+        if fields < 2:
             continue
-        column, problem = fault
-        last = number == first_line + len(lines) - 1
-        if last and (not ended or problem.startswith("missing")):
-            problem = f"the last line is cut off ({problem.partition(';')[0]}); remove it"
-        return InputError(f"{where}{number}: {column + ': ' if column else ''}{problem}")
-    return InputError(f"{where} cannot be read as numbers; write it again")
+        alike = [cells for cells in split if len(cells) == fields]
+        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in cells] for cells in alike])
+        share = float(numeric.mean()) * len(alike) / len(split)
+        columns = np.flatnonzero(numeric.mean(axis=0) > 0.5)
+        if share > best and columns.size:
+            best, found = share, (separator, fields, columns)
+    separator, fields, columns = found
+    run: list[int] = []
+    for index, line in enumerate(lines if best > 0 else []):
+        if not line.strip():
+            continue
+        cells = _cells(line, separator)
+        numbers = [bool(_NUMBER.fullmatch(cells[c])) for c in columns if c < len(cells)]
+        run = [*run, index] if sum(numbers) > len(columns) / 2 else []
+        if len(run) == _IN_A_ROW:
+            break
+    if not run:
+        raise InputError(f"{path}: no columns of numbers in it; write {_EXAMPLE} above such")
+    return _Layout(separator, fields, run[0])
 
 
-def _fault_in_line(line: str, columns: list[_Header]) -> tuple[str, str] | None:
-    """Return column and ``problem; what to do`` of a line, or None if nothing is wrong."""
-    if not line.strip():
-        return "", "empty line; remove it"
-    if line.lstrip().startswith("#"):
-        return "", "comment among the samples; move it above the header"
-    cells = [cell.strip() for cell in line.split(",")]
-    if len(cells) != len(columns):
-        return _fault_in_fields(line, cells, [column.name for column in columns])
-    for column, cell in zip(columns, cells, strict=True):
-        problem = _fault_in_cell(cell, column.quantity)
-        if problem:
-            return column.name, problem
+def _header(
+    path: Path, lines: Sequence[str], layout: _Layout
+) -> tuple[list[str], list[str], int | None]:
+    """Return the columns' names and units, and the index of the header's first line."""
+    rows = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
+    names, units, header = [], [""] * layout.fields, None
+    for index, line in reversed(rows[-_ABOVE:]):
+        cells = next(_split_header(line, layout), None)
+        if cells is None:
+            if layout.separator == "," and 2 * len(line.split(",")) == layout.fields:
+                raise InputError(
+                    f"{path}:{layout.first + 1}: decimal commas, {layout.fields} fields for "
+                    f"{layout.fields // 2} columns; separate them by semicolons, or write 1.5"
+                )
+            continue
+        bare = [cell.strip("[]() ") for cell in cells]
+        if header is None and all(_is_unit(cell) for cell in bare if cell):
+            units, header = bare, index
+            continue
+        names, header = cells, index
+        break
+    fields = max(layout.fields, len(names))
+    units += [""] * (fields - len(units))
+    names += [""] * (fields - len(names))
+    named = [name or f"column {i}" for i, name in enumerate(names, start=1)]
+    twice = {name for name, count in Counter(named).items() if count > 1}
+    named = [f"{n} (column {i})" if n in twice else n for i, n in enumerate(named, start=1)]
+    return named, units, header
+
+
+def _split_header(line: str, layout: _Layout) -> Iterator[list[str]]:
+    """Yield the cells of a line, by any separator that gives as many as the numbers have."""
+    bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
+    ways = [_cells(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
+    for number, way in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
+        cells = [cell.strip().strip('"') for cell in way]
+        more = any(cells[layout.fields :]) and number > 0
+        if len(cells) < layout.fields or more or not any(cells):
+            continue
+        if not any(_NUMBER.fullmatch(cell) for cell in cells):
+            yield cells
+
+
+def _is_unit(text: str) -> bool:
+    return any(power_of(text, quantity) is not None for quantity in QUANTITIES)
+
+
+def _check_fields(path: Path, body: Sequence[str], layout: _Layout, names: int) -> None:
+    """Refuse a line that has fewer fields than the others, or more than the header."""
+    separator, fields = layout.separator, layout.fields
+    for number, line in enumerate(body, start=layout.first + 1):
+        count = len(line.split()) if separator == " " else line.count(separator) + 1
+        if count == fields:
+            continue
+        where, cells = f"{path}:{number}", _cells(line, separator)
+        if not line.strip():
+            raise InputError(f"{where}: empty line; remove it")
+        if line.startswith("#"):
+            raise InputError(f"{where}: comment among the samples; move it above the header")
+        counts = f"{len(cells)} fields for {fields} columns"
+        if len(cells) < fields:
+            if number == layout.first + len(body):
+                raise InputError(f"{where}: the last line is cut off ({counts}); remove it")
+            others = [s for s in _SEPARATORS[:-1] if s != separator and s in line]
+            advice = "separate the fields as above" if others else "complete the line or remove it"
+            raise InputError(f"{where}: missing field, {counts}; {advice}")
+        if any(cells[max(fields, names) :]):
+            halves = [a.lstrip("+-").isdecimal() and b.isdecimal() for a, b in pairwise(cells)]
+            if separator == "," and any(halves):
+                problem = f"decimal comma or extra field, {counts}; write 1.5 instead of 1,5"
+                raise InputError(f"{where}: {problem}")
+            raise InputError(f"{where}: extra field {cells[-1][:30]!r}, {counts}; remove it")
+
+
+def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
+    """Return the cells, as numbers where a whole column is, and the decimal mark."""
+    text = "\n".join(body)
+    frames = []
+    for decimal in "." if layout.separator == "," else ".,":
+        try:
+            frame = pd.read_csv(
+                StringIO(text),
+                sep=r"\s+" if layout.separator == " " else layout.separator,
+                decimal=decimal,
+                header=None,
+                names=range(layout.fields),
+                usecols=range(layout.fields),
+                index_col=False,
+                skip_blank_lines=False,
+                skipinitialspace=True,
+                low_memory=False,
+            )
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{path}: {one_line(str(error))[:200]}; write it again") from None
+        frames.append((frame, decimal))
+        if "," not in text:
+            break
+    return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
+
+
+def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
+    """Return a column's numbers; dates and times of day in seconds.
+
+    Raises
+    ------
+    InputError
+        A cell is none; the text names its line.
+    """
+    if column.dtype.kind in "iuf":
+        values: NDArray[Any] = column.to_numpy()
+        return values
+    text = column.astype(str)
+    numbers = pd.to_numeric(text.str.replace(decimal, "."), errors="coerce")
+    wrong = np.flatnonzero(numbers.isna() & column.notna() & (text.str.lower() != "nan"))
+    if not wrong.size:
+        return np.asarray(numbers, dtype=np.float64)
+    moments = _moments(text) if ":" in text.iloc[0] else None
+    if moments is not None:
+        return moments
+    cell = str(column.iloc[wrong[0]])
+    shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
+    raise InputError(
+        f"{path}:{first_line + wrong[0]}: {name}: {shown} is not a number; write it like 1.5"
+    )
+
+
+def _moments(text: Any) -> NDArray[Any] | None:
+    """Return dates or times of day in seconds; None if they are none."""
+    for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
+        try:
+            moments = parse(text)
+        except (ValueError, OverflowError):
+            continue
+        zero = pd.Timestamp(0, tz="UTC") if hasattr(moments.iloc[0], "tz") else pd.Timedelta(0)
+        seconds: NDArray[Any] = ((moments - zero) / pd.Timedelta(1, "s")).to_numpy()
+        return seconds
     return None
 
 
-def _fault_in_fields(line: str, cells: list[str], names: list[str]) -> tuple[str, str]:
-    for separator, words in _SEPARATORS.items():
-        if separator in line:
-            return "", f"{words} separate the fields; write commas, and points in numbers"
-    counts = f"{len(cells)} fields for {len(names)} columns"
-    if len(cells) < len(names):
-        return names[len(cells)], f"missing field, {counts}; complete the line or remove it"
-    halves = [bool(_INTEGER.fullmatch(a)) and b.isdecimal() for a, b in pairwise(cells)]
-    if any(halves):
-        column = names[min(halves.index(True), len(names) - 1)]
-        sure = len(cells) == 2 * len(names) and all(halves[::2])
-        problem = "decimal comma" if sure else "decimal comma or extra field"
-        return column, f"{problem}, {counts}; write 1.5 instead of 1,5"
-    return f"field {len(names) + 1}", f"extra field {_quoted(cells[-1])}, {counts}; remove it"
-
-
-def _fault_in_cell(cell: str, quantity: str) -> str | None:
-    not_a_number = cell.lstrip("+-").lower() == "nan"
-    if not quantity or (quantity == "displacement" and (not cell or not_a_number)):
-        return None
-    if not cell:
-        return f"empty cell; {AT_EVERY_SAMPLE}"
-    if _NUMBER.fullmatch(cell):
-        if math.isfinite(float(cell)):
-            return None
-        return f"{_quoted(cell)} is too large for a number; correct or remove the line"
-    if not_a_number or cell.lstrip("+-").lower() in ("inf", "infinity"):
-        return f"{_quoted(cell)} is not a finite number; {AT_EVERY_SAMPLE}"
-    return f"{_quoted(cell)} is not a number; write it like 1.5 or 1.5e-3"
-
-
-def _looks_cut(lines: list[str]) -> bool:
-    """Whether the last number has fewer decimals than all the numbers above it have alike."""
-    cells = [line.rpartition(",")[2].strip() for line in lines[-50:]]
-    if not cells[-1]:
-        return True
-    cells = [cell for cell in cells if cell]
-    if len(cells) < 6 or any("e" in cell.lower() for cell in cells):
-        return False
-    decimals = [len(cell.partition(".")[2]) for cell in cells]
+def _is_cut(body: Sequence[str], separator: str) -> bool:
+    """Tell whether the last number has fewer decimals than all the numbers above it have alike."""
+    cells = [line.rpartition(separator)[2].strip() for line in body[-50:]]
+    if not cells[-1] or len(cells) < 6 or any("e" in cell.lower() for cell in cells):
+        return not cells[-1] and all(cells[:-1])
+    decimals = [len(re.split("[.,]", cell)[-1]) for cell in cells if cell]
     return len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
-
-
-def _quoted(cell: str) -> str:
-    """Return a cell as it may stand in a one-line message, or nothing for an empty one."""
-    return repr(cell if len(cell) <= 30 else cell[:30] + "...") if cell else ""

@@ -1,0 +1,112 @@
+"""What an object shows of itself at a prompt: its fields, or the head of its text, never a flood.
+
+A class shows its fields by ``__repr__ = brief`` in its body. One that has a text of its own for
+``print`` shows the beginning of it: ``return head(str(self))``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["LONGEST", "MOST_LINES", "brief", "head"]
+
+# A repr has at most so many lines and characters.
+MOST_LINES, LONGEST = 12, 1200
+
+# Characters of a line, and of a value in it.
+WIDTH, VALUE = 96, 70
+
+# What shows itself shortly.
+PLAIN = (bool, int, float, complex, str, bytes, slice, Path)
+
+# An array with at most so many numbers is shown by them.
+FEW = 4
+
+
+def brief(thing: object) -> str:
+    """Return class and fields of an object, on one line or one each; long values by their size."""
+    return _called(thing, [f"{name}={_value(value)}" for name, value in _fields(thing)])
+
+
+def head(text: str) -> str:
+    """Return the beginning of a text, with what is left out counted."""
+    lines = text.splitlines()
+    if len(lines) <= MOST_LINES and len(text) <= LONGEST:
+        return text
+    shown: list[str] = []
+    for line in (one.rstrip()[: 2 * WIDTH] for one in lines[: MOST_LINES - 1]):
+        if len("\n".join([*shown, line])) > LONGEST - WIDTH:
+            break
+        shown.append(line)
+    return "\n".join([*shown, f"... {len(lines) - len(shown)} more lines: print it to see them"])
+
+
+def _called(thing: object, parts: list[str]) -> str:
+    name = type(thing).__name__
+    line = f"{name}({', '.join(parts)})"
+    if len(line) <= WIDTH:
+        return line
+    room = MOST_LINES - 2
+    if len(parts) > room:
+        parts = [*parts[: room - 1], f"... {len(parts) - room + 1} more"]
+    return "\n".join([f"{name}(", *(f"    {part[: WIDTH - 5]}," for part in parts), ")"])
+
+
+def _fields(thing: object) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of an object's fields."""
+    names: Iterable[str] = vars(thing)
+    if is_dataclass(thing):
+        names = [field.name for field in fields(thing) if field.repr]
+    for name in names:
+        if not name.startswith("_"):
+            yield name, getattr(thing, name)
+
+
+def _value(value: Any, *, nested: bool = True) -> str:
+    """Return a value in a few words; of what is in it, if it is ``nested``."""
+    if isinstance(value, np.ndarray):
+        return _array(value)
+    if isinstance(value, Mapping):
+        items = (f"{key!r}: {_value(one, nested=False)}" for key, one in value.items())
+        return _joined("{", items, len(value), "}")
+    if isinstance(value, list | tuple | set | frozenset):
+        return _joined("[", (_value(one, nested=False) for one in value), len(value), "]")
+    if nested and is_dataclass(value) and not isinstance(value, type):
+        parts = [f"{name}={_value(one, nested=False)}" for name, one in _fields(value)]
+        line = f"{type(value).__name__}({', '.join(parts)})"
+        return line if len(line) <= VALUE else f"{type(value).__name__}(...)"
+    plain = value.item() if isinstance(value, np.generic) else value
+    if plain is None or isinstance(plain, PLAIN):
+        return f"{plain:.6g}" if isinstance(plain, float) else _cut(repr(plain))
+    return str(getattr(value, "__name__", f"{type(value).__name__}(...)"))
+
+
+def _joined(opening: str, items: Iterator[str], count: int, closing: str) -> str:
+    """Return the first items of a collection, as many as there is room for, and how many more."""
+    shown: list[str] = []
+    for item in items:
+        if sum(map(len, shown)) + 2 * len(shown) + len(item) > VALUE:
+            break
+        shown.append(item)
+    more = [f"... {count - len(shown)} more"] if len(shown) < count else []
+    return f"{opening}{', '.join([*shown, *more])}{closing}"
+
+
+def _array(values: np.ndarray[Any, Any]) -> str:
+    """Return the numbers of a small array, or shape and range."""
+    if values.size <= FEW:
+        return _cut(repr(values.tolist()))
+    text = f"array {values.shape}"
+    if values.dtype.kind in "iuf" and np.isfinite(values).any():
+        finite = values[np.isfinite(values)]
+        text += f" from {finite.min():.4g} to {finite.max():.4g}"
+    return text
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= VALUE else f"{text[: VALUE - 3]}..."

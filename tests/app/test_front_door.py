@@ -1,0 +1,197 @@
+"""The first minute: whatever ordinary record a user has, it gets a config that resolves.
+
+Records are made by a play model of the tests' own, at any length, rate, start time, unit and
+separator; what is checked is all that a run does before it samples.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from bwbayes.app.config.proposal import propose
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.arrays import FloatArray
+from bwbayes.data import Record
+from bwbayes.data.io.columns import Naming
+from bwbayes.data.io.grid import decimals_of
+from bwbayes.errors import InputWarning
+
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
+    "voltage": {"V": 1.0, "mV": 1e-3, "kV": 1e3, "µV": 1e-6},
+    "displacement": {"um": 1.0, "µm": 1.0, "nm": 1e-3, "mm": 1e3, "m": 1e6, "pm": 1e-6},
+}
+SEPARATORS = [",", ";", "\t", "|", " ", ", ", "  "]
+
+Drive = Any
+
+
+def drive(kind: str, periods: float, time: FloatArray) -> FloatArray:
+    """Return a voltage over the times 0 to 1 of a record, V."""
+    phase = 2 * np.pi * periods * time
+    size: FloatArray = {
+        "sine": np.ones_like(time),
+        "decaying": np.exp(-1.8 * time),
+        "growing": 0.1 + 0.9 * time,
+        "unipolar": np.ones_like(time),
+        "chirp": np.ones_like(time),
+        "triangle": np.exp(-time),
+    }[kind]
+    if kind == "chirp":
+        phase = phase * (0.3 + 0.7 * time)
+    wave = 2 / np.pi * np.arcsin(np.sin(phase)) if kind == "triangle" else np.sin(phase)
+    voltage: FloatArray = 80.0 * size * wave
+    return voltage / 2 + 45.0 if kind == "unipolar" else voltage
+
+
+def play(voltage: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the displacement of two plays and a gain, with noise, um."""
+    result = 0.4 * voltage
+    for radius, weight in ((8.0, 0.2), (25.0, 0.15)):
+        state, states = voltage[0], np.empty_like(voltage)
+        for i, value in enumerate(voltage):
+            state = min(max(state, value - radius), value + radius)
+            states[i] = state
+        result = result + weight * states
+    return result + 0.05 * rng.standard_normal(voltage.size)
+
+
+def written(
+    path: Path,
+    voltage: FloatArray,
+    displacement: FloatArray,
+    *,
+    rate: float = 1000.0,
+    start: float = 0.0,
+    units: tuple[str, str, str] = ("s", "V", "um"),
+    separator: str = ",",
+    header: bool = True,
+) -> Path:
+    """Write a record as an instrument would, every number with the digits that it needs."""
+    scales = [UNITS[q][unit] for q, unit in zip(UNITS, units, strict=True)]
+    decimals = max(decimals_of(1 / rate) + 3 + round(np.log10(scales[0])), 0)
+    times = [f"{(start + i / rate) / scales[0]:.{decimals}f}" for i in range(voltage.size)]
+    columns = [times] + [
+        [f"{value:.9g}" for value in values / scale]
+        for values, scale in zip((voltage, displacement), scales[1:], strict=True)
+    ]
+    names = [f"{name}_{unit}" for name, unit in zip(UNITS, units, strict=True)]
+    lines = [separator.join(names)] * header
+    path.write_text("\n".join([*lines, *map(separator.join, zip(*columns, strict=True))]) + "\n")
+    return path
+
+
+def resolved(path: Path, naming: Naming | None = None) -> Problem:
+    """Return the problem of a file that has no config: all but the sampling of a run."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return resolve(propose(path, path.parent, naming).config, path.parent)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    samples=st.integers(200, 3000),
+    rate=st.one_of(
+        st.sampled_from([1.0, 200.0, 500.0, 1000.0, 1e5]),
+        st.floats(0, 5).map(lambda power: float(f"{10**power:.6g}")),
+    ),
+    start=st.sampled_from([0.0, -3.2, 0.005, 25.0, 1234.567, 86_400.0, 1.7e9, 1_732_336_257.123]),
+    units=st.tuples(*(st.sampled_from(list(table)) for table in UNITS.values())),
+    separator=st.sampled_from(SEPARATORS),
+    kind=st.sampled_from(["sine", "decaying", "growing", "unipolar", "chirp", "triangle"]),
+    periods=st.floats(1.5, 12),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_any_ordinary_record_gets_a_config_that_resolves(
+    tmp_path: Path,
+    samples: int,
+    rate: float,
+    start: float,
+    units: tuple[str, str, str],
+    separator: str,
+    kind: str,
+    periods: float,
+    seed: int,
+) -> None:
+    """Every window holds readings, and what is held out is a quarter, or nothing."""
+    voltage = drive(kind, periods, np.arange(samples) / samples)
+    displacement = play(voltage, np.random.default_rng(seed))
+    options: dict[str, Any] = {"rate": rate, "start": start, "units": units}
+    path = written(tmp_path / "a.csv", voltage, displacement, separator=separator, **options)
+    problem = resolved(path)
+    record = problem.record
+    assert (samples, samples) == (record.samples, record.readings)
+    assert record.interval == pytest.approx(1 / rate, rel=1e-4)
+    np.testing.assert_allclose(record.voltage, voltage, rtol=1e-8, atol=1e-9)
+    fitted = np.concatenate([np.r_[w] for w in problem.posterior.only.training])
+    held = [np.r_[w] for v in problem.validations.values() for w in v.windows]
+    assert all(window.size for window in held)
+    every = np.sort(np.concatenate([fitted, *held]))
+    np.testing.assert_array_equal(every, np.arange(samples))
+    assert sum(window.size for window in held) in (0, *range(samples // 4 - 8, samples // 4 + 9))
+    # A clock's time stamps count from the first sample; what they were is kept.
+    assert abs(record.start) < 1e6
+    assert record.start + record.time_offset == pytest.approx(start, abs=1 / rate)
+
+
+def held_out(problem: Problem) -> np.ndarray[Any, Any]:
+    """Return whether each sample is held out."""
+    held = np.zeros(problem.record.samples, dtype=np.bool_)
+    for window in problem.validations["held_out"].windows:
+        held[window] = True
+    return held
+
+
+@pytest.mark.parametrize("kind", ["sine", "decaying", "unipolar", "chirp", "triangle"])
+@pytest.mark.parametrize("periods", [9.3, 16.0, 40.0])
+def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: float) -> None:
+    """Of every amplitude and rate that the drive has: no tail, and no end of a chirp."""
+    voltage = drive(kind, periods, np.arange(4000) / 4000)
+    path = written(tmp_path / "a.csv", voltage, play(voltage, np.random.default_rng(0)))
+    held = held_out(resolved(path))
+    rates = np.abs(np.gradient(voltage))
+    for values in (voltage, rates):
+        assert stats.ks_2samp(values[held], values[~held]).statistic < 0.2
+        assert np.ptp(values[held]) > 0.7 * np.ptp(values)
+
+
+def test_the_tail_of_a_decaying_sine_is_not_all_that_is_held_out(tmp_path: Path) -> None:
+    voltage = drive("decaying", 16.0, np.arange(8000) / 8000)
+    path = written(tmp_path / "a.csv", voltage, play(voltage, np.random.default_rng(0)))
+    held = held_out(resolved(path))
+    assert np.abs(voltage[held]).max() > 0.7 * np.abs(voltage).max()
+    windows = np.flatnonzero(np.diff(held.astype(int)) == 1).size
+    assert 2 <= windows <= 5
+
+
+@pytest.mark.parametrize(
+    ("window", "gone"),
+    [
+        ((1.60, 1.67), [1.60, 1.65]),
+        ((1.63, 1.67), [1.60, 1.65]),
+        ((1.60, 1.65), [1.60]),
+        ((1.61, 1.62), [1.60]),
+        ((0.0, 0.05), [0.0]),
+    ],
+)
+def test_exclude_takes_every_sample_that_it_touches(
+    window: tuple[float, float], gone: list[float]
+) -> None:
+    time = 0.05 * np.arange(100)
+    record = Record(np.sin(time), np.cos(time), 0.05)
+    left = record.exclude([window])
+    np.testing.assert_allclose(time[~left.has_reading], gone, atol=1e-9)
+
+
+def test_messages_tell_the_windows_of_a_fast_or_late_record_apart() -> None:
+    record = Record(np.sin(np.arange(500)), np.cos(np.arange(500)), 1e-5, start=99_999.0)
+    with pytest.raises(ValueError, match=r"window 99999\.00499 to 99999\.006 s: reaches outside"):
+        record.window(99_999.00499, 99_999.006)

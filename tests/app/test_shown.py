@@ -1,0 +1,200 @@
+"""Objects show little at a prompt, ``dir`` public names alone, and docstrings no inner modules."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from types import FunctionType, MethodType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import bwbayes as bw
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.campaign_result import CampaignResult, Row
+from bwbayes.control.loop import Noise, Stand
+from bwbayes.control.tracking import Tracking, Wishes, track
+from bwbayes.population.population import population
+from bwbayes.shown import LONGEST, MOST_LINES, brief, head
+from tests.app import small
+from tests.control import cases
+from tests.population.populations import drawn
+
+INNER = re.compile(r"bwbayes\.[a-z_]+\.\w+")
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """Return what public names make and public calls return."""
+    fit, folder = bw.open_run(small.finished(tmp_path_factory)), tmp_path_factory.mktemp("shown")
+    rng = np.random.default_rng(1)
+    time = np.arange(300) / 50
+    voltage = 60 * np.sin(2 * np.pi * time) * (1 - time / 20)
+    stand = bw.VirtualTestStand(sample_rate=50.0)
+    record = stand.run(voltage, rng)
+    problem, posterior, draws = fit.problem, fit.problem.posterior, fit.result.flat_draws
+    background = bw.Background.of(posterior, draws)
+    bands = bw.predict_record(posterior, draws, record, bw.Start(), rng)
+    point = bw.point_fit(posterior, rng)
+    experiment = bw.Experiment(posterior, problem.plan)
+    with ThreadPoolExecutor(1) as executor:
+        (replicate,) = bw.replicates(experiment, 1, [0], executor)
+    many = population(drawn(rng).specimens, rng)
+    rows = tuple(Row(f"s{i}", f"s{i}.csv", "refused", "because " * 40, {}) for i in range(200))
+    return [
+        fit,
+        record,
+        stand,
+        bw.Record.from_arrays(np.sin(np.arange(1000)), interval=1e-3),
+        bw.signal("identification"),
+        bw.Actuator(),
+        bw.Start(),
+        bw.Step(10.0, 1.0),
+        bw.noise_model("discrepancy", 0.01),
+        bw.InputError("a"),
+        bw.InputWarning("a"),
+        bw.NotConvergedError("a"),
+        *bw.inspect(bw.Record(voltage, -voltage, 0.02)),
+        point,
+        bw.first_chain(posterior, point, problem.plan, rng),
+        background,
+        bands,
+        bw.score(bands, rng),
+        bw.assess(bands, background),
+        fit.predict(record, lead_in=0.2),
+        bw.measure_loops(posterior, draws),
+        bw.measure_step(posterior, draws, bw.Step(10.0, 1.0)),
+        experiment,
+        replicate,
+        bw.judge([replicate.entry()], rng),
+        many,
+        bw.Campaign(CampaignResult(rows, many), CampaignFolder(folder)),
+        fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
+        fit.export(folder / "export"),
+        followed(rng),
+        *fit.design("d", candidates={"fast": voltage, "slow": 0.5 * voltage}),
+        bw.compare(fit, fit, future=False, workers=1),
+        bw.parse_config('[record]\nfile = "a.csv"\n', "a"),
+        bw.Distribution("normal", {"mean": 1.0, "sd": 0.1}),
+    ]
+
+
+def followed(generator: np.random.Generator) -> Tracking:
+    """Return what ``fit.track`` does, of three draws: the margins of a thousand take a minute."""
+    actuator = cases.actuator("bouc-wen, second-order", "zero")
+    noise = Noise(np.full(3, 0.5), np.full(3, 1.5), np.full(3, 0.5))
+    wishes = Wishes(frequencies=(5.0,))
+    return track(actuator, cases.theta(actuator, 3), noise, Stand(cases.SPAN), wishes, generator)
+
+
+def reached(things: list[Any]) -> dict[type, Any]:
+    """Return an object of each of the package's types that public attributes lead to."""
+    found: dict[type, Any] = {}
+    waiting = list(things)
+    while waiting:
+        thing = waiting.pop()
+        if isinstance(thing, Mapping | list | tuple) and not hasattr(thing, "_fields"):
+            waiting += list(thing.values() if isinstance(thing, Mapping) else thing)[:1]
+        if not type(thing).__module__.startswith("bwbayes") or type(thing) in found:
+            continue
+        if isinstance(thing, MethodType | FunctionType | type):
+            continue
+        found[type(thing)] = thing
+        for name in dir(thing):
+            if not name.startswith(("_", "model_")):
+                # A campaign without its files has no table.
+                with suppress(OSError):
+                    waiting.append(getattr(thing, name))
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+def test_every_object_shows_itself_in_a_dozen_lines(objects: list[Any]) -> None:
+    """Those that users make and get, and all that their public attributes lead to."""
+    found = reached(objects)
+    public = {getattr(bw, name) for name in bw.__all__ if isinstance(getattr(bw, name), type)}
+    assert not {one.__name__ for one in public - set(found)}
+    assert len(found) > 60
+    for thing in [*objects, *found.values()]:
+        text = repr(thing)
+        assert text.count("\n") < MOST_LINES, type(thing)
+        assert len(text) <= LONGEST, type(thing)
+
+
+def test_what_is_printed_is_still_whole(objects: list[Any]) -> None:
+    fit = objects[0]
+    assert len(str(fit).splitlines()) > MOST_LINES
+    assert str(fit).startswith("small: converged, ")
+    first, last = repr(fit).splitlines()[0], repr(fit).splitlines()[-1]
+    assert str(fit).startswith(first)
+    assert re.fullmatch(r"\.\.\. \d+ more lines: print it to see them", last)
+
+
+@dataclass(frozen=True)
+class Anything:
+    """With fields of any kind."""
+
+    __repr__ = brief
+
+    one: Any
+    another: Any
+
+
+VALUES = st.recursive(
+    st.none() | st.text() | st.floats() | st.integers() | st.binary(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
+)
+
+
+@given(VALUES, VALUES)
+def test_anything_is_shown_shortly(one: Any, another: Any) -> None:
+    for thing in (Anything(one, another), Anything(Anything(one, another), [one] * 50)):
+        assert repr(thing).count("\n") < MOST_LINES
+        assert len(repr(thing)) <= LONGEST
+
+
+def test_values_are_shown_by_their_size() -> None:
+    shown = repr(Anything(np.arange(1000.0), {"a": 0.1 + 0.2, "b": np.float64(1e-9)}))
+    assert shown == "Anything(one=array (1000,) from 0 to 999, another={'a': 0.3, 'b': 1e-09})"
+    shown = repr(Anything(np.array([1, 2]), np.array([[np.nan]] * 9)))
+    assert shown == "Anything(one=[1, 2], another=array (9, 1))"
+    assert "... 96 more]" in repr(Anything(["a long text"] * 100, 0))
+
+
+@given(st.text(st.characters(codec="utf-8")))
+def test_the_head_of_any_text_is_short(text: str) -> None:
+    for whole in (text, "\n".join([text] * 20), 2000 * text):
+        assert head(whole).count("\n") < MOST_LINES
+        assert len(head(whole)) <= LONGEST
+
+
+def test_dir_has_public_names_alone() -> None:
+    assert sorted(bw.__all__) == dir(bw)
+
+
+def documented() -> Iterator[tuple[str, str]]:
+    """Yield the docstrings of public names, and of what is public of them."""
+    for name in bw.__all__:
+        thing = getattr(bw, name)
+        yield name, inspect.getdoc(thing) or ""
+        for member in dir(thing) if isinstance(thing, type) else ():
+            if not member.startswith(("_", "model_")):
+                yield f"{name}.{member}", inspect.getdoc(getattr(thing, member)) or ""
+
+
+def test_no_public_docstring_names_an_inner_module() -> None:
+    named = {name: INNER.findall(text) for name, text in documented()}
+    assert len(named) > 200
+    assert {} == {name: found for name, found in named.items() if found}
+
+
+def test_no_docstring_of_what_is_returned_names_an_inner_module(objects: list[Any]) -> None:
+    named = {type(thing): INNER.findall(type(thing).__doc__ or "") for thing in objects}
+    assert {} == {kind: found for kind, found in named.items() if found}

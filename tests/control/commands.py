@@ -1,0 +1,163 @@
+"""Fitted problems to compensate with, and what becomes of commands that are played."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bwbayes.app.config.config import parse
+from bwbayes.app.config.keywords import config_of
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.workers import one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.control.predicted import Compensation
+from bwbayes.data.record import Record
+from bwbayes.data.teststand import LaserSensor, VirtualTestStand
+from bwbayes.data.waveforms import signal
+from bwbayes.inference import pointfit
+from bwbayes.inference.noise import noise_model
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.results.bands import LEVELS
+from bwbayes.results.prediction import thinned
+from bwbayes.sampling.sampler import draws, first_chain, sample
+
+__all__ = [
+    "CONFIG",
+    "LIMITS",
+    "about",
+    "discrepancy",
+    "drawn",
+    "inside",
+    "measured_voltage",
+    "off",
+    "problem",
+    "promised",
+    "rms",
+]
+
+CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
+LIMITS = Limits(-100.0, 100.0)
+
+# Of the stand whose voltage is measured: sds, um, time, s, and the rate at which it moves, Hz.
+SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
+
+
+@cache
+def problem(discrepancy: str = "process", rate: float = 100.0, seed: int = 1) -> Problem:
+    """Return that of the ring bender with the command for a voltage."""
+    text = CONFIG.read_text(encoding="utf-8").replace(
+        'discrepancy = "process"', f'discrepancy = "{discrepancy}"\nsample_rate = {rate}'
+    )
+    config = parse(re.sub(r"ess = \d+", "ess = 500", text), "compensation")
+    return resolve(config.model_copy(update={"seed": seed}), CONFIG.parent)
+
+
+def measured_voltage(rate: float, seed: int = 1) -> Problem:
+    """Return that of a ring bender whose amplifier's output is measured at a rate, Hz.
+
+    The amplifier moves as fast as it can, whatever the rate, and the discrepancy is small.
+    """
+    source, every = np.random.default_rng(seed), round(FAST / rate)
+    stand = VirtualTestStand("none", FAST, sensor=LaserSensor(sd=SENSOR, span=200.0))
+    run = stand.run(signal("identification"), source)
+    assert run.truth is not None
+    moved = run.truth[::every] + discrepancy(run.truth[::every].size, 1 / rate, source)
+    reading = moved + SENSOR * source.standard_normal(moved.size)
+    voltage = stand.amplifier.output(run.voltage, 1 / FAST)[::every]
+    truth = stand.parameters() | {"discrepancy_sd": DISCREPANCY, "discrepancy_time": TIME}
+    keys: dict[str, Any] = {
+        "dynamics": "second-order",
+        "from_rest": True,
+        "parameters": {name: {"fixed": truth[name]} for name in ("mass", "stiffness")},
+        "truth": truth,
+        "ess": 500,
+        "seed": seed,
+    }
+    config, records = config_of(Record(voltage, reading, 1 / rate), keys)
+    return resolve(config, Path(), records)
+
+
+def discrepancy(samples: int, interval: float, source: np.random.Generator) -> FloatArray:
+    """Draw that of the stand whose voltage is measured, (samples,), um."""
+    noise = noise_model("discrepancy", interval)
+    return noise.draw(np.array([[0.0, DISCREPANCY, TIME]]), samples, source)[0]
+
+
+def drawn(of: Problem, seed: int) -> FloatArray:
+    """Fit a problem, and return a thousand draws (draws, free)."""
+    posterior = of.posterior
+    with ThreadPoolExecutor(1) as executor, one_thread():
+        point = pointfit.fit(posterior, generator(seed, "point fit"))
+        chain = first_chain(posterior, point, of.plan, generator(seed, "sampling"))
+        outcome = sample(posterior, of.plan, chain, executor)
+    assert outcome.converged, outcome.stop_reason
+    flat = draws(posterior, chain).reshape(-1, len(posterior.names))
+    return thinned(flat, generator(seed, "draws"))
+
+
+def about(of: Problem, spread: float, count: int, source: np.random.Generator) -> FloatArray:
+    """Return draws (draws, free) about the truth, each parameter with this relative sd."""
+    truth = of.config.truth
+    known = np.array([truth.get(name, 0.5) for name in of.posterior.names])
+    scale = np.where(known == 0.0, 1.0, known)
+    return known + spread * scale * source.standard_normal((count, known.size))
+
+
+def promised(
+    of: Problem, command: Compensation, truths: FloatArray, source: np.random.Generator
+) -> dict[tuple[str, int], float]:
+    """Return the part of truths (truths, free) whose errors are where the command says.
+
+    Each plays the command by a DAC, which holds it.
+    """
+    record = of.posterior.only
+    theta = of.posterior.prior.theta(truths)
+    actuator = replace(record.actuator, interval=command.reference.interval, hold="zero")
+    model = actuator.displacement(record.table.actuator(theta), command.voltage, from_rest=True)
+    # Displacements count from where the actuator stands at zero volts, where it begins.
+    model -= model[:, :1]
+    noise = record.noise.at(command.reference.interval)
+    held: dict[tuple[str, int], list[float]] = {}
+    for row, one in enumerate(model):
+        truth = one + noise.draw(record.table.noise(theta[row : row + 1]), one.size, source)[0]
+        # One sample of each truth: its samples are not independent.
+        at = np.array([source.integers(one.size)])
+        for key, part in inside(command, truth, at).items():
+            held.setdefault(key, []).append(part)
+    return {key: float(np.mean(values)) for key, values in held.items()}
+
+
+def inside(
+    command: Compensation, truth: FloatArray, at: Any = slice(None)
+) -> dict[tuple[str, int], float]:
+    """Return the part of a displacement's samples inside the bands, and whether its rms error is.
+
+    ``at`` are the samples that count for the bands.
+    """
+    held = {}
+    for level in LEVELS:
+        bands = command.compensated.bands
+        low, high = (edge["displacement", level][at] for edge in (bands.lower, bands.upper))
+        held["band", level] = float(np.mean((low <= truth[at]) & (truth[at] <= high)))
+        least, most = command.summary["compensated"]["rms_um"][str(level)]
+        held["rms", level] = float(least <= rms(truth - command.asked) <= most)
+    return held
+
+
+def off(held: dict[tuple[str, int], float], count: int) -> dict[tuple[str, int], float]:
+    """Return by how many standard errors the parts are off."""
+    return {
+        (kind, level): (part - level / 100) / np.sqrt(level / 100 * (1 - level / 100) / count)
+        for (kind, level), part in held.items()
+    }
+
+
+def rms(error: FloatArray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(error**2)))

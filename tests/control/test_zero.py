@@ -1,0 +1,153 @@
+"""0 um is where the actuator stands at zero volts: for commands, which begin there, loops and C."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.app.config.keywords import config_of
+from bwbayes.app.jobs.at_work import command_limits
+from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.arrays import FloatArray
+from bwbayes.control.compensation import compensate
+from bwbayes.control.exported import exported
+from bwbayes.control.predicted import Compensation
+from bwbayes.control.sampled import SampledModel
+from bwbayes.control.wished import Reference, shaped
+from bwbayes.data.record import Record
+from bwbayes.data.teststand import RingBender, VirtualTestStand
+from bwbayes.errors import InputError
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.operator import Span
+from bwbayes.model.registry import HYSTERESIS
+from tests.control import cases
+from tests.control.compiled import Compiled
+from tests.programs import needs
+
+OFFSET, INTERVAL = 7.0, 0.005
+TIME = INTERVAL * np.arange(400)
+
+# Of a model with a gain about the middle of 0 to 100 V, which is not zero at zero volts.
+VALUES = {
+    "d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "quadratic": 1.5, "lag": 3.8e-3,
+    "offset": OFFSET, "sensor_sd": 0.1, "discrepancy_sd": 1e-6, "discrepancy_time": 0.5,
+}  # fmt: skip
+
+
+def problem(**keys: Any) -> Problem:
+    """Return that of a ring bender driven on one side, whose sensor has an offset."""
+    stand = VirtualTestStand("none", 1 / INTERVAL, RingBender(offset=OFFSET))
+    run = stand.run(50 * (1 - np.cos(4 * np.pi * TIME)), np.random.default_rng(1))
+    config, records = config_of(run, {"from_rest": True, **keys})
+    return resolve(config, Path(), records)
+
+
+def made(of: Problem, flat: FloatArray, asked: Reference, **options: Any) -> Compensation:
+    source, limits = np.random.default_rng(7), Limits(-100.0, 100.0)
+    return compensate(of.posterior, flat, asked, source, limits=limits, **options)
+
+
+def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -> None:
+    of = problem(gain=["quadratic"])
+    flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
+    asked = shaped("sine", INTERVAL, 10.0, 2.0, middle=15.0)
+    command = made(of, flat, asked, from_rest=True).voltage
+    assert command[0] == pytest.approx(0.0, abs=1e-9)
+    at_zero = flat.copy()
+    at_zero[:, of.posterior.names.index("offset")] = 0.0
+    same = made(of, at_zero, asked, from_rest=True)
+    np.testing.assert_allclose(same.voltage, command, atol=1e-9)
+
+    model, _ = export_draws(of, flat, tmp_path, voltage=(-100.0, 100.0))
+    state, stepped = model.model.begin(np.zeros(1)), []
+    reference = np.asarray(asked.displacement)[1:]
+    for target in reference:
+        voltage, state = model.model.inverse(state, np.array([target]), Span(-100.0, 100.0))
+        stepped.append(voltage[0])
+    np.testing.assert_allclose(stepped, command[:-1], atol=1e-6)
+
+    compiled = Compiled(model, tmp_path, needs("cc"))
+    np.testing.assert_allclose(compiled.run("inverse", 0.0, reference), command[:-1], atol=1e-6)
+
+
+# Operators that integrate take half a minute to find in which states a record may begin.
+@pytest.mark.parametrize(
+    ("hysteresis", "from_rest"),
+    [(name, True) for name in HYSTERESIS]
+    + [(name, False) for name in HYSTERESIS if name not in ("jiles-atherton", "domain-wall")],
+)
+def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool) -> None:
+    """At zero volts and 0 um, with every operator, whatever the sensor's offset."""
+    of = problem(hysteresis=hysteresis, dynamics="lag")
+    flat = of.posterior.prior.draw(np.random.default_rng(2), 1).repeat(2, axis=0)
+    flat[:, of.posterior.names.index("offset")] = OFFSET
+    asked = Reference(5 * (1 - np.cos(2 * np.pi * TIME[:20] / TIME[20])), INTERVAL)
+    command = made(of, flat, asked, from_rest=from_rest, nearest=True)
+    for played in (command.compensated, command.linear):
+        assert played.voltage[0] == pytest.approx(0.0, abs=1e-6)
+        for kind in ("parameter", "displacement"):
+            spread = 6 * flat[:, of.posterior.names.index("discrepancy_sd")].max()
+            edges = [played.bands.lower[kind, 95][0], played.bands.upper[kind, 95][0]]
+            np.testing.assert_allclose(edges, 0.0, atol=1e-6 if kind == "parameter" else spread)
+
+
+@pytest.mark.parametrize("name", cases.ACTUATORS)
+def test_a_sampled_model_stands_at_zero_at_zero_volts(name: str, tmp_path: Path) -> None:
+    """Also with a gain about another voltage, and creep."""
+    gain = PolynomialGain(("quadratic", "cubic"), Span(0.0, 80.0))
+    actuator = replace(cases.actuator(name, "zero"), gain=gain)
+    theta = cases.theta(actuator, 1, name)
+    model = SampledModel.of(actuator, theta)
+    begun = model.begin(np.zeros(1))
+    assert model.displacement(begun) == pytest.approx(0.0, abs=1e-12)
+    voltage = cases.drive(300)
+    voltage[0] = 0.0
+    expected = actuator.displacement(theta, voltage, from_rest=True)[0]
+    assert abs(expected[0]) > 0.1
+    compiled = Compiled(exported(name, actuator, theta[0], cases.SPAN), tmp_path, needs("cc"))
+    displacement = compiled.run("forward", 0.0, voltage)
+    np.testing.assert_allclose(displacement, expected - expected[0], atol=1e-10)
+
+
+def test_a_reference_that_begins_elsewhere_gets_a_way_from_zero() -> None:
+    of = problem(dynamics="lag")
+    flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
+    asked = Reference(25 + 10 * np.cos(2 * np.pi * TIME), INTERVAL, smoothed=0.01)
+    command = made(of, flat, asked)
+    assert (1.0, 1.0) == (command.reference.approach, command.summary["approach_s"])
+    way = round(1.0 / INTERVAL)
+    np.testing.assert_array_equal(command.asked[way:], asked.given)
+    assert (0.0, 0.0) == (command.asked[0], command.smoothed[0])
+    assert command.voltage[0] == pytest.approx(0.0, abs=1e-9)
+    assert np.max(np.abs(np.diff(command.asked[: way + 1]))) < 0.4
+    assert any("begins at 35 um: a way of 1 s is put before it" in one for one in command.remarks)
+    again = command.reference.from_zero()
+    assert again is command.reference
+
+
+def test_smoothing_keeps_where_a_reference_begins_and_ends() -> None:
+    """However short it is, and however wide the smoothing; a ramp stays as it is."""
+    for samples, smoothed in ((10, 1.0), (400, 0.02)):
+        ramp = Reference(np.linspace(0, 30, samples), INTERVAL, smoothed=smoothed)
+        np.testing.assert_allclose(np.asarray(ramp.displacement), ramp.given, atol=1e-9)
+    moving = Reference(np.sin(3 * TIME) + TIME, INTERVAL, smoothed=0.05)
+    ends = np.asarray(moving.displacement)[[0, -1]]
+    np.testing.assert_allclose(ends, moving.given[[0, -1]], atol=1e-9)
+
+
+def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> None:
+    of = problem(dynamics="lag")
+    flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
+    asked = shaped("sine", INTERVAL, 5.0, 2.0)
+    with pytest.raises(InputError, match=r"20 to 100 V leaves out zero volts.*include it"):
+        compensate(of.posterior, flat, asked, np.random.default_rng(1), limits=Limits(20.0, 100.0))
+    voltage = 60 + 40 * np.sin(4 * np.pi * TIME)
+    record = Record(voltage, 0.5 * voltage + np.sin(TIME), INTERVAL)
+    config, records = config_of(record, {})
+    assert command_limits(resolve(config, Path(), records), None) == (0.0, 100.0)
