@@ -24,6 +24,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.identifiability import stretches_once
+from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Asked", "Promise", "promises", "ranked"]
@@ -76,6 +77,8 @@ class Asked:
         The candidates' voltages (samples,) by name, V.
     interval
         Their sampling interval, s.
+    standing
+        How the validation of the run came out.
     """
 
     run: str
@@ -84,6 +87,7 @@ class Asked:
     amplifier: Limits
     signals: Mapping[str, FloatArray]
     interval: float
+    standing: Standing
 
     @property
     def target(self) -> str:

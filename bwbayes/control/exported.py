@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Exported", "exported"]
@@ -71,6 +73,8 @@ class Exported:
         Standard deviations of its parameters, by name, if they are known.
     without_inverse
         Why it has no inverse; None if it has one.
+    standing
+        How the validation of the run came out that it is of.
     """
 
     __repr__ = brief
@@ -80,6 +84,7 @@ class Exported:
     limits: Span
     sds: Mapping[str, float]
     without_inverse: str | None
+    standing: Standing = field(default_factory=Standing)
 
     @property
     def linear(self) -> Any:
@@ -98,6 +103,7 @@ class Exported:
         return {
             "name": self.name,
             "bwbayes": version("bwbayes"),
+            "validation": self.standing.numbers,
             "interval_s": actuator.interval,
             "hold": actuator.hold,
             "limits_V": list(self.limits),
@@ -156,6 +162,7 @@ class Exported:
         return environment.get_template("actuator.c.j2").render(
             title=f"Model of {_plain(self.name)}",
             parts=f"Parts: {_plain(', '.join(parts))}.",
+            warnings=[_plain(line) for said in self.standing.said for line in wrap(said, 92)],
             version=_plain(version("bwbayes")),
             interval=actuator.interval,
             between=BETWEEN[actuator.hold],
@@ -269,4 +276,4 @@ def _in_c(value: Any) -> Any:
 
 def _plain(text: str) -> str:
     """Return a text that ends no comment of C."""
-    return re.sub(r"[^\w .,:;=+()-]", "_", text, flags=re.ASCII)
+    return re.sub(r"[^\w .,:;=+()%/-]", "_", text, flags=re.ASCII)

@@ -7,7 +7,7 @@ the reference as requested and as it was smoothed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from bwbayes.control.wished import Reference
 from bwbayes.data.record import Record
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.results.bands import KINDS, LEVELS, Bands
+from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Choice", "Compensation", "Errors", "Played", "planned"]
@@ -91,7 +92,8 @@ class Compensation:
     largest difference of the two voltages that could have been taken, V, and ``other`` what the
     other one leaves, as ``Played.smoothed.expected``, um. ``limit`` is that of the error, um, if
     there is one; ``hold`` what the command does between samples, and ``between`` how far the
-    displacement leaves straight lines there, um.
+    displacement leaves straight lines there, um. ``standing`` is how the validation of the run came
+    out that all of this builds on.
     """
 
     __repr__ = brief
@@ -107,6 +109,7 @@ class Compensation:
     from_rest: bool
     limit: float | None = None
     remarks: tuple[str, ...] = ()
+    standing: Standing = field(default_factory=Standing)
 
     @property
     def asked(self) -> FloatArray:
@@ -135,6 +138,7 @@ class Compensation:
         """What is promised, in numbers."""
         asked = self.asked
         return {
+            "validation": self.standing.numbers,
             "reference": self.reference.name,
             "samples": asked.size,
             "interval_s": self.reference.interval,

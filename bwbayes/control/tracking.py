@@ -25,6 +25,7 @@ from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["CONTROLLERS", "Tracking", "Wishes", "track"]
@@ -81,7 +82,8 @@ class Tracking:
     ``rms`` and ``largest`` error, um, and the share of samples ``limited`` by the amplifier are
     (controllers, frequencies, signals, draws), in the order of ``CONTROLLERS``, ``frequencies``,
     Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
-    take the time ``rise``, s.
+    take the time ``rise``, s. ``standing`` is how the validation of the run came out that gave the
+    draws.
     """
 
     __repr__ = brief
@@ -98,6 +100,7 @@ class Tracking:
     rms: FloatArray
     largest: FloatArray
     limited: FloatArray
+    standing: Standing = field(default_factory=Standing)
 
     @property
     def best(self) -> FloatArray:
@@ -135,6 +138,7 @@ class Tracking:
         """Return all of it for a summary, with units in the names."""
         gains, margins, stand = self.gains, self.margins, self.stand
         return {
+            "validation": self.standing.numbers,
             "controller": {
                 "proportional_V_per_um": gains.proportional,
                 "integral_V_per_um_s": gains.integral,

@@ -21,6 +21,7 @@ from bwbayes.app.report.report import render
 from bwbayes.comparison.design import Asked, Promise
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.result import summary
+from bwbayes.results.standing import Standing
 from tests.app import example, small
 from tests.programs import needs
 
@@ -89,7 +90,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         paths[name].write_text(page, encoding="utf-8")
     check(small.config(), folder, folder, small.quiet())
     wave = 100 * np.sin(np.arange(300) / 10)
-    asked = Asked("a run", "beta", None, Limits(-100, 100), {"sine": wave, "far": 9 * wave}, 0.01)
+    asked = Asked(
+        "a run", "beta", None, Limits(-100, 100), {"sine": wave, "far": 9 * wave}, 0.01, Standing()
+    )
     made = [Promise("sine", 0.6, 0.01), Promise("far", np.nan, np.nan, "goes too far")]
     drawn = dict.fromkeys(("promises", "best"), picture)
     paths["design"].write_text(design_page(asked, made, drawn), encoding="utf-8")

@@ -16,6 +16,7 @@ from bwbayes.app.report.design_report import alike, render
 from bwbayes.comparison.design import Asked, Promise
 from bwbayes.data import read_record
 from bwbayes.model.inverse.limits import Limits
+from bwbayes.results.standing import Standing
 from tests.app import small
 
 CANDIDATES = """\
@@ -105,7 +106,9 @@ def test_a_page_names_what_cannot_be_told_apart_and_what_is_refused() -> None:
         Promise("d", np.nan, np.nan, "is too fast"),
     ]
     assert ["b"] == alike(made)
-    asked = Asked("run", None, "x", Limits(-100, 100, 50.0), dict.fromkeys("abcd", wave), 0.01)
+    asked = Asked(
+        "run", None, "x", Limits(-100, 100, 50.0), dict.fromkeys("abcd", wave), 0.01, Standing()
+    )
     page = render(asked, made, {})
     assert "Not to be told apart from it: b." in page
     assert "<li>d is too fast</li>" in page

@@ -10,6 +10,7 @@ import click
 from bwbayes.app.commands.shared import (
     FILE,
     capacitance_option,
+    conclude,
     current_option,
     hold_option,
     overwrite_option,
@@ -81,12 +82,13 @@ def compensate(
 
     if (shape is None) == (reference is None):
         raise InputError("compensate: give either a shape or --reference")
-    made = compensate_draws(*drawn(folder), shape or reference, **options)
+    made = compensate_draws(drawn(folder), shape or reference, **options)
     name = made.reference.name
     files = made.save(out or folder / "compensation" / name, overwrite=overwrite)
+    status = conclude(made.standing)
     for remark in made.remarks:
         click.echo(f"bwbayes: {remark}", err=True)
     click.echo(repr(made))
     for path in files:
         click.echo(f"wrote {path}")
-    return 0
+    return status

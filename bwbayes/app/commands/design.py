@@ -11,6 +11,7 @@ from bwbayes.app.commands.shared import (
     FILE,
     NOT_CONVERGED,
     capacitance_option,
+    conclude,
     current_option,
     overwrite_option,
     slew_option,
@@ -57,6 +58,7 @@ def design(
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
     from bwbayes.app.jobs.design import design as rank
+    from bwbayes.app.running.folder import RunFolder
 
     try:
         rank(
@@ -75,4 +77,5 @@ def design(
     except NotConvergedError as error:
         click.echo(f"NOT CONVERGED: {error}", err=True)
         return NOT_CONVERGED
-    return 0
+    # The screen begins with it.
+    return conclude(RunFolder.open(folder).standing(), say=False)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from bwbayes.app.commands.shared import FILE, hold_option, overwrite_option
+from bwbayes.app.commands.shared import FILE, conclude, hold_option, overwrite_option
 
 __all__ = ["export"]
 
@@ -50,8 +50,9 @@ def export(
         hold=hold,
         overwrite=overwrite,
     )
+    status = conclude(made.standing)
     if made.without_inverse is not None:
         click.echo(f"bwbayes: no inverse in it: {made.without_inverse}", err=True)
     for path in files:
         click.echo(f"wrote {path}")
-    return 0
+    return status

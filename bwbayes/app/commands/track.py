@@ -7,7 +7,13 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.shared import FILE, overwrite_option, quiet_option, voltage_option
+from bwbayes.app.commands.shared import (
+    FILE,
+    conclude,
+    overwrite_option,
+    quiet_option,
+    voltage_option,
+)
 
 __all__ = ["track"]
 
@@ -76,8 +82,9 @@ def track(
         draws=draws,
     )
     made, files = track_run(folder, out, setup, overwrite=overwrite)
+    status = conclude(made.standing)
     if not quiet:
         show(made, Console())
         for path in files:
             click.echo(f"wrote {path}")
-    return 0
+    return status

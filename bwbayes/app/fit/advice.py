@@ -8,11 +8,12 @@ from typing import Any
 from bwbayes.app.fit.compared import Compared, Finished, compared, named
 from bwbayes.app.fit.options import options_of
 from bwbayes.app.fit.surroundings import warn
+from bwbayes.app.jobs.at_work import Drawn
 from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.design import design_draws
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.jobs.track import Setup, track_draws
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import ArrayLike
 from bwbayes.comparison.design import Promise
 from bwbayes.control.exported import Exported
 from bwbayes.control.tracking import Tracking
@@ -59,7 +60,7 @@ class Advice:
         InputError
             A target that is not a free parameter of the actuator, or limits that leave nothing.
         """
-        return design_draws(self.problem, _drawn(self), target, **options)
+        return design_draws(_drawn(self), target, **options)
 
     @options_of(compensate_draws)
     def compensate(self: Finished, reference: Any, **options: Any) -> Compensated:
@@ -90,7 +91,7 @@ class Advice:
         InputWarning
             A reference that was smoothed or led to, a command beyond what was fitted.
         """
-        made = compensate_draws(self.problem, _drawn(self), reference, **options)
+        made = compensate_draws(_drawn(self), reference, **options)
         warn(made.remarks, 4)
         return made
 
@@ -114,7 +115,7 @@ class Advice:
         InputError
             A hysteresis without a step of bounded time, or files that exist or cannot be written.
         """
-        return export_draws(self.problem, _drawn(self), Path(folder), **options)[0]
+        return export_draws(_drawn(self), Path(folder), **options)[0]
 
     @options_of(Setup)
     def track(self: Finished, **options: Any) -> Tracking:
@@ -131,7 +132,7 @@ class Advice:
         InputError
             A model that cannot be stepped or inverted, or options that make no sense.
         """
-        return track_draws(self.problem, _drawn(self), Setup(**options))
+        return track_draws(_drawn(self), Setup(**options))
 
 
 def require_converged(fit: Finished) -> None:
@@ -150,8 +151,10 @@ def require_converged(fit: Finished) -> None:
         )
 
 
-def _drawn(fit: Finished) -> FloatArray:
-    """Return the draws (draws, free) of a fit that has converged."""
+def _drawn(fit: Finished) -> Drawn:
+    """Return what a fit that has converged gives; warn if its validation did not pass."""
     require_converged(fit)
-    posterior = fit.problem.posterior
-    return draws(posterior, fit.chain).reshape(-1, len(posterior.names))
+    posterior, standing = fit.problem.posterior, fit.result.standing
+    warn(standing.said, 5)
+    flat = draws(posterior, fit.chain).reshape(-1, len(posterior.names))
+    return Drawn(fit.problem, flat, standing)

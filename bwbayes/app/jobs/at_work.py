@@ -1,8 +1,9 @@
-"""A finished run to be put to work: its problem, its draws, and the voltages that it may use."""
+"""A finished run to be put to work: its draws, its validation, and the voltages it may use."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +13,26 @@ from bwbayes.app.running.run import finished, going_on
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.model.operator import Span
+from bwbayes.results.standing import Standing
 from bwbayes.sampling.sampler import draws
 
-__all__ = ["command_limits", "drawn", "limits_of", "refuse_existing"]
+__all__ = ["Drawn", "command_limits", "drawn", "limits_of", "refuse_existing"]
 
 
-def drawn(path: Path) -> tuple[Problem, FloatArray]:
-    """Return the problem of the run in a folder, and its draws (draws, free).
+class Drawn(NamedTuple):
+    """What a run that has converged gives to whatever builds on it.
+
+    ``problem`` is what was fitted; ``flat`` its draws, (draws, free), parameters in their own
+    units; ``standing`` how its validation came out, which goes along.
+    """
+
+    problem: Problem
+    flat: FloatArray
+    standing: Standing = Standing()
+
+
+def drawn(path: Path) -> Drawn:
+    """Return what the run in a folder gives.
 
     Raises
     ------
@@ -27,12 +41,14 @@ def drawn(path: Path) -> tuple[Problem, FloatArray]:
     InputError
         No such run.
     """
-    problem, chain, outcome = finished(RunFolder.open(path))
+    folder = RunFolder.open(path)
+    problem, chain, outcome = finished(folder)
     if not outcome.converged:
         raise NotConvergedError(
             f"{path}: not converged: {outcome.stop_reason}; go on with `{going_on(path, problem)}`"
         )
-    return problem, draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+    return Drawn(problem, flat, folder.standing())
 
 
 def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:

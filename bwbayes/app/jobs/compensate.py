@@ -16,10 +16,9 @@ import numpy as np
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.compensation import draw_compensation, draw_compensations
-from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.jobs.at_work import Drawn, command_limits, refuse_existing
+from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.compensation_report import render
-from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Choice, Compensation
 from bwbayes.control.wished import SHAPES, Reference, shaped
@@ -34,7 +33,7 @@ from bwbayes.results.prediction import thinned
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Compensated", "compensate_draws", "compensate_run", "reference_of"]
+__all__ = ["Compensated", "compensate_draws", "reference_of"]
 
 FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.html")
 
@@ -96,21 +95,11 @@ class Compensated(Compensation):
         if self.limit is not None:
             within = after["probability_below_limit"]
             text += f"; stays below {self.limit:g} um with a probability of {within:.2f}"
-        return text
-
-
-def compensate_run(path: Path, reference: Reference | Path, **options: Any) -> Compensated:
-    """Return the command for a reference from the run in a folder.
-
-    Options and errors are as of :func:`compensate_draws`; a run that has not converged is refused.
-    """
-    problem, flat = drawn(path)
-    return compensate_draws(problem, flat, reference, **options)
+        return "\n".join([*self.standing.said, text])
 
 
 def compensate_draws(
-    problem: Problem,
-    flat: FloatArray,
+    run: Drawn,
     reference: Any,
     *,
     command: Choice = "mean",
@@ -134,10 +123,8 @@ def compensate_draws(
 
     Parameters
     ----------
-    problem
-        What was fitted; of several records the first.
-    flat
-        Its draws, (draws, free), parameters in their own units; a thousand of them are used.
+    run
+        What is built on; of several records the first, and a thousand of the draws.
     reference
         As of :func:`reference_of`.
     command
@@ -170,6 +157,7 @@ def compensate_draws(
     InputError
         A reference that cannot be read or reached.
     """
+    problem, flat, standing = run
     span = command_limits(problem, voltage)
     fastest = math.inf if slew is None else slew
     limits = Limits(span.low, span.high, fastest, current, capacitance)
@@ -199,7 +187,8 @@ def compensate_draws(
         limit=limit,
     )
     far = beyond_training(alone.posterior, made.voltage, asked.interval)
-    return Compensated.of(replace(made, remarks=(*made.remarks, *(one.line for one in far))))
+    remarks = (*made.remarks, *(one.line for one in far))
+    return Compensated.of(replace(made, remarks=remarks, standing=standing))
 
 
 def reference_of(given: Any, default: float, **options: Any) -> Reference:

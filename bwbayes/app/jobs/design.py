@@ -23,9 +23,10 @@ from bwbayes.app.config.config import SignalConfig
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.design import draw_design
-from bwbayes.app.jobs.at_work import drawn, limits_of, refuse_existing
+from bwbayes.app.jobs.at_work import Drawn, drawn, limits_of, refuse_existing
 from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.app.report.design_report import render
+from bwbayes.app.screen import show_standing
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Asked, Promise, promises, ranked
 from bwbayes.data import Record, read_record, write_record
@@ -100,20 +101,22 @@ def design(
     refuse_existing([out / name for name in FILES], overwrite)
     if (parameter is None) == (drive is None):
         raise InputError("design: give either a parameter or a drive")
-    problem, flat = drawn(path)
+    run = drawn(path)
+    problem = run.problem
     amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
     signals = candidates_of(candidates, problem, amplifier)
     target = parameter if drive is None else _drive(drive, problem)
     assert target is not None
-    made = promised(problem, flat, signals, target, amplifier)
+    made = promised(run, signals, target, amplifier)
     if made[0].refused:
         raise InputError(
             f"design: the amplifier can make none of the candidates; {made[0].name} "
             f"{made[0].refused}"
         )
     interval = problem.records[liveliest(problem)].interval
-    asked = Asked(path.name, parameter, drive, amplifier, signals, interval)
+    asked = Asked(path.name, parameter, drive, amplifier, signals, interval, run.standing)
     write(asked, made, out)
+    show_standing(run.standing, console)
     table = Table("candidate", asked.left, "remark", box=box.SIMPLE_HEAD)
     for one in made:
         left = "-" if one.refused else f"{one.left:.1%} ± {one.error:.1%}"
@@ -146,6 +149,7 @@ def write(asked: Asked, made: Sequence[Promise], out: Path) -> None:
         write_summary(
             numbers,
             {
+                "validation": asked.standing.numbers,
                 "target": asked.target,
                 "best": made[0].name,
                 "amplifier": asdict(asked.amplifier),
@@ -157,8 +161,7 @@ def write(asked: Asked, made: Sequence[Promise], out: Path) -> None:
 
 
 def design_draws(
-    problem: Problem,
-    flat: FloatArray,
+    run: Drawn,
     target: str | ArrayLike,
     *,
     candidates: Mapping[str, ArrayLike] | None = None,
@@ -171,8 +174,8 @@ def design_draws(
 
     Parameters
     ----------
-    problem, flat
-        What was fitted, and its draws (draws, free).
+    run
+        What is built on.
     target
         A parameter's name, or a drive (samples,), V, whose parameter band is to be narrow.
     candidates
@@ -186,23 +189,23 @@ def design_draws(
     InputError
         A target that is not a free parameter of the actuator, or limits that leave nothing.
     """
-    amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
+    amplifier = amplifier_of(run.problem, voltage, slew, current, capacitance)
     if candidates is None:
-        signals = candidates_of(PRESET, problem, amplifier)
+        signals = candidates_of(PRESET, run.problem, amplifier)
     else:
         signals = {n: np.asarray(v, dtype=np.float64) for n, v in candidates.items()}
     asked = target if isinstance(target, str) else np.asarray(target, dtype=np.float64)
-    return promised(problem, flat, signals, asked, amplifier)
+    return promised(run, signals, asked, amplifier)
 
 
 def promised(
-    problem: Problem,
-    flat: FloatArray,
+    run: Drawn,
     signals: Mapping[str, FloatArray],
     target: str | FloatArray,
     amplifier: Limits,
 ) -> list[Promise]:
     """Return what signals (samples,) promise, the best first."""
+    problem, flat, _ = run
     source = generator(problem.config.seed, "design")
     # Of several records, what all of them taught of the actuator, seen from one.
     name = liveliest(problem)

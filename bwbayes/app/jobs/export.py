@@ -12,9 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
-from bwbayes.app.problem.problem import Problem
-from bwbayes.arrays import FloatArray
+from bwbayes.app.jobs.at_work import Drawn, command_limits, drawn, refuse_existing
 from bwbayes.control.exported import Exported, exported
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -32,13 +30,11 @@ def export(path: Path, out: Path | None = None, **options: Any) -> tuple[Exporte
     Options, errors and what is returned are as of :func:`export_draws`; a run that has not
     converged is refused.
     """
-    problem, flat = drawn(path)
-    return export_draws(problem, flat, out or path / "export", **options)
+    return export_draws(drawn(path), out or path / "export", **options)
 
 
 def export_draws(
-    problem: Problem,
-    flat: FloatArray,
+    run: Drawn,
     folder: Path,
     *,
     voltage: tuple[float, float] | None = None,
@@ -50,10 +46,8 @@ def export_draws(
 
     Parameters
     ----------
-    problem
-        What was fitted.
-    flat
-        Its draws, (draws, free), parameters in their own units.
+    run
+        What is built on.
     folder
         Where the files go.
     voltage
@@ -74,6 +68,7 @@ def export_draws(
         A hysteresis that has no step of bounded time, options that make no sense, or files that
         exist or cannot be written.
     """
+    problem, flat, standing = run
     posterior = problem.posterior
     # Of several records the first: what belongs to a record matters little to a controller.
     one = posterior.datasets[0]
@@ -82,6 +77,7 @@ def export_draws(
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
     made = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
+    made = replace(made, standing=standing)
     return made, _written(made, folder, overwrite)
 
 

@@ -7,7 +7,7 @@ frequency (PNG), and a page.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,9 @@ from rich.table import Table
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.tracking import draw_tracking
-from bwbayes.app.jobs.at_work import command_limits, drawn, refuse_existing
+from bwbayes.app.jobs.at_work import Drawn, command_limits, drawn, refuse_existing
 from bwbayes.app.jobs.export import at_rate
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.track_report import render
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Robustness
@@ -86,14 +86,15 @@ class Setup:
         return Robustness(self.gain_margin, self.phase_margin)
 
 
-def track_draws(problem: Problem, flat: FloatArray, setup: Setup) -> Tracking:
-    """Follow the paper's signals with draws (draws, free) of a posterior for actuators.
+def track_draws(run: Drawn, setup: Setup) -> Tracking:
+    """Follow the paper's signals with the draws of a run for actuators.
 
     Raises
     ------
     InputError
         A model that cannot be stepped or inverted, or a setup that makes no sense.
     """
+    problem, flat, standing = run
     posterior, seed = problem.posterior, problem.config.seed
     # Of several records the first: what belongs to a record matters little to a controller.
     one = posterior.datasets[0]
@@ -103,7 +104,7 @@ def track_draws(problem: Problem, flat: FloatArray, setup: Setup) -> Tracking:
     actuator = at_rate(one.actuator, setup.rate, "zero")
     stand = Stand(command_limits(problem, setup.voltage), setup.delay)
     wishes = Wishes(setup.robustness, setup.frequencies, setup.amplitude)
-    return track(
+    made = track(
         actuator,
         one.table.actuator(some),
         _noise(one.table.columns(some)),
@@ -112,6 +113,7 @@ def track_draws(problem: Problem, flat: FloatArray, setup: Setup) -> Tracking:
         generator(seed, "track"),
         one.table.actuator(theta),
     )
+    return replace(made, standing=standing)
 
 
 def _noise(column: dict[str, FloatArray]) -> Noise:
@@ -138,11 +140,11 @@ def track_run(
     folder = out or path / "track"
     files = [folder / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
     refuse_existing(files, overwrite)
-    problem, flat = drawn(path)
-    made = track_draws(problem, flat, setup)
+    run = drawn(path)
+    made = track_draws(run, setup)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        name = problem.config.name or problem.record.origin
+        name = run.problem.config.name or run.problem.record.origin
         write_summary(files[0], {"name": name, **made.numbers()})
         made.to_pandas().to_csv(files[1], index=False)
         save_one(draw_tracking(made), files[2])

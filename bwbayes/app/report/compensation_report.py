@@ -61,6 +61,7 @@ def render(made: Compensation, pictures: Mapping[str, bytes]) -> str:
             rows.append((f"{title} to the smoothed reference, 95 % interval", *texts, "µm"))
     return template("compensation.html.j2").render(
         name=made.reference.name,
+        run_standing=made.standing,
         summary=summary,
         error=Table("error", "Error", ("Quantity", "Compensated", "Uncompensated", "Unit"), rows),
         known=_facts(made, summary),

@@ -35,6 +35,7 @@ def render(asked: Asked, made: Sequence[Promise], pictures: Mapping[str, bytes])
     """Return the page; ``made`` is ranked, ``pictures`` are PNG files by their figure's name."""
     columns = ("Candidate", "Left", "Error", "Lowest", "Highest", "Fastest", "Length")
     return template("design.html.j2").render(
+        run_standing=asked.standing,
         best=made[0],
         alike=alike(made),
         refused=[f"{one.name} {one.refused}" for one in made if one.refused],

@@ -27,6 +27,7 @@ def render(name: str, tracking: Tracking, png: bytes) -> str:
     low, high = margins.crossover.min(), margins.crossover.max()
     return template("track.html.j2").render(
         name=name,
+        run_standing=tracking.standing,
         about=f"{tracking.rms.shape[-1]} draws of the posterior as actuators on the virtual test "
         "stand; its mean is the model that the controller has",
         margins=f"{margins.gain.size} draws: gain margin at least {margins.gain.min():.2f} (asked: "

@@ -1,0 +1,118 @@
+"""What builds on a run says first how the run's validation came out, wherever it is read.
+
+That nothing is said of a run that passed, each command's own tests say.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import bwbayes as bw
+from bwbayes.app.commands.cli import cli
+from bwbayes.results.causes import Cause
+from bwbayes.results.verdict import Verdict
+from tests.app import small
+
+OFF = "95 % bands cover 55 % of 50 readings"
+STATUS = {False: 3, None: 5}
+HEADLINE = {False: "VALIDATION FAILED", None: "Validation inconclusive"}
+
+COMMANDS = {
+    "compensate": ("sine", "--amplitude", "20", "--frequency", "1", "--from-rest"),
+    "track": ("--frequency", "2", "--draws", "5"),
+    "design": ("--parameter", "d"),
+    "export": (),
+}
+IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
+    "compensate": lambda fit, _: fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
+    "track": lambda fit, _: fit.track(frequencies=(2.0,), draws=5),
+    "design": lambda fit, _: fit.design("d"),
+    "export": lambda fit, folder: fit.export(folder),
+}
+
+
+def verdict(holds: bool | None) -> Verdict:
+    cause = Cause("operator", "the operator", "try another") if holds is False else None
+    return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small.finished(tmp_path_factory)
+
+
+@pytest.fixture(params=[False, None], ids=["failed", "inconclusive"])
+def holds(request: pytest.FixtureRequest) -> bool | None:
+    answer: bool | None = request.param
+    return answer
+
+
+@pytest.fixture
+def judged(run: Path, tmp_path: Path, holds: bool | None) -> Path:
+    """Return a copy of a run of which the verdict on one window is as it is asked for."""
+    folder = tmp_path / "judged"
+    shutil.copytree(run, folder)
+    numbers = json.loads((folder / "summary.json").read_text())
+    numbers["validation"]["held-out"] |= verdict(holds).summary
+    (folder / "summary.json").write_text(json.dumps(numbers))
+    return folder
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_says_it_first_and_ends_with_its_status(
+    name: str, judged: Path, holds: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    arguments = [name, str(judged), *COMMANDS[name], "--out", str(out)]
+    assert cli.main(arguments, standalone_mode=False) == STATUS[holds]
+    said = capsys.readouterr()
+    # Design shows its table on the screen, and the verdict above it.
+    first = (said.out if name == "design" else said.err).partition("\n")[0]
+    assert first.startswith(f"{HEADLINE[holds]}: held-out")
+    assert OFF in first
+    (numbers,) = out.glob("*.json")
+    known = json.loads(numbers.read_text())["validation"]
+    assert known["status"] == ("inconclusive" if holds is None else "failed")
+    assert [OFF in line for line in known["verdicts"]] == [True]
+    for page in out.glob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        kinds = re.findall(r'<section class="status (\w+)"', text)
+        assert kinds[0] == {False: "bad", None: "note"}[holds]
+        assert "good" not in kinds
+        assert text.index(OFF) < text.index("<table")
+    for code in out.glob("*.c"):
+        comment = re.sub(r"\s*\n \* ", " ", code.read_text().partition("*/")[0])
+        assert OFF in comment
+    assert name == "export" or any(out.glob("*.html"))
+
+
+@pytest.fixture(scope="module")
+def fit(run: Path) -> bw.Fit:
+    return bw.open_run(run)
+
+
+@pytest.mark.parametrize("name", IN_PYTHON)
+def test_python_warns_of_it(
+    name: str, fit: bw.Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verdicts = dict(fit.result.verdicts) | {"held-out": verdict(False)}
+    monkeypatch.setitem(fit.__dict__, "result", replace(fit.result, verdicts=verdicts))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        made = IN_PYTHON[name](fit, tmp_path / "out")
+    (told,) = (one for one in caught if OFF in str(one.message))
+    assert str(told.message).startswith(HEADLINE[False])
+    assert Path(told.filename) == Path(__file__)
+    if name != "design":
+        assert made.standing.holds is False
+    if name == "compensate":
+        assert repr(made).startswith(HEADLINE[False])
