@@ -41,7 +41,7 @@ IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
 
 
 def verdict(holds: bool | None) -> Verdict:
-    cause = Cause("operator", "the operator", "try another") if holds is False else None
+    cause = Cause("loop", "the operator", "try another") if holds is False else None
     return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
 
 
