@@ -221,7 +221,8 @@ def assess(
         sure = transient if transient and transient.sure else None
         why = _why(bands, residuals, reasons, start, sure, drift, beyond)
         return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
-    doubts = [f"{text}, which may be luck (p = {chance:.1g})" for text, chance in chances]
+    advice = _offset_advice(bands, judged, standard)
+    doubts = [f"{text}, which may be luck (p = {chance:.1g}){advice}" for text, chance in chances]
     if transient and _in_sds(bands, transient.size) > LEAST_SDS:
         doubts.append(transient.line)
     if standard.worth < FEWEST:
@@ -230,7 +231,6 @@ def assess(
             f"use a record {FEWEST / standard.worth:.2g} times as long"
         )
     if doubts:
-        doubts = [f"{doubts[0]}{_offset_advice(bands, judged, standard)}", *doubts[1:]]
         return replace(verdict, holds=None, reasons=tuple(doubts))
     return verdict
 
