@@ -125,12 +125,9 @@ def lines_of_shell() -> dict[str, str]:
     return result
 
 
-def _measured(name: str, *, predicted: bool = False) -> Record:
-    """Return a reader's record of that name: 37 s at 25 readings a second, or a short step.
-
-    One that a run is to predict has the noise of the small run's.
-    """
-    stand = VirtualTestStand(discrepancy="process" if predicted else "none", sample_rate=25.0)
+def _measured(name: str) -> Record:
+    """Return a reader's record of that name: 37 s at 25 readings a second, or a short step."""
+    stand = VirtualTestStand(discrepancy="none", sample_rate=25.0)
     if name.startswith("step"):
         drive = Waveform(Staircase((10.0,), 5.0), 6.0, start=1.0)
     else:
@@ -178,7 +175,7 @@ def with_files(line: str, folder: Path, run: Path) -> None:
             path.write_text(config + HELD_OUT, encoding="utf-8")
             write_record(specimen(0), path.with_name("my_record.csv"))
         elif word.endswith(".csv"):
-            record = _measured(path.stem, predicted=words[1] == "predict")
+            record = _measured(path.stem)
             write_record(record, path)
             if unit and record.displacement is not None:
                 write_record(replace(record, displacement=1e3 * record.displacement), path)

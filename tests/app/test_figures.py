@@ -125,7 +125,7 @@ def test_label_that_is_no_mathtext_becomes_the_name() -> None:
 def test_band_names_are_not_read_as_mathematics() -> None:
     figure = draw_loop([example.bands(r"$\nonsense{$")])
     figure.draw_without_rendering()
-    assert r"\$\nonsense{\$ (not fitted)" == figure.axes[0].get_title()
+    assert r"\$\nonsense{\$ (held out)" == figure.axes[0].get_title()
 
 
 @pytest.mark.parametrize("value", [1.0, np.nan, np.inf])

@@ -359,6 +359,6 @@ def test_whatever_a_validation_is_called_all_stays_in_the_folder(bench: Path, na
 @pytest.mark.parametrize("out", ["results/..", "x" * 250, "record.csv/out"])
 def test_a_folder_that_cannot_be_made_leaves_nothing(bench: Path, out: str) -> None:
     problem = resolve(parse(QUICK, "my.toml"), bench)
-    with pytest.raises(InputError, match="--out"):
+    with pytest.raises(InputError, match="choose another"):
         RunFolder.create(bench / out, problem, overwrite=False)
     assert ["record.csv"] == [path.name for path in bench.iterdir()]
