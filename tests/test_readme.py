@@ -233,6 +233,15 @@ def verdicts() -> str:
     )
 
 
+def ordinary() -> str:
+    one = measured()["ordinary answers"]
+    right, wrong = (Counter(one[kind]) for kind in ("correct", "other"))
+    return (
+        f"{one['seeds']} records: {right['True']} pass, {right['False']} fail; of another "
+        f"actuator's, with a fifth more gain, {wrong['True']} pass and {wrong['False']} fail"
+    )
+
+
 def moving() -> str:
     every = [one for name, one in measured().items() if name.startswith("moving, ")]
     kinds, records = sum(one["cases"] for one in every), every[0]["records of each case"]
@@ -389,6 +398,7 @@ FINDINGS = [
     hostile,
     steady,
     verdicts,
+    ordinary,
     moving,
     moving_operators,
     nested,

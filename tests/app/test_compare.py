@@ -213,7 +213,7 @@ def test_other_records_windows_and_held_out_parts_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["a"], "give two runs or more, or a CONFIG (.toml)"),
+        (["a"], "give two runs or more, or a CONFIG"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
         (["a", "b", "--models", "linear"], "goes with one CONFIG"),
         (["a", "a"], "the same run is there twice"),

@@ -56,11 +56,11 @@ def compare(
     from bwbayes.app.screen import show_comparison
 
     console = Console(stderr=True, quiet=quiet)
-    if models is None and len(paths) == 1 and paths[0].suffix == ".toml":
+    if models is None and len(paths) == 1 and paths[0].is_file():
         models = USUAL_MODELS
     if models is None:
         if len(paths) < 2:
-            raise InputError("compare: give two runs or more, or a CONFIG (.toml)")
+            raise InputError("compare: give two runs or more, or a CONFIG")
         where = out or Path("results") / "comparison"
         made = compare_runs(
             paths, where, console, workers=workers, how=how, with_future=future, overwrite=overwrite
