@@ -44,6 +44,8 @@ class NotConvergedError(InputError):
 class ColumnsError(InputError):
     """Columns or units of a file that are not known; ``columns`` and ``units`` are a guess.
 
+    So is ``fs``, the sampling rate, Hz, if no column can be the time.
+
     The text says what to write in Python; :meth:`in_config` and :meth:`in_command` what to write
     elsewhere. ``place`` is the table of the config that names the file.
     """
@@ -54,15 +56,18 @@ class ColumnsError(InputError):
         columns: Mapping[str, str],
         units: Mapping[str, str],
         place: str = "record",
+        fs: float | None = None,
     ) -> None:
-        self.problem, self.place = problem, place
+        self.problem, self.place, self.fs = problem, place, fs
         self.guess = {"columns": dict(columns), "units": dict(units)}
-        said = ", ".join(f"{key}={table!r}" for key, table in self.guess.items() if table)
-        super().__init__(f"{problem}; say {said}")
+        said = [f"{key}={table!r}" for key, table in self.guess.items() if table]
+        said += [] if fs is None else [f"fs={fs:g}"]
+        super().__init__(f"{problem}; say {', '.join(said)}")
 
     def within(self, place: str) -> ColumnsError:
         """Return the error of a file that a table of a config names."""
-        return ColumnsError(self.problem, self.guess["columns"], self.guess["units"], place)
+        guess = self.guess["columns"], self.guess["units"]
+        return ColumnsError(self.problem, *guess, place, self.fs)
 
     def in_config(self) -> InputError:
         """Return the error for a config, with the lines to write into its table."""
@@ -70,6 +75,7 @@ class ColumnsError(InputError):
         for key, table in self.guess.items():
             pairs = ", ".join(f"{quantity} = {text!r}" for quantity, text in table.items())
             lines += [f"{key} = {{ {pairs} }}"] if table else []
+        lines += [] if self.fs is None else [f"fs = {self.fs:g}"]
         return InputError(f"{self.problem}; under [{self.place}] say {' and '.join(lines)}")
 
     def in_command(self, command: str) -> InputError:
@@ -79,6 +85,7 @@ class ColumnsError(InputError):
             for key, table in self.guess.items()
             for quantity, text in table.items()
         ]
+        options += [] if self.fs is None else [f"--fs {self.fs:g}"]
         return InputError(f"{self.problem}; copy and correct: {' '.join([command, *options])}")
 
 

@@ -250,8 +250,46 @@ def _logger(folder: Path, time: Array, voltage: Array, displacement: Array) -> W
     moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(time, unit="s")
     values = zip(moments, voltage, displacement, strict=True)
     rows = [f"{t.isoformat(timespec='milliseconds')},{v},{d}" for t, v, d in values]
-    return _text(folder / "a.csv", ["Timestamp,Command [V],Position [um]", *rows])._replace(
-        units={"time": "s"}
+    return _text(folder / "a.csv", ["Timestamp,Command [V],Position [um]", *rows])
+
+
+def _clock(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+    values = zip(time, voltage, displacement, strict=True)
+    rows = [f"00:00:{t:06.3f},{v},{d}" for t, v, d in values]
+    return _text(folder / "a.csv", ["Time,Command [V],Position [um]", *rows])
+
+
+def _thousands(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+    marks = str.maketrans(",.", ".,")
+    table = zip(1e3 * time, 1e3 * voltage, 1e3 * displacement, strict=True)
+    rows = [";".join(f"{value:,.2f}".translate(marks) for value in row) for row in table]
+    return _text(folder / "a.csv", ["Zeit [ms];Spannung [mV];Weg [nm]", *rows])
+
+
+def _fortran(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+    table = zip(time, voltage, displacement, strict=True)
+    rows = ["  ".join(f"{value:.9E}".replace("E", "D") for value in row) for row in table]
+    return _text(folder / "a.dat", ["% t/s u/V x/um", *rows], newline="\n")
+
+
+def _beside(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+    """Of an oscilloscope: what it was set to stands beside the first numbers."""
+    rows = _rows([time, voltage, displacement], ",")
+    head = ['"Record Length",600', '"Source","CH1"', '"Vertical Units","V"']
+    head += [","] * (len(rows) - len(head))
+    written = _text(folder / "a.csv", [f"{a},{b}" for a, b in zip(head, rows, strict=True)])
+    columns = {"time": "3", "voltage": "4", "displacement": "5"}
+    return written._replace(
+        columns=columns, units={"time": "s", "voltage": "V", "displacement": "um"}
+    )
+
+
+def _no_names(folder: Path, _: Array, voltage: Array, displacement: Array) -> Written:
+    written = _text(folder / "a.txt", _rows([voltage, displacement], "\t"))
+    return written._replace(
+        columns={"voltage": "1", "displacement": "2"},
+        units={"voltage": "V", "displacement": "um"},
+        fs=1 / INTERVAL,
     )
 
 
@@ -309,4 +347,9 @@ INSTRUMENTS: Mapping[str, Callable[[Path, Array, Array, Array], Written]] = {
     "Japanese, cp932": _japanese,
     "separators at the ends": _trailing,
     "no times at all": _no_times,
+    "no names and no times": _no_names,
+    "times of day": _clock,
+    "marks between thousands": _thousands,
+    "exponents of Fortran": _fortran,
+    "settings beside the numbers": _beside,
 }

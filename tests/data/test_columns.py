@@ -171,7 +171,9 @@ def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> Non
     path = tmp_path / "a.csv"
     rows = [f"{v!r},{d!r}" for v, d in zip(VOLTAGE.tolist(), DISPLACEMENT.tolist(), strict=True)]
     path.write_text("\n".join(["voltage_V,displacement_um", *rows]) + "\n")
-    with pytest.raises(InputError, match=r"no column for the time; .* the sampling rate, fs"):
+    with pytest.raises(
+        InputError, match=r"which is the sampling rate, Hz, as there is no time\?.*; say fs=1000"
+    ):
         read_record(path)
     assert_same(read_record(path, fs=100.0))
     with pytest.raises(InputError, match=r"fs: 0 Hz is no sampling rate"):

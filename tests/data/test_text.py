@@ -356,7 +356,7 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
     (
         "column missing",
         "\n".join(line.partition(",")[2] for line in LINES),
-        "record.csv:1: no column for the time; add it (or give the sampling rate, fs)",
+        "record.csv:1: which is the sampling rate, Hz, as there is no time? There are",
     ),
     ("empty file", "", "record.csv: the file is empty"),
     ("blank file", " \n\n", "record.csv: the file is empty"),

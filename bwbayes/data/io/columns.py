@@ -41,6 +41,8 @@ COMMON_NAMES = {
 # Units: a prefix's power of ten and a base unit, and the power that leads from it to s, V or um.
 _PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
 _BASES = {"time": ("s", 0), "voltage": ("V", 0), "displacement": ("m", 6), "truth": ("m", 6)}
+# A rate to correct, Hz.
+_COMMON_FS = 1000.0
 _COMMON_UNITS = {
     "time": ("s", "ms", "us"),
     "voltage": ("V", "mV", "kV"),
@@ -276,6 +278,10 @@ def _open(
     moving = [s for s in rest[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
     rest = _alike(moving or rest, chosen)
     guess_columns, guess_units = dict(naming.columns), dict(naming.units)
+    # Where one column is missing it is that of the time.
+    timeless = "time" in columns and len(rest) == len(columns) - 1
+    if timeless:
+        columns = [quantity for quantity in columns if quantity != "time"]
     for quantity in unknown:
         guess_units[quantity] = _COMMON_UNITS[quantity][0]
     for quantity in columns:
@@ -289,17 +295,16 @@ def _open(
     lost = [q for q in columns if q not in guess_columns]
     there = _listed(source.series)
     if lost:
-        instead = " (or give the sampling rate, fs)" if "time" in lost else ""
-        raise InputError(
-            f"{where}: no column for the {' and the '.join(lost)}; add it{instead}. {there}"
-        )
+        raise InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {there}")
     questions = [f"which column is the {', which the '.join(columns)}"] if columns else []
     if unknown:
         questions.append(
             f"which unit has {', which '.join(f'{chosen[q].name!r} ({q})' for q in unknown)}"
         )
+    if timeless:
+        questions.append("which is the sampling rate, Hz, as there is no time")
     problem = f"{where}: {', and '.join(questions)}? {there}"
-    return ColumnsError(problem, guess_columns, guess_units)
+    return ColumnsError(problem, guess_columns, guess_units, fs=_COMMON_FS if timeless else None)
 
 
 def _listed(series: Sequence[Series]) -> str:

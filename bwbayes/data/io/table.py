@@ -90,7 +90,7 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
     others = [s.name for s in source.series if s.name not in names.values()]
     if others and source.first_line is not None:
         some = ", ".join(others[:10]) + (", ..." if len(others) > 10 else "")
-        remark = f"{source.path}:{source.first_line - 1}: ignored columns: {some}"
+        remark = f"{source.path}:{max(source.first_line - 1, 1)}: ignored columns: {some}"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     foreign = {q: name for q, name in names.items() if q in QUANTITIES and not is_own(name, q)}
     group = next(iter(chosen.values()))[0].group

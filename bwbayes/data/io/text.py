@@ -34,7 +34,12 @@ from bwbayes.errors import InputError, InputWarning, one_line
 
 __all__ = ["read_text", "write_text"]
 
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?nan|[+-]?inf", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)([eEdD][+-]?\d+)?"
+    r"|[+-]?nan|[+-]?inf",
+    re.IGNORECASE,
+)
+_CLOCK = re.compile(r".*\d:\d\d")
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _EXAMPLE = "time_s,voltage_V,displacement_um"
 
@@ -99,7 +104,8 @@ def read_text(path: Path) -> Source:
             name,
             len(body),
             partial(_numbers, path, frame[column], decimal, name, layout.first + 1),
-            unit,
+            # Dates and times of day have no unit, and become seconds.
+            "s" if _CLOCK.match(str(frame[column].iloc[0])) else unit,
         )
         for column, (name, unit) in enumerate(zip(names, units, strict=True))
         if column < layout.fields
@@ -269,7 +275,8 @@ def _check_fields(path: Path, body: Sequence[str], layout: _Layout, names: int) 
 
 def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
     """Return the cells, as numbers where a whole column is, and the decimal mark."""
-    text = "\n".join(body)
+    # Fortran writes 1.5D+00.
+    text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
     frames = []
     for decimal in "." if layout.separator == "," else ".,":
         try:
@@ -277,6 +284,7 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
                 StringIO(text),
                 sep=r"\s+" if layout.separator == " " else layout.separator,
                 decimal=decimal,
+                thousands=_thousands(text, decimal),
                 header=None,
                 names=range(layout.fields),
                 usecols=range(layout.fields),
@@ -291,6 +299,12 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
         if "," not in text:
             break
     return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
+
+
+def _thousands(text: str, decimal: str) -> str | None:
+    """Return the mark between thousands, as in 1.234,5, if there are any."""
+    mark = "." if decimal == "," else ","
+    return mark if re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text) else None
 
 
 def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
@@ -315,7 +329,8 @@ def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) 
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     raise InputError(
-        f"{path}:{first_line + wrong[0]}: {name}: {shown} is not a number; write it like 1.5"
+        f"{path}:{first_line + wrong[0]}: {name}: {shown} is not a number; write it like 1.5, or "
+        "nothing where a reading is missing"
     )
 
 
