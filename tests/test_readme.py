@@ -384,6 +384,11 @@ def _errors(study: str) -> str:
     )
 
 
+def long_fit() -> str:
+    gib = measured()["long fit"]["gib"]
+    return f"{gib:.2f} GiB at most, of a new process with all that it loads"
+
+
 def defects() -> str:
     one = measured()["defects"]
     return f"{one['planted']} planted, {one['caught']} caught"
@@ -413,6 +418,7 @@ FINDINGS = [
     compensation_by_a_dac,
     specimens,
     populations,
+    long_fit,
     defects,
 ]
 

@@ -215,6 +215,15 @@ class Posterior:
         Of the record of that name; it may be left out if there is one alone. Where the start of the
         dynamics is unknown, it is the most probable one.
         """
+        return np.concatenate(list(self.simulations(theta, rows, record)))
+
+    def simulations(
+        self, theta: FloatArray, rows: IntArray | slice = slice(None), record: str | None = None
+    ) -> Iterator[FloatArray]:
+        """Yield the rows of :meth:`simulate` a few at a time, where all would not fit into memory.
+
+        Each is (some models, rows), in the order of θ.
+        """
         number = 0 if record is None else self.table.records.index(record)
         one = self.only if record is None else self.datasets[number]
         likelihood, theta = self.likelihoods[number], self.table.of(theta, one.name)
@@ -234,9 +243,8 @@ class Posterior:
                     return begun.to(voltage.size)
             return actuator.advance(model[part], voltage, None, moving, from_rest=rest)[0]
 
-        return np.concatenate(
-            [simulated(part)[:, rows] for part in batches(len(theta), voltage.size)]
-        )
+        for part in batches(len(theta), voltage.size):
+            yield simulated(part)[:, rows]
 
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""

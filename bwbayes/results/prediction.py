@@ -12,7 +12,7 @@ its own, see :mod:`bwbayes.results.start`.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -197,21 +197,28 @@ def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
 
 def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
     """Walk through a record and summarise the mixture over a window."""
-    pieces = _simulated(mixed.start, record.voltage, window)
-    parts: list[dict[str, FloatArray]] = []
+    samples = window.stop - window.start
+    joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(mixed.start.model))
-    pending: deque[Future[dict[str, FloatArray]]] = deque()
+    pending: deque[tuple[int, Future[dict[str, FloatArray]]]] = deque()
+
+    def put() -> None:
+        first, part = pending.popleft()
+        for key, values in part.result().items():
+            joined[key][first : first + values.size] = values
+
     with ThreadPoolExecutor(THREADS) as executor:
-        for first, simulated in pieces:
-            pending.append(executor.submit(_summarised, mixed, record, first, simulated))
+        for first, simulated in _simulated(mixed.start, record.voltage, window):
+            work = executor.submit(_summarised, mixed, record, first, simulated)
+            pending.append((first - window.start, work))
             totals += simulated.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
             if len(pending) > THREADS:
-                parts.append(pending.popleft().result())
-        parts += [one.result() for one in pending]
-    means = totals / (window.stop - window.start)
+                put()
+        while pending:
+            put()
+    means = totals / samples
     common = float(np.var(means) + np.mean(mixed.start.offset_sd**2))
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return Bands(
         name=name,
         time=record.time[window],

@@ -8,14 +8,16 @@ ones too. A number that hardly any of them reaches says what the model, noise in
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import numpy as np
 from scipy.signal import periodogram
 from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
@@ -99,11 +101,10 @@ def replicated(
     chosen = draws[generator.choice(len(draws), count, replace=False)]
     theta = posterior.prior.theta(chosen)
     rows = one.readings.rows
-    simulated = posterior.simulate(theta, rows, record)
     noise = one.table.noise(posterior.table.of(theta, one.name))
-    middle = np.mean(simulated, axis=0)
+    middle, spread = _moments(posterior.simulations(theta, rows, record))
     variance = np.sum(np.square(one.noise.marginal_sd(noise)), axis=0)
-    sd = np.sqrt(np.mean(variance) + np.var(simulated, axis=0))
+    sd = np.sqrt(np.mean(variance) + spread)
     voltage, samples = one.voltage[rows], int(rows[-1]) + 1
     # Where readings are missing they are missing in all.
     neighbours = np.flatnonzero(np.diff(rows) == one.readings.stride)
@@ -111,13 +112,16 @@ def replicated(
     def looked_at(readings: FloatArray) -> FloatArray:
         return _statistics(readings, voltage, middle, sd, neighbours)
 
-    made = []
-    at_once = max(LARGEST // rows.size, 1)
-    for first in range(0, count, at_once):
-        some = slice(first, first + at_once)
-        noises = (one.noise.draw(own[np.newaxis], samples, generator) for own in noise[some])
-        added = np.array([(discrepancy + sensor)[rows] for discrepancy, sensor in noises])
-        made.append(looked_at(simulated[some] + added))
+    made, left = [], iter(noise)
+    # Once more, rather than to keep them all.
+    for simulated in posterior.simulations(theta, rows, record):
+        for some in batches(len(simulated), rows.size, LARGEST):
+            noises = (
+                one.noise.draw(own[np.newaxis], samples, generator)
+                for own in islice(left, len(simulated[some]))
+            )
+            added = np.array([(discrepancy + sensor)[rows] for discrepancy, sensor in noises])
+            made.append(looked_at(simulated[some] + added))
     every = np.concatenate(made)
     observed = looked_at(np.asarray(one.readings.values)[np.newaxis])[0]
     lower, upper = np.quantile(every, [0.025, 0.975], axis=0)
@@ -143,6 +147,16 @@ def numbers(checked: Replicated) -> dict[str, object]:
             for name, one in checked.statistics.items()
         },
     }
+
+
+def _moments(pieces: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance (readings,) of rows that come a few at a time, (some, readings)."""
+    mean, squares = np.zeros(1), np.zeros(1)
+    for number, row in enumerate(chain.from_iterable(pieces), 1):
+        away = row - mean
+        mean = mean + away / number
+        squares = squares + away * (row - mean)
+    return mean, squares / number
 
 
 def _statistics(
