@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
@@ -80,8 +80,10 @@ def _error(made: Compensation) -> Figure:
     spread.set_xlabel("rms of the error (µm)")
     spread.set_ylabel("draws")
     spread.set_xscale("log")
-    spread.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    spread.xaxis.set_major_formatter(ScalarFormatter())
+    # A decade each; within one or two decades, which may hold none, a few between.
+    wide = np.log10(bins[-1] / bins[0]) > 2
+    spread.xaxis.set_major_locator(LogLocator(numticks=5) if wide else MaxNLocator(3))
+    spread.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     spread.xaxis.set_minor_formatter(NullFormatter())
     share_legend(figure)
     return figure
