@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter
 
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
@@ -80,13 +80,19 @@ def _error(made: Compensation) -> Figure:
     spread.set_xlabel("rms of the error (µm)")
     spread.set_ylabel("draws")
     spread.set_xscale("log")
-    # A decade each; within one or two decades, which may hold none, a few between.
-    wide = np.log10(bins[-1] / bins[0]) > 2
-    spread.xaxis.set_major_locator(LogLocator(numticks=5) if wide else MaxNLocator(3))
+    spread.xaxis.set_major_locator(_few_ticks(bins[0], bins[-1]))
     spread.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     spread.xaxis.set_minor_formatter(NullFormatter())
     share_legend(figure)
     return figure
+
+
+def _few_ticks(low: float, high: float) -> Locator:
+    """Return what puts two to five ticks on a logarithmic axis; one decade may hold no power."""
+    decades = np.log10(high / low)
+    if decades < 1:
+        return MaxNLocator(3)
+    return LogLocator(numticks=5) if decades > 2 else LogLocator(subs=(1, 3))
 
 
 def _loops(made: Compensation) -> Figure:
