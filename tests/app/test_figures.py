@@ -255,12 +255,13 @@ def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
                 assert not np.isfinite(y[(x > 1.01) & (x < 1.99)]).any()
         for drawn in panel.collections:
             for path in drawn.get_paths():
-                assert all(np.ptp(corners[:, 0]) < 1.01 for corners in path.to_polygons())
+                polygons = [np.asarray(corners) for corners in path.to_polygons()]
+                assert all(np.ptp(corners[:, 0]) < 1.01 for corners in polygons)
     whole = draw_loop([bands]).axes[0]
     sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == MEAN_COLOUR]
     assert 2 == len(sizes)
-    sources = interactive._series(bands).select({"type": ColumnDataSource})
-    times = [source.data["time"] for source in sources]
+    every = interactive._series(bands).references()
+    times = [np.asarray(one.data["time"]) for one in every if isinstance(one, ColumnDataSource)]
     assert 2 == len(times)
     assert all(np.ptp(time) < 1 for time in times)
 

@@ -176,6 +176,7 @@ def test_density_of_the_noise_model_is_that_of_its_covariance(
     np.testing.assert_allclose(density, np.sqrt(2 * interval * np.array(sums)), rtol=1e-6)
     white = WhiteNoise(interval).steady_state(np.array([[sensor]]))
     level = dataclasses.replace(series, noise=white).noise_density(frequency)
+    assert level is not None
     np.testing.assert_allclose(level, sensor * np.sqrt(2 * interval))
 
 

@@ -70,8 +70,9 @@ def _error(made: Compensation) -> Figure:
     _errors(along, made, without=False)
     along.set_xlabel("time (s)")
     both = np.concatenate([made.linear.rms, made.compensated.rms])
-    # Errors are mostly far from zero; where they are not, all of them may be zero.
-    bins = np.geomspace(max(both.min(), 1e-9), max(both.max(), 2e-9), BINS)
+    # Errors are mostly far from zero; where they are not, all of them may be zero, or alike.
+    low = max(float(both.min()), 1e-9)
+    bins = np.geomspace(low, max(float(both.max()), 1.1 * low), BINS)
     for played, colour, name in (
         (made.linear, LINEAR_COLOUR, "uncompensated"),
         (made.compensated, MEAN_COLOUR, "compensated"),

@@ -20,7 +20,9 @@ from bokeh.models import (
     BasicTicker,
     ColumnDataSource,
     DataRange1d,
+    GlyphRenderer,
     HoverTool,
+    Line,
     Model,
 )
 from bokeh.models.annotations import BoxAnnotation
@@ -176,10 +178,10 @@ def _series(bands: Bands) -> Model:
     return grid
 
 
-def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> Model:
+def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> GlyphRenderer[Line]:
     """Draw the bands, the mean and the readings of a window; return the mean's line."""
     _ribbons(plot, source, about)
-    mean: Model = plot.line(
+    mean = plot.line(
         "time", f"mean{about}", source=source, color=MEAN_COLOUR, **_named("mean", about)
     )
     if bands.measured is not None:

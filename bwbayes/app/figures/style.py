@@ -124,11 +124,12 @@ def time_label(offset: float) -> str:
 
 def with_gaps(bands: Bands) -> Bands:
     """Return bands of several windows with nan between them, where lines are to end."""
-    if bands.inside is None:
+    inside = bands.inside
+    if inside is None:
         return bands
 
     def cut(values: FloatArray) -> FloatArray:
-        return np.where(bands.inside, values, np.nan)
+        return np.where(inside, values, np.nan)
 
     return replace(
         bands,
