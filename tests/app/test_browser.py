@@ -267,6 +267,8 @@ def test_loops_stand_side_by_side(chromium: Any, pages: dict[str, Path]) -> None
             )
             assert beside == (first["y"] == second["y"])
             assert beside == (first["x"] + first["width"] <= second["x"])
+            narrow = opened.page.locator(".scroll:has(#parameters)")
+            assert narrow.evaluate("e => e.scrollWidth <= e.clientWidth")
 
 
 def middle_of(page: Any, name: str) -> tuple[float, float, float]:

@@ -20,12 +20,11 @@ from bokeh.models import (
     BasicTicker,
     ColumnDataSource,
     DataRange1d,
-    GlyphRenderer,
     HoverTool,
-    Line,
     Model,
 )
 from bokeh.models.annotations import BoxAnnotation
+from bokeh.models.renderers import DataRenderer
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
@@ -62,7 +61,7 @@ LEVEL = 95  # %
 OF_LOOPS: tuple[Kind, ...] = ("sensor", "parameter")
 TOOLS = "box_zoom,wheel_zoom,pan,reset"
 HEIGHTS = {"voltage": 130, "displacement": 330, "residual": 230}  # CSS pixels
-LOOP_HEIGHT, LOOP_WIDTH = 430, 250  # CSS pixels; the least width
+LOOP_HEIGHT, LOOP_WIDTH = 430, 240  # CSS pixels; the least width
 FONT_SIZE = "13px"
 
 
@@ -178,7 +177,7 @@ def _series(bands: Bands) -> Model:
     return grid
 
 
-def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> GlyphRenderer[Line]:
+def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> DataRenderer:
     """Draw the bands, the mean and the readings of a window; return the mean's line."""
     _ribbons(plot, source, about)
     mean = plot.line(
