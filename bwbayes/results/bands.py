@@ -107,6 +107,14 @@ class Bands:
     common_sd: float = 0.0
     separate: bool = False
 
+    @property
+    def windows(self) -> list[slice]:
+        """The windows that the bands are about, each without a gap."""
+        if self.inside is None:
+            return [slice(0, self.time.size)]
+        edges = np.flatnonzero(np.diff(self.inside, prepend=False, append=False))
+        return [slice(*edge) for edge in edges.reshape(-1, 2).tolist()]
+
     def within(self, windows: Sequence[slice]) -> Bands:
         """Return the bands of some windows: from the first sample of them to the last."""
         whole = slice(windows[0].start, windows[-1].stop)

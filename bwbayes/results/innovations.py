@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.noise import SteadyState
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.spectrum import (
     ResidualSpectrum,
@@ -70,7 +71,8 @@ class Innovations:
     """Normalised innovations of the readings that were fitted, and the drive there.
 
     All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
-    ``residual`` in um. ``interval`` is that between readings, s; some may be missing.
+    ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
+    the noise model's filter, of one model.
     """
 
     __repr__ = brief
@@ -81,6 +83,21 @@ class Innovations:
     rate: FloatArray
     residual: FloatArray
     interval: float
+    noise: SteadyState | None = None
+
+    def noise_density(self, frequency: FloatArray) -> FloatArray | None:
+        """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided.
+
+        It is that of white innovations of variance S that pass (1 − a z⁻¹)/(1 − φ z⁻¹), in the
+        names of :class:`~bwbayes.inference.noise.DiscrepancyNoise`. None if it is not known.
+        """
+        if self.noise is None:
+            return None
+        kept, _, variance, _, log_decay, _ = self.noise
+        later = np.exp(-2j * np.pi * frequency * self.interval)
+        passed = np.abs((1 - np.exp(log_decay) * later) / (1 - kept * later))
+        density: FloatArray = np.sqrt(2 * self.interval * variance) * passed
+        return density
 
     def spectrum(self) -> ResidualSpectrum:
         """Return the residual's spectrum, with its lines."""
@@ -143,7 +160,8 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     time = begin + interval * readings.rows.astype(np.float64)
     voltage = posterior.only.voltage[readings.rows]
     apart = interval * readings.stride
-    return Innovations(time, white[0, 0], voltage, rate[readings.rows], residual[0], apart)
+    steady = posterior.only.noise.steady_state(noise)
+    return Innovations(time, white[0, 0], voltage, rate[readings.rows], residual[0], apart, steady)
 
 
 def remarks(series: Innovations) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from bwbayes.results.verdict import Verdict
+from bwbayes.results.verdict import STATUSES, Verdict
 
 __all__ = ["Standing"]
 
@@ -53,7 +53,7 @@ class Standing:
     @property
     def status(self) -> str:
         """The outcome in a word."""
-        return {True: "passed", False: "failed", None: "inconclusive"}[self.holds]
+        return STATUSES[self.holds]
 
     @property
     def headline(self) -> str:

@@ -42,7 +42,7 @@ from bwbayes.results.standard import Z_90, Standard, standardised
 from bwbayes.results.transient import DOUBTED, Transient
 from bwbayes.shown import brief
 
-__all__ = ["Background", "Verdict", "assess"]
+__all__ = ["STATUSES", "Background", "Verdict", "assess"]
 
 # Worth fewer independent readings than this a record cannot show that bands hold.
 FEWEST = 5.0
@@ -109,6 +109,10 @@ class Background:
         )
 
 
+# How a validation came out, in a word.
+STATUSES = {True: "passed", False: "failed", None: "inconclusive"}
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether bands hold on one record or window.
@@ -138,6 +142,11 @@ class Verdict:
     cause: Cause | None = None
     notes: tuple[str, ...] = ()
     separate: bool = False
+
+    @property
+    def status(self) -> str:
+        """The outcome in a word."""
+        return STATUSES[self.holds]
 
     @property
     def where(self) -> str:

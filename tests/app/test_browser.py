@@ -16,8 +16,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from bwbayes.app.jobs.check import check
+from bwbayes.app.report.campaign_report import render as campaign_page
 from bwbayes.app.report.design_report import render as design_page
 from bwbayes.app.report.report import render
+from bwbayes.app.running.campaign_result import STATUSES, CampaignResult, Row
 from bwbayes.comparison.design import Asked, Promise
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.result import summary
@@ -28,7 +30,7 @@ from tests.programs import needs
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 WIDTHS = (400, 1400)
-PAGES = ("run", "unconverged", "check", "design")
+PAGES = ("run", "unconverged", "check", "design", "campaign")
 FIGURES = ("loop", "bands_training", "bands_held-out", "coverage", "corner", "trace", "ranks")
 
 # WCAG 2.2, level AA, for text of ordinary size.
@@ -96,7 +98,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     made = [Promise("sine", 0.6, 0.01), Promise("far", np.nan, np.nan, "goes too far")]
     drawn = dict.fromkeys(("promises", "best"), picture)
     paths["design"].write_text(design_page(asked, made, drawn), encoding="utf-8")
+    drawn = {"parameters": picture}
+    paths["campaign"].write_text(campaign_page("batch", campaign(), drawn), encoding="utf-8")
     return paths
+
+
+def campaign() -> CampaignResult:
+    """Make up a campaign with a record for each way to end, and a dozen parameters."""
+    known = {"unit": "um/V", "mean": 0.7, "sd": 0.01, "lower_95": 0.68, "upper_95": 0.72}
+    numbers = {"parameters": {f"parameter_{number}": known for number in range(12)}}
+    rows = [Row(status, "a.csv", status, "why", numbers) for status in STATUSES]
+    return CampaignResult(tuple(rows), None, "too few records")
 
 
 @pytest.fixture(scope="module")
@@ -161,14 +173,102 @@ def test_low_contrast_would_be_noticed(chromium: Any, pages: dict[str, Path]) ->
         assert opened.page.evaluate(CONTRAST)[0] < LEAST_CONTRAST
 
 
-def test_what_is_cut_off_says_so_and_scrolls(chromium: Any, pages: dict[str, Path]) -> None:
-    """A table that is wider than a telephone has a shadow at its edge, and scrolls by itself."""
+# Whether each table's region is too narrow for it, and how wide the words are that say so.
+CUES = """[...document.querySelectorAll(".scroll")].map(region => [
+  region.scrollWidth > region.clientWidth,
+  parseFloat(getComputedStyle(region.firstElementChild, "::before").width)])"""
+
+
+@pytest.mark.parametrize("width", [400, 700, 1000, 1400])
+@pytest.mark.parametrize("name", PAGES)
+def test_a_table_that_scrolls_says_so_and_no_other(
+    chromium: Any, pages: dict[str, Path], name: str, width: int
+) -> None:
+    """Words and a shadow; on a telephone no table scrolls."""
+    with Opened(chromium, pages[name], width) as opened:
+        page = opened.page
+        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        cues = page.evaluate(CUES)
+        assert cues
+        for too_wide, words in cues:
+            assert words > 80 if too_wide else words == 0
+        assert width > 400 or not any(too_wide for too_wide, _ in cues)
+        shadows = page.locator(".scroll").evaluate_all(
+            "all => all.map(e => getComputedStyle(e).backgroundImage)"
+        )
+        assert all("radial-gradient" in shadow for shadow in shadows)
+
+
+def test_intervals_are_seen_on_a_telephone(chromium: Any, pages: dict[str, Path]) -> None:
+    """Every one lies on the page, behind the title of its column."""
     with Opened(chromium, pages["run"], 400) as opened:
-        table = opened.page.locator("#validation").locator("..")
-        assert table.evaluate("e => e.scrollWidth > e.clientWidth")
-        assert "radial-gradient" in table.evaluate("e => getComputedStyle(e).backgroundImage")
-        table.evaluate("e => { e.scrollLeft = 1e4; }")
-        assert table.evaluate("e => e.scrollLeft > 0")
+        intervals = opened.page.locator("#parameters td[data-title='95 % interval']")
+        boxes = [one.bounding_box() for one in intervals.all()]
+        assert 4 == len(boxes)
+        assert all(0 <= box["x"] and box["x"] + box["width"] <= 400 for box in boxes)
+        title = intervals.first.evaluate("e => getComputedStyle(e, '::before').content")
+        assert "95 % interval" in title
+
+
+def test_last_column_of_a_campaign_can_be_reached(chromium: Any, pages: dict[str, Path]) -> None:
+    """Of more parameters than a screen has room for."""
+    with Opened(chromium, pages["campaign"]) as opened:
+        page = opened.page
+        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        region = page.locator(".scroll:has(#records)")
+        assert region.evaluate("e => e.scrollWidth > e.clientWidth")
+        region.evaluate("e => { e.scrollLeft = 1e5; }")
+        last = page.locator("#records tr:nth-child(2) td").last.bounding_box()
+        room = region.bounding_box()
+        assert last["x"] + last["width"] <= room["x"] + room["width"] + 1
+
+
+def test_three_scores_are_seen_and_the_others_are_folded(
+    chromium: Any, pages: dict[str, Path]
+) -> None:
+    with Opened(chromium, pages["run"]) as opened:
+        page = opened.page
+        seen = [row.inner_text() for row in page.locator("#validation tbody th").all()]
+        names = ["NRMSE", "Max error", "Coverage of the 50, 90, 95% sensor bands"]
+        assert names == seen
+        assert page.locator("#validation").is_visible()
+        assert not page.locator("#scores").is_visible()
+        page.locator("summary", has_text="Other scores").click()
+        assert page.locator("#scores").is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_verdicts_have_the_colors_of_their_banners(
+    chromium: Any, pages: dict[str, Path], scheme: str
+) -> None:
+    """Passed on green, inconclusive on amber, all else on red, in every row of a campaign."""
+    color = "e => getComputedStyle(e).backgroundColor"
+    with Opened(chromium, pages["campaign"], color_scheme=scheme) as opened:
+        page = opened.page
+        rows = page.locator("#records tbody tr")
+        seen = rows.locator(".mark").evaluate_all(f"a => a.map({color})")
+        drawn = dict(zip(STATUSES, seen, strict=True))
+        page.set_content(
+            page.content().split("<main>")[0]
+            + "".join(f'<p class="status {kind}">x</p>' for kind in ("bad", "note", "good"))
+        )
+        bad, note, good = page.locator(".status").evaluate_all(f"a => a.map({color})")
+    assert 3 == len({bad, note, good})
+    expected = dict.fromkeys(STATUSES, bad)
+    assert expected | {"validation inconclusive": note, "passed": good} == drawn
+
+
+def test_loops_stand_side_by_side(chromium: Any, pages: dict[str, Path]) -> None:
+    """On a screen; on a telephone one below the other."""
+    for width, beside in ((1400, True), (400, False)):
+        with Opened(chromium, pages["run"], width) as opened:
+            first, second = (
+                box.bounding_box() for box in opened.page.locator("#loop .bk-Figure").all()
+            )
+            assert beside == (first["y"] == second["y"])
+            assert beside == (first["x"] + first["width"] <= second["x"])
+            narrow = opened.page.locator(".scroll:has(#parameters)")
+            assert narrow.evaluate("e => e.scrollWidth <= e.clientWidth")
 
 
 def middle_of(page: Any, name: str) -> tuple[float, float, float]:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import bwbayes as bw
 from bwbayes.app.commands.compensate import compensate as command
 from bwbayes.app.commands.shared import finish
+from bwbayes.app.figures.compensation import draw_compensations
 from bwbayes.app.jobs.at_work import drawn
-from bwbayes.app.jobs.compensate import FILES, compensate_draws
+from bwbayes.app.jobs.compensate import FILES, Compensated, compensate_draws
 from bwbayes.control.wished import shaped
 from bwbayes.errors import InputError, NotConvergedError
 from tests.app import small
@@ -57,6 +61,36 @@ def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Pat
     with pytest.raises(InputError, match="exists"):
         made.save(tmp_path / "new")
     assert made.save(tmp_path / "new", overwrite=True) == files
+
+
+@pytest.fixture(scope="module")
+def sine(run: Path) -> Compensated:
+    return compensate_draws(drawn(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True)
+
+
+@pytest.mark.parametrize("times", [1.0, 1.05, 8.0, 30.0, 99.0, 1e3, 1e6])
+@pytest.mark.parametrize("least", [0.0, 0.0428, 5.83])
+def test_ticks_of_the_errors_histogram_are_few_and_do_not_overlap(
+    sine: Compensated, least: float, times: float
+) -> None:
+    """However small the errors are, and however much smaller than without compensation."""
+    made = replace(
+        sine,
+        compensated=replace(sine.compensated, rms=np.full(9, least)),
+        linear=replace(sine.linear, rms=np.full(9, least * times)),
+    )
+    figure = draw_compensations(made)["error"]
+    figure.draw_without_rendering()
+    panel = figure.axes[1]
+    low, high = panel.get_xlim()
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    labels = [
+        label.get_window_extent(renderer)
+        for place, label in zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
+        if low <= place <= high and label.get_text()
+    ]
+    assert 2 <= len(labels) <= 5
+    assert not any(one.overlaps(two) for one, two in itertools.combinations(labels, 2))
 
 
 @pytest.mark.filterwarnings("ignore:between samples")

@@ -14,6 +14,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from bokeh.models import ColumnDataSource
 from hypothesis import given, settings
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,7 +28,7 @@ from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, dr
 from bwbayes.app.figures.coverage import draw_coverage
 from bwbayes.app.figures.loop import along, draw_loop
 from bwbayes.app.figures.series import _around_largest_error, draw_bands
-from bwbayes.app.figures.style import STYLE, envelope, zigzag
+from bwbayes.app.figures.style import MEAN_COLOUR, STYLE, envelope, zigzag
 from bwbayes.inference.parameters import Parameter
 from tests.app import example
 
@@ -240,6 +241,39 @@ def test_coverage_is_drawn_in_percent_with_its_error(figures: Mapping[str, Figur
     sensor, displacement = [48.1, 89.2, 94.3], [51.4, 91.5, 96.6]
     np.testing.assert_allclose(np.array([sensor, displacement] * 2), np.stack(drawn))
     np.testing.assert_allclose(np.array([44.0, 52.2]), whiskers[0][0, :, 1])
+
+
+def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
+    """Between 1 and 2 s nothing is drawn; nor is there a path of the loop."""
+    bands = example.bands(lead_in=0).within([slice(0, 1000), slice(2000, 3000)])
+    along_time = draw_bands(bands)
+    for panel in along_time.axes[::2]:
+        for line in panel.lines:
+            x, y = np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)
+            if x.size > 2:
+                assert np.diff(x[np.isfinite(y)]).max() > 0.9
+                assert not np.isfinite(y[(x > 1.01) & (x < 1.99)]).any()
+        for drawn in panel.collections:
+            for path in drawn.get_paths():
+                polygons = [np.asarray(corners) for corners in path.to_polygons()]
+                assert all(np.ptp(corners[:, 0]) < 1.01 for corners in polygons)
+    whole = draw_loop([bands]).axes[0]
+    sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == MEAN_COLOUR]
+    assert 2 == len(sizes)
+    every = interactive._series(bands).references()
+    times = [np.asarray(one.data["time"]) for one in every if isinstance(one, ColumnDataSource)]
+    assert 2 == len(times)
+    assert all(np.ptp(time) < 1 for time in times)
+
+
+def test_file_time_stands_beside_the_time_axis() -> None:
+    """The time stamp of time zero, whole; the axis counts from there."""
+    stamped = dataclasses.replace(example.bands(), time_offset=1.7e9)
+    assert "time after 1700000000 s (s)" == draw_bands(stamped).axes[4].get_xlabel()
+    assert (
+        "time after 1700000000 s (s)"
+        in interactive.draw(example.run(every=(stamped,)))["bands_held-out"]
+    )
 
 
 def test_pit_leaves_out_the_lead_in() -> None:

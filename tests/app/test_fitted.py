@@ -157,7 +157,18 @@ def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["loop", "loops", "bands", "coverage", "innovations", "corner", "trace", "ranks", "record"],
+    [
+        "loop",
+        "loops",
+        "bands",
+        "coverage",
+        "innovations",
+        "spectrum",
+        "corner",
+        "trace",
+        "ranks",
+        "record",
+    ],
 )
 def test_every_figure_is_one_of_matplotlib(fit: Fit, name: str) -> None:
     assert getattr(fit.plot, name)().axes

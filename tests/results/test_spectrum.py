@@ -6,13 +6,17 @@ frequency; of records without lines one in 100 shows one at most, whatever its n
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from bwbayes.app.figures.spectrum import draw_spectrum
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import pointfit
-from bwbayes.results.innovations import innovations, numbers, remarks
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.results.innovations import Innovations, innovations, numbers, remarks
 from bwbayes.results.spectrum import ResidualSpectrum, residual_spectrum, without_lines
 from tests.inference.problems import INTERVAL, short_posterior
 
@@ -150,3 +154,45 @@ def test_hum_is_named_and_not_taken_for_a_slow_discrepancy() -> None:
             assert 5.0 == pytest.approx(number["frequency"], abs=0.01)  # type: ignore[has-type]
         else:
             assert () == said
+
+
+@pytest.mark.parametrize("theta", [(0.5, 1.4, 0.3), (0.02, 3.0, 40.0), (0.7, 1e-9, 0.01)])
+def test_density_of_the_noise_model_is_that_of_its_covariance(
+    theta: tuple[float, float, float],
+) -> None:
+    """Against the sum over all lags: 2 Δ Σ cov(k Δ) cos(2π f k Δ)."""
+    sensor, sd, time = theta
+    interval = 0.01
+    lags = np.arange(1, 400_000)
+    covariance = sd**2 * np.exp(-interval * lags / time)
+    frequency = np.array([0.3, 2.0, 17.0, 50.0])
+    angles = 2 * np.pi * interval * frequency
+    sums = [sensor**2 + sd**2 + 2 * np.sum(covariance * np.cos(a * lags)) for a in angles]
+    steady = DiscrepancyNoise(interval).steady_state(np.array([theta]))
+    empty = np.empty(0)
+    series = Innovations(empty, empty, empty, empty, empty, interval, steady)
+    density = series.noise_density(frequency)
+    assert density is not None
+    np.testing.assert_allclose(density, np.sqrt(2 * interval * np.array(sums)), rtol=1e-6)
+    white = WhiteNoise(interval).steady_state(np.array([[sensor]]))
+    level = dataclasses.replace(series, noise=white).noise_density(frequency)
+    assert level is not None
+    np.testing.assert_allclose(level, sensor * np.sqrt(2 * interval))
+
+
+def test_picture_names_the_lines_and_has_the_noise_model_beside_the_residual() -> None:
+    """Hum of 0.4 um at 50 Hz; without it, the legend says that there are no lines."""
+    generator, time = np.random.default_rng(4), np.arange(4000) / 200
+    noise, voltage = generator.standard_normal(time.size), np.sin(2 * np.pi * time)
+    steady = WhiteNoise(0.005).steady_state(np.array([[1.0]]))
+    for hum, expected in ((0.4, "50 Hz (mains, 0.4 µm)"), (0.0, "no lines")):
+        values = noise + hum * np.sin(2 * np.pi * 50 * time)
+        series = Innovations(time, values, voltage, voltage, values, 0.005, steady)
+        figure = draw_spectrum(series)
+        panel = figure.axes[0]
+        assert ["residual", "noise model"] == panel.get_legend_handles_labels()[1][:2]
+        texts = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert ["residual", "noise model", expected] == texts
+        assert ("log", "log") == (panel.get_xscale(), panel.get_yscale())
+        if hum:
+            assert 50 == pytest.approx(float(np.asarray(panel.lines[-1].get_xdata())[0]), abs=0.05)

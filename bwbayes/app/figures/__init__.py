@@ -49,9 +49,9 @@ def draw_all(result: Result) -> dict[str, Figure]:
 
     ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME`` for each of
     the result's bands, ``coverage``,
-    ``innovations`` (of several records ``innovations_NAME``), ``corner``, ``trace`` and ``ranks``.
-    Without convergence only the last two; without bands or a measurement to hold them against,
-    what needs them is left out.
+    ``innovations`` and ``spectrum`` (of several records ``innovations_NAME`` and so on),
+    ``corner``, ``trace`` and ``ranks``. Without convergence only the last two; without bands or a
+    measurement to hold them against, what needs them is left out.
     """
     with _styled():
         return {name: draw() for name, draw in drawings(result).items()}
@@ -101,9 +101,8 @@ def _of_predictions(result: Result) -> Drawings:
         every["coverage"] = _drawing("coverage", "draw_coverage", result.bands, result.scores)
     several = len(result.innovations) > 1
     return every | {
-        f"innovations_{name}" if several else "innovations": _drawing(
-            "innovations", "draw_innovations", one
-        )
+        f"{kind}_{name}" if several else kind: _drawing(kind, f"draw_{kind}", one)
+        for kind in ("innovations", "spectrum")
         for name, one in result.innovations.items()
     }
 

@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter
 
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
@@ -70,8 +70,9 @@ def _error(made: Compensation) -> Figure:
     _errors(along, made, without=False)
     along.set_xlabel("time (s)")
     both = np.concatenate([made.linear.rms, made.compensated.rms])
-    # Errors are mostly far from zero; where they are not, all of them may be zero.
-    bins = np.geomspace(max(both.min(), 1e-9), max(both.max(), 2e-9), BINS)
+    # Errors are mostly far from zero; where they are not, all of them may be zero, or alike.
+    low = max(float(both.min()), 1e-9)
+    bins = np.geomspace(low, max(float(both.max()), 1.1 * low), BINS)
     for played, colour, name in (
         (made.linear, LINEAR_COLOUR, "uncompensated"),
         (made.compensated, MEAN_COLOUR, "compensated"),
@@ -80,11 +81,19 @@ def _error(made: Compensation) -> Figure:
     spread.set_xlabel("rms of the error (µm)")
     spread.set_ylabel("draws")
     spread.set_xscale("log")
-    spread.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    spread.xaxis.set_major_formatter(ScalarFormatter())
+    spread.xaxis.set_major_locator(_few_ticks(bins[0], bins[-1]))
+    spread.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     spread.xaxis.set_minor_formatter(NullFormatter())
     share_legend(figure)
     return figure
+
+
+def _few_ticks(low: float, high: float) -> Locator:
+    """Return what puts two to five ticks on a logarithmic axis; one decade may hold no power."""
+    decades = np.log10(high / low)
+    if decades < 1:
+        return MaxNLocator(3)
+    return LogLocator(numticks=5) if decades > 2 else LogLocator(subs=(1, 3))
 
 
 def _loops(made: Compensation) -> Figure:

@@ -19,6 +19,9 @@ EXTREMES = 100
 # Stretches of time whose size is shown.
 STRETCHES = 40
 
+# Part of the time in which a record without readings ends the line.
+GAP = 0.02
+
 
 def draw_innovations(innovations: Innovations) -> Figure:
     """Draw autocorrelation, quantiles, size along time, and size along the drive."""
@@ -69,10 +72,15 @@ def _draw_time(panel: Axes, innovations: Innovations) -> None:
     reach = max(4.5, 1.1 * float(np.quantile(np.abs(white), 0.9995)))
     shown = np.clip(white, -reach, reach)
     panel.plot(time, shown, ".", color=MEASURED_COLOUR, ms=2, mew=0, alpha=dim)
-    pieces = np.array_split(np.arange(white.size), min(STRETCHES, max(white.size // 20, 1)))
-    middle = [float(np.mean(time[piece])) for piece in pieces]
-    size = [float(np.sqrt(np.mean(white[piece] ** 2))) for piece in pieces]
-    panel.plot(middle, size, color=MEAN_COLOUR, lw=1.5, label="root mean square: 1 is right")
+    stretches = min(STRETCHES, max(white.size // 20, 1))
+    gaps = np.flatnonzero(np.diff(time) > GAP * np.ptp(time)) + 1
+    label = "root mean square: 1 is right"
+    for window in np.split(np.arange(white.size), gaps):
+        pieces = np.array_split(window, max(round(stretches * window.size / white.size), 1))
+        middle = [float(np.mean(time[piece])) for piece in pieces]
+        size = [float(np.sqrt(np.mean(white[piece] ** 2))) for piece in pieces]
+        panel.plot(middle, size, color=MEAN_COLOUR, lw=1.5, label=label)
+        label = "_nolegend_"
     panel.axhline(1, color=MEAN_COLOUR, lw=0.8, ls=":")
     panel.set(ylim=(-reach, reach), title="Does the record go on as it starts?")
     panel.set(xlabel="time (s)", ylabel="innovation (sds)")

@@ -15,22 +15,21 @@ from typing import Any
 
 import numpy as np
 from bokeh.embed import json_item
-from bokeh.layouts import gridplot
+from bokeh.layouts import gridplot, row
 from bokeh.models import (
     BasicTicker,
     ColumnDataSource,
     DataRange1d,
     HoverTool,
     Model,
-    TabPanel,
-    Tabs,
 )
 from bokeh.models.annotations import BoxAnnotation
+from bokeh.models.renderers import DataRenderer
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
 
-from bwbayes.app.figures.loop import along, one_way
+from bwbayes.app.figures.loop import paths, polygons
 from bwbayes.app.figures.style import (
     BAND_COLOURS,
     BAND_NAMES,
@@ -39,6 +38,7 @@ from bwbayes.app.figures.style import (
     MEAN_COLOUR,
     MEASURED_COLOUR,
     starts,
+    time_label,
     title,
 )
 from bwbayes.app.report.page import Plots, Script
@@ -61,7 +61,7 @@ LEVEL = 95  # %
 OF_LOOPS: tuple[Kind, ...] = ("sensor", "parameter")
 TOOLS = "box_zoom,wheel_zoom,pan,reset"
 HEIGHTS = {"voltage": 130, "displacement": 330, "residual": 230}  # CSS pixels
-LOOP_HEIGHT = 430
+LOOP_HEIGHT, LOOP_WIDTH = 430, 240  # CSS pixels; the least width
 FONT_SIZE = "13px"
 
 
@@ -88,9 +88,16 @@ def draw(result: Result) -> dict[str, Markup]:
     looped = [bands for bands in result.bands if bands.name not in result.steps]
     looped.sort(key=lambda bands: bands.training)
     if looped:
-        tabs = [TabPanel(child=_loop(bands), title=title(bands)) for bands in looped]
-        plots["loop"] = Tabs(tabs=tabs, sizing_mode="stretch_width")
+        plots["loop"] = _side_by_side([_loop(bands) for bands in looped])
     return {name: _page_json(plot, i) for i, (name, plot) in enumerate(plots.items())}
+
+
+def _side_by_side(plots: list[figure]) -> Model:
+    """Put plots into a row, which goes on below where it is too narrow."""
+    for plot in plots:
+        plot.styles = {"flex": f"1 1 {LOOP_WIDTH}px"}
+    beside: Model = row(*plots, sizing_mode="stretch_width", styles={"flex-wrap": "wrap"})
+    return beside
 
 
 def _page_json(plot: Model, number: int) -> Markup:
@@ -127,52 +134,66 @@ def _figure(height: int, ylabel: str, **options: Any) -> figure:
     return plot
 
 
-def _legend(plot: figure) -> None:
+def _legend(plot: figure, columns: int = 2) -> None:
     """Put the legend above the plot, where a click hides what it names."""
     legend = plot.legend[0]
-    legend.update(ncols=2, click_policy="hide", border_line_color=None, padding=0)
+    legend.update(ncols=columns, click_policy="hide", border_line_color=None, padding=0)
     legend.update(label_text_font_size=FONT_SIZE, glyph_height=14, spacing=8, margin=4)
     plot.add_layout(legend, "above")
 
 
 def _series(bands: Bands) -> Model:
-    """Draw voltage, displacement with its bands, and readings minus mean, over one time."""
-    source = ColumnDataSource(_columns(bands, kept(bands)))
+    """Draw voltage, displacement with its bands, and readings minus mean, over one time.
+
+    Each window by itself: an area has no gaps.
+    """
+    at = kept(bands)
+    sources = [
+        ColumnDataSource(_columns(bands, at[(at >= window.start) & (at < window.stop)]))
+        for window in bands.windows
+    ]
     voltage = _figure(HEIGHTS["voltage"], "voltage (V)", x_range=DataRange1d(range_padding=0.01))
-    voltage.line("time", "voltage", source=source, color=MEASURED_COLOUR)
+    for source in sources:
+        voltage.line("time", "voltage", source=source, color=MEASURED_COLOUR)
     plots = [voltage]
     residual = "band − mean (µm)" if bands.measured is None else "measured − mean (µm)"
     for about, label in (("", "displacement (µm)"), ("_residual", residual)):
         height = HEIGHTS["residual" if about else "displacement"]
         plot = _figure(height, label, x_range=voltage.x_range)
-        _ribbons(plot, source, about)
-        mean = plot.line(
-            "time", f"mean{about}", source=source, color=MEAN_COLOUR, **_named("mean", about)
-        )
-        if bands.measured is not None:
-            plot.scatter(
-                "time",
-                f"measured{about}",
-                source=source,
-                size=2.5,
-                color=MEASURED_COLOUR,
-                alpha=0.6,
-                **_named("measured", about),
-            )
+        means = [_along(plot, bands, source, about) for source in sources]
         if bands.scored_from:
             until = float(bands.time[min(bands.scored_from, bands.time.size - 1)])
             lead_in: dict[str, Any] = {"left": float(bands.time[0]), "right": until}
             plot.add_layout(BoxAnnotation(**lead_in, fill_color=LEAD_IN_COLOUR, fill_alpha=0.35))
-        plot.add_tools(HoverTool(renderers=[mean], mode="vline", tooltips=_tips(bands)))
+        plot.add_tools(HoverTool(renderers=means, mode="vline", tooltips=_tips(bands)))
         plots.append(plot)
     _legend(plots[1])
-    plots[-1].xaxis.axis_label = "time (s)"
+    plots[-1].xaxis.axis_label = time_label(bands.time_offset)
     for plot in plots[:-1]:
         plot.xaxis.major_label_text_font_size = "0px"
     grid: Model = gridplot(
         [[plot] for plot in plots], sizing_mode="stretch_width", toolbar_location="above"
     )
     return grid
+
+
+def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> DataRenderer:
+    """Draw the bands, the mean and the readings of a window; return the mean's line."""
+    _ribbons(plot, source, about)
+    mean = plot.line(
+        "time", f"mean{about}", source=source, color=MEAN_COLOUR, **_named("mean", about)
+    )
+    if bands.measured is not None:
+        plot.scatter(
+            "time",
+            f"measured{about}",
+            source=source,
+            size=2.5,
+            color=MEASURED_COLOUR,
+            alpha=0.6,
+            **_named("measured", about),
+        )
+    return mean
 
 
 def _named(label: str, about: str) -> dict[str, Any]:
@@ -218,7 +239,7 @@ def kept(bands: Bands) -> IntArray:
     if bands.measured is not None:
         series.append(np.nan_to_num(bands.measured - bands.mean))
     first = starts(bands.time.size, STRETCHES)
-    chosen = [np.array([0, bands.time.size - 1])]
+    chosen = [np.array([[window.start, window.stop - 1] for window in bands.windows]).ravel()]
     for values, order in itertools.product(series, (1, -1)):
         # Sorted by stretch and value, each stretch begins with its least.
         stretch = np.searchsorted(first, np.arange(values.size), side="right")
@@ -242,11 +263,19 @@ def _columns(bands: Bands, at: IntArray) -> dict[str, FloatArray]:
 
 def _loop(bands: Bands) -> figure:
     """Draw displacement against voltage, with sensor and parameter band."""
-    at = along(bands.voltage, bands.mean)
-    at = np.union1d(at[::ONE_IN], at[-1:])
-    plot = _figure(LOOP_HEIGHT, "displacement (µm)", x_axis_label="voltage (V)")
+    every = [np.union1d(path[::ONE_IN], path[-1:]) for path in paths(bands)]
+    plot = _figure(
+        LOOP_HEIGHT,
+        "displacement (µm)",
+        x_axis_label="voltage (V)",
+        title=title(bands),
+        toolbar_location="above",
+    )
     for kind in OF_LOOPS:
-        ribbon = ColumnDataSource(_ribbon(bands, at, kind))
+        corners = [one.astype(np.float32) for one in polygons(bands, every, kind)]
+        ribbon = ColumnDataSource(
+            {"x": [one[:, 0] for one in corners], "y": [one[:, 1] for one in corners]}
+        )
         plot.patches(
             "x", "y", source=ribbon, color=BAND_COLOURS[kind], legend_label=BAND_NAMES[kind]
         )
@@ -260,25 +289,17 @@ def _loop(bands: Bands) -> figure:
             alpha=0.4,
             legend_label="measured",
         )
-    columns = _columns(bands, at)
-    source = ColumnDataSource({n: x for n, x in columns.items() if not n.endswith("_residual")})
+    columns = _columns(bands, np.concatenate(every))
+    ends = np.cumsum([path.size for path in every])[:-1]  # of windows, where the line ends
+    source = ColumnDataSource(
+        {n: np.insert(x, ends, np.nan) for n, x in columns.items() if not n.endswith("_residual")}
+    )
     mean = plot.line(
         "voltage", "mean", source=source, color=MEAN_COLOUR, line_width=1.5, legend_label="mean"
     )
     plot.add_tools(HoverTool(renderers=[mean], line_policy="nearest", tooltips=_tips(bands)))
-    _legend(plot)
+    _legend(plot, 1)
     return plot
-
-
-def _ribbon(bands: Bands, at: IntArray, kind: Kind) -> dict[str, list[FloatArray]]:
-    """Return the corners of a band, one polygon from each turning point to the next."""
-    voltage = bands.voltage[at].astype(np.float32)
-    lower, upper = (edge[kind, LEVEL][at].astype(np.float32) for edge in (bands.lower, bands.upper))
-    xs, ys = [], []
-    for part in one_way(bands.voltage[at]):
-        xs.append(np.concatenate([voltage[part], voltage[part][::-1]]))
-        ys.append(np.concatenate([lower[part], upper[part][::-1]]))
-    return {"x": xs, "y": ys}
 
 
 def _one_in_each_cell(x: FloatArray, y: FloatArray) -> IntArray:

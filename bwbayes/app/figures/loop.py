@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ from bwbayes.app.figures.style import (
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.bands import Bands, Kind
 
-__all__ = ["along", "draw_loop", "one_way"]
+__all__ = ["along", "draw_loop", "paths", "polygons"]
 
 SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
 
@@ -63,12 +63,12 @@ def draw_loop(every: Sequence[Bands]) -> Figure:
 
 
 def _draw(panel: Axes, bands: Bands, dot: str) -> None:
-    kept = along(bands.voltage, bands.mean)
-    voltage = bands.voltage[kept]
+    every = paths(bands)
     for kind in SHOWN:
-        lower, upper = bands.lower[kind, 95][kept], bands.upper[kind, 95][kept]
-        panel.add_collection(_ribbon(voltage, lower, upper, kind))
-    panel.plot(voltage, bands.mean[kept], color=MEAN_COLOUR, lw=0.7, label="mean")
+        panel.add_collection(_ribbon(bands, every, kind))
+    for number, path in enumerate(every):
+        label = "_nolegend_" if number else "mean"
+        panel.plot(bands.voltage[path], bands.mean[path], color=MEAN_COLOUR, lw=0.7, label=label)
     if bands.measured is not None:
         panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
         few = bands.measured.size <= FEW
@@ -76,6 +76,14 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
         size, alpha = (3.0, 0.7) if few else (2.0, 0.25)
         dots[0].set(markersize=size, markeredgewidth=0.0, zorder=1.5, alpha=alpha)
     panel.autoscale_view()
+
+
+def paths(bands: Bands) -> list[IntArray]:
+    """Return the samples to draw of each window."""
+    return [
+        part.start + along(bands.voltage[part], bands.mean[part])  # no path from one to the next
+        for part in bands.windows
+    ]
 
 
 def along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
@@ -89,19 +97,25 @@ def along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
     return np.union1d(kept, [voltage.size - 1])
 
 
-def _ribbon(x: FloatArray, lower: FloatArray, upper: FloatArray, kind: Kind) -> PolyCollection:
-    """Return a band along a path that may turn back: a polygon from each turn to the next.
+def _ribbon(bands: Bands, every: Sequence[IntArray], kind: Kind) -> PolyCollection:
+    """Return a band along paths that may turn back: a polygon from each turn to the next.
 
     Opaque, because what overlaps where the path turns must not look like a denser band.
     """
     colour = BAND_COLOURS[kind]
-    corners = [
-        np.stack([np.append(x[part], x[part][::-1]), np.append(lower[part], upper[part][::-1])], 1)
-        for part in one_way(x)
-    ]
+    corners = list(polygons(bands, every, kind))
     return PolyCollection(
         corners, facecolor=colour, edgecolor=colour, linewidth=0.4, label=BAND_NAMES[kind]
     )
+
+
+def polygons(bands: Bands, every: Sequence[IntArray], kind: Kind) -> Iterator[FloatArray]:
+    """Yield the corners (corners, 2) of a 95 % band along paths, from each turn to the next."""
+    for path in every:
+        for part in one_way(bands.voltage[path]):
+            at = path[part]
+            edges = np.append(bands.lower[kind, 95][at], bands.upper[kind, 95][at[::-1]])
+            yield np.stack([bands.voltage[np.append(at, at[::-1])], edges], 1)
 
 
 def one_way(voltage: FloatArray) -> list[slice]:
@@ -114,13 +128,15 @@ def one_way(voltage: FloatArray) -> list[slice]:
 
 def _zoom(whole: Axes, tip: Axes, bands: Bands) -> None:
     """Cut the tip's panel to the tip and mark it on the whole loop."""
-    at = int(np.argmax(bands.voltage))
-    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
-    height = float(np.max(bands.upper["sensor", 95]) - np.min(bands.lower["sensor", 95]))
-    upright = min(TIP_HEIGHT * width, height / 2)
-    across = (float(np.ptp(bands.voltage)) or 1.0) * upright / height
-    left = float(bands.voltage[at]) - (1 - BEYOND) * across
-    top = float(np.max(bands.upper["sensor", 95][at])) + BEYOND * upright
+    inside = slice(None) if bands.inside is None else bands.inside
+    voltage = bands.voltage[inside]
+    lower, upper = bands.lower["sensor", 95][inside], bands.upper["sensor", 95][inside]
+    at = int(np.argmax(voltage))
+    height = float(np.max(upper) - np.min(lower))
+    upright = min(TIP_HEIGHT * float(np.mean(upper - lower)), height / 2)
+    across = (float(np.ptp(voltage)) or 1.0) * upright / height
+    left = float(voltage[at]) - (1 - BEYOND) * across
+    top = float(upper[at]) + BEYOND * upright
     tip.set_xlim(left, left + across)
     tip.set_ylim(top - upright, top)
     whole.indicate_inset(

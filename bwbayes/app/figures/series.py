@@ -19,7 +19,9 @@ from bwbayes.app.figures.style import (
     envelope,
     plain,
     share_legend,
+    time_label,
     title,
+    with_gaps,
     zigzag,
 )
 from bwbayes.arrays import FloatArray
@@ -42,6 +44,7 @@ def draw_bands(bands: Bands) -> Figure:
     The left column shows all samples, the right one a short stretch around the largest error (or
     the largest displacement, if nothing was measured), where the bands can be told apart.
     """
+    bands = with_gaps(bands)
     figure = Figure(figsize=(11, 7.4), layout="constrained")
     axes = figure.subplots(3, 2, sharex="col", width_ratios=(2, 1), height_ratios=(1, 2, 2))
     short = _around_largest_error(bands)
@@ -49,7 +52,7 @@ def draw_bands(bands: Bands) -> Figure:
         _draw_voltage(column[0], bands, part)
         _draw_displacement(column[1], bands, part)
         _draw_residual(column[2], bands, part)
-        column[2].set_xlabel("time (s)")
+        column[2].set_xlabel(time_label(bands.time_offset))
     axes[2, 1].xaxis.set_major_locator(MaxNLocator(5))
     for panel in axes[:, 0]:
         _mark(panel, bands, short)
@@ -70,11 +73,11 @@ def _around_largest_error(bands: Bands) -> slice:
     first = min(bands.scored_from, size - 1)
     error = bands.mean if bands.measured is None else bands.measured - bands.mean
     at = first + int(np.argmax(np.nan_to_num(np.abs(error[first:]))))  # a reading may be missing
-    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+    width = float(np.nanmean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
     reach = max(int(ZOOM_PART * size / 2), LEAST_ZOOM)
     near = bands.mean[max(at - reach, 0) : at + reach + 1]
     here = min(at, reach)
-    far = np.abs(near - near[here]) > ZOOM_HEIGHT * width / 2
+    far = ~(np.abs(near - near[here]) <= ZOOM_HEIGHT * width / 2)  # so is another window
     away = np.abs(np.flatnonzero(far) - here)
     reach = max(int(away.min()), LEAST_ZOOM) if away.size else reach
     return slice(max(at - reach, 0), min(at + reach + 1, size))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,8 +39,10 @@ __all__ = [
     "plain",
     "share_legend",
     "starts",
+    "time_label",
     "title",
     "unit_text",
+    "with_gaps",
     "zigzag",
 ]
 
@@ -114,6 +117,29 @@ def title(bands: Bands) -> str:
     return titled(bands.name, training=bands.training, separate=bands.separate)
 
 
+def time_label(offset: float) -> str:
+    """Return the label of a time axis; ``offset`` is what the file's own clock adds to it, s."""
+    return f"time after {offset:.15g} s (s)" if offset else "time (s)"
+
+
+def with_gaps(bands: Bands) -> Bands:
+    """Return bands of several windows with nan between them, where lines are to end."""
+    inside = bands.inside
+    if inside is None:
+        return bands
+
+    def cut(values: FloatArray) -> FloatArray:
+        return np.where(inside, values, np.nan)
+
+    return replace(
+        bands,
+        voltage=cut(bands.voltage),
+        mean=cut(bands.mean),
+        lower={key: cut(edge) for key, edge in bands.lower.items()},
+        upper={key: cut(edge) for key, edge in bands.upper.items()},
+    )
+
+
 def starts(samples: int, most: int) -> IntArray:
     """Return the first samples of at most ``most`` stretches of nearly equal length."""
     return np.linspace(0, samples, min(samples, most), endpoint=False).astype(np.int64)
@@ -124,10 +150,11 @@ def envelope(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Thin a band to ``most`` stretches, each with its least and largest edge.
 
-    Every excursion stays visible, which it would not if samples were left out.
+    Every excursion stays visible, which it would not if samples were left out; a stretch of nothing
+    but nan stays a gap.
     """
     first = starts(time.size, most)
-    return time[first], np.minimum.reduceat(lower, first), np.maximum.reduceat(upper, first)
+    return time[first], np.fmin.reduceat(lower, first), np.fmax.reduceat(upper, first)
 
 
 def zigzag(time: FloatArray, values: FloatArray, most: int = 1500) -> tuple[FloatArray, FloatArray]:

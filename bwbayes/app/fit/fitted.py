@@ -55,9 +55,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Fit", "carried_on", "to_know"]
 
-# How the validation of bands came out, in a word.
-HELD = {True: "passed", False: "FAILED", None: "inconclusive"}
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Advice):
@@ -312,7 +309,7 @@ class Fit(Advice):
             parameters=list(parameter_rows(self.result)),
             score_columns=list(SCORE_COLUMNS),
             scores=[
-                (name, HELD[self.verdicts[name].holds], *score_texts(one))
+                (name, self.verdicts[name].status, *score_texts(one))
                 for name, one in scores.items()
             ],
             remarks=self.remarks,

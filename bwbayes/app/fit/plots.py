@@ -21,6 +21,7 @@ from bwbayes.app.figures.innovations import draw_innovations
 from bwbayes.app.figures.loop import draw_loop
 from bwbayes.app.figures.loops import draw_loops
 from bwbayes.app.figures.record import draw_record
+from bwbayes.app.figures.spectrum import draw_spectrum
 from bwbayes.app.figures.style import STYLE
 from bwbayes.app.figures.tracking import draw_tracking
 from bwbayes.app.problem.problem import Problem
@@ -83,6 +84,13 @@ class Plots:
         Of several records in the one of this name, by default the first.
         """
         return _drawn(draw_innovations, self.converged().innovations[self._record(name)])
+
+    def spectrum(self, name: str | None = None) -> Figure:
+        """Draw the residual's spectrum with its lines, beside the noise model's.
+
+        Of several records in the one of this name, by default the first.
+        """
+        return _drawn(draw_spectrum, self.converged().innovations[self._record(name)])
 
     def corner(self) -> Figure:
         """Draw each parameter of the posterior, and each pair of them."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from bwbayes.app.figures.style import unit_text
 from bwbayes.app.report.page import Table, picture, template
-from bwbayes.app.report.words import digits
+from bwbayes.app.report.words import KINDS, digits, mark
 from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.arrays import FloatArray
 from bwbayes.population.population import Spread
@@ -36,11 +36,12 @@ NOTE = (
 def render(name: str, campaign: CampaignResult, pictures: Mapping[str, bytes]) -> str:
     """Return the page of a campaign of that name, with PNG files by the name of their figure."""
     told = campaign.population
+    ended = [KINDS.get(status, "bad") for status, count in campaign.counts.items() if count]
     return template("campaign.html.j2").render(
         name=name,
         counts=campaign.counts,
         total=len(campaign.rows),
-        well=campaign.exit_status == 0,
+        kind=min(ended, key=["bad", "note", "good"].index, default="good"),
         outliers=[
             (record, ", ".join(parameters)) for record, parameters in campaign.outliers.items()
         ],
@@ -49,7 +50,7 @@ def render(name: str, campaign: CampaignResult, pictures: Mapping[str, bytes]) -
             "short",
             "Records to look at",
             ("Record", "Status", "Why"),
-            [(row.name, row.status, row.reason) for row in campaign.rows if row.reason],
+            [(row.name, mark(row.status), row.reason) for row in campaign.rows if row.reason],
         ),
         untold=campaign.untold,
         population=_population([] if told is None else [*told.parameters.values()]),
@@ -70,7 +71,7 @@ def _records(campaign: CampaignResult) -> Table:
             one = row.parameters.get(name)
             texts.append(_interval(one["lower_95"], one["upper_95"]) if one else "")
             flat |= {f"{name} {key}": one[key] for key in ("mean", "sd")} if one else {}
-        rows.append((row.name, row.status, *texts))
+        rows.append((row.name, mark(row.status), *texts))
         numbers.append(flat)
     titles = (f"{name} ({unit})" if unit else name for name, unit in units.items())
     return Table(

@@ -75,6 +75,13 @@ CAPTIONS = {
         "size from the start on, and the same wherever the drive is. Whiskers are 95 % of chance.",
         "Autocorrelation, normal quantiles, course in time and size by drive of the innovations",
     ),
+    "spectrum": Caption(
+        "Spectrum of the residuals",
+        "Amplitude spectral density of the residuals, and that of the noise model at the most "
+        "probable draw. Dashed: oscillations above the noise, the strongest first, with their "
+        "likely source and amplitude; the noise model does not describe them.",
+        "Amplitude density of the residuals and of the noise model against frequency, with lines",
+    ),
     "corner": Caption(
         "Posterior",
         "Each parameter, and each pair of parameters; contours hold 50 and 90 % of the draws. "

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.report.page import Table, template
+from bwbayes.app.report.words import mark
 from bwbayes.comparison.choice import Comparison
 from bwbayes.comparison.table import COLUMNS, DIFFERENCE_COLUMNS, differences, rows, table
 
@@ -22,7 +23,14 @@ def render(comparison: Comparison, problem: Problem) -> str:
         lines=comparison.lines,
         against=comparison.against,
         models=Table(
-            "models", "Models", COLUMNS, list(rows(comparison)), records=table(comparison)
+            "models",
+            "Models",
+            (COLUMNS[0], "validation", *COLUMNS[1:]),
+            [
+                (row[0], mark(one.standing.status) if one.converged else "-", *row[1:])
+                for one, row in zip(comparison.candidates, rows(comparison), strict=True)
+            ],
+            records=table(comparison),
         ),
         differences=Table(
             "differences", f"Differences to {comparison.best}", DIFFERENCE_COLUMNS, less

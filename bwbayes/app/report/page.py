@@ -129,6 +129,19 @@ class Table:
         return [not all(NUMBER.match(text) for text in column) for column in columns]
 
     @property
+    def labels(self) -> list[str]:
+        """For each column, its title, with that of its group."""
+        first, *others = self.titles
+        groups = [group for group, columns in self.groups for _ in range(columns)]
+        return [
+            first,
+            *(
+                f"{group}: {title}" if group else title
+                for group, title in zip(groups or [""] * len(others), others, strict=True)
+            ),
+        ]
+
+    @property
     def csv(self) -> str:
         """The table as CSV, as a data URI."""
         titles, *rows = (

@@ -14,16 +14,15 @@ from bwbayes.app.figures.style import title
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
 from bwbayes.app.report.page import Picture, Plots, picture, template
-from bwbayes.app.report.words import covered, error_text
+from bwbayes.app.report.words import covered, error_text, mark
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
-from bwbayes.results.standing import Standing
 
 __all__ = ["render"]
 
 # Figures by where they stand; those of bands come with the evidence, held-out ones first.
 ANSWER = ("loop",)
-EVIDENCE = ("agreement", "coverage", "innovations")
+EVIDENCE = ("agreement", "coverage", "innovations", "spectrum")
 
 LEVEL = 95  # %, of the bands that the answer speaks of
 
@@ -75,6 +74,7 @@ def render(
         remarks=result.remarks,
         parameters=tables.parameters(result, summary) if converged else None,
         validation=tables.validation(result, summary) if converged and result.scores else None,
+        scores=tables.scores(result, summary) if converged and result.scores else None,
         loops=tables.loops(result, summary),
         loops_closed=result.loops is None
         or all(one.closed for one in (result.loops.major, result.loops.minor)),
@@ -122,7 +122,8 @@ def _about(result: Result) -> str:
 
 
 def _span(bands: Bands) -> str:
-    return f"{bands.time[0]:g} to {bands.time[-1]:g} s"
+    windows = [bands.time[window] for window in bands.windows]
+    return ", ".join(f"{time[0]:g} to {time[-1]:g}" for time in windows) + " s"
 
 
 def _headline(result: Result) -> str:
@@ -140,7 +141,7 @@ def _answers(result: Result, every: list[Bands]) -> Iterator[dict[str, str]]:
         verdict = result.verdicts.get(bands.name)
         yield {
             "where": f"{title(bands)}, {_span(bands)}",
-            "status": Standing.of([verdict] if verdict else []).status,
+            "status": mark(verdict.status) if verdict else "",
             "coverage": covered(scores, "sensor", LEVEL),
             "width": f"{scores.width_um[LEVEL]:.2f} µm",
             "error": error_text(scores),

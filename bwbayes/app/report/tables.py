@@ -16,10 +16,10 @@ from markupsafe import Markup
 
 from bwbayes.app.figures.style import title, unit_text
 from bwbayes.app.report.page import Table
-from bwbayes.app.report.words import covered, digits, error_text, symbol
+from bwbayes.app.report.words import covered, digits, error_text, mark, symbol
 from bwbayes.inference.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.results.bands import LEVELS
+from bwbayes.results.bands import LEVELS, Bands
 from bwbayes.results.loops import MEASURES, Estimate
 from bwbayes.results.replicated import STATISTICS
 from bwbayes.results.result import Result
@@ -33,6 +33,7 @@ __all__ = [
     "priors",
     "replicated",
     "sampling",
+    "scores",
     "steps",
     "taught",
     "validation",
@@ -160,17 +161,42 @@ def replicated(result: Result) -> list[Table]:
 
 
 def validation(result: Result, summary: Summary) -> Table:
-    """Return the scores: a column for each of the bands, held-out ones first."""
-    judged = [bands for bands in result.bands if bands.name in result.scores]
-    judged.sort(key=lambda bands: bands.training)
+    """Return the scores that matter most: a column for each of the bands, held-out ones first."""
+    columns = [list(_main_scores(result.scores[bands.name])) for bands in _judged(result)]
+    return _of_scores(result, summary, "validation", "Band validation", columns)
+
+
+def scores(result: Result, summary: Summary) -> Table:
+    """Return the verdicts and the other scores, as :func:`validation` has them."""
     columns = [
         [("Validation", _held(result, bands.name)), *_scores(result.scores[bands.name])]
-        for bands in judged
+        for bands in _judged(result)
     ]
-    rows = [[row[0][0], *(text for _, text in row)] for row in zip(*columns, strict=True)]
+    return _of_scores(result, summary, "scores", "Other scores", columns)
+
+
+def _judged(result: Result) -> list[Bands]:
+    judged = [bands for bands in result.bands if bands.name in result.scores]
+    return sorted(judged, key=lambda bands: bands.training)
+
+
+def _of_scores(
+    result: Result,
+    summary: Summary,
+    name: str,
+    caption: str,
+    columns: Sequence[Sequence[tuple[str, str]]],
+) -> Table:
+    """Return columns of titles and texts as a table, without rows of which nothing is known."""
+    judged = _judged(result)
+    rows = [
+        [row[0][0], *(text or UNKNOWN for _, text in row)]
+        for row in zip(*columns, strict=True)
+        if any(text for _, text in row)
+    ]
     kept = {bands.name: summary["validation"][bands.name] for bands in judged}
     titles = ["Quantity", *(title(bands) for bands in judged)]
-    return Table("validation", "Band validation", titles, rows, records=_flat(kept))
+    return Table(name, caption, titles, rows, records=_flat(kept))
 
 
 def loops(result: Result, summary: Summary) -> Table | None:
@@ -255,21 +281,25 @@ def _stated(parameter: Parameter) -> str:
 
 def _held(result: Result, name: str) -> str:
     verdict = result.verdicts.get(name)
-    if verdict is None:
-        return UNKNOWN
-    return {True: "passed", False: "FAILED", None: "inconclusive"}[verdict.holds]
+    return "" if verdict is None else mark(verdict.status)
+
+
+def _main_scores(scores: Scores) -> Iterator[tuple[str, str]]:
+    """Yield titles and texts of the three rows that are always seen."""
+    yield "NRMSE", error_text(scores)
+    yield "Max error", f"{scores.max_error_um:.2f} µm"
+    levels = ", ".join(f"{level}" for level in LEVELS)
+    shares = [covered(scores, "sensor", level).removesuffix(" %") for level in LEVELS]
+    yield f"Coverage of the {levels}% sensor bands", f"{', '.join(shares)}%"
 
 
 def _scores(scores: Scores) -> Iterator[tuple[str, str]]:
-    """Yield titles and texts of one column of the scores, the levels from the widest band."""
-    yield "NRMSE of the mean", error_text(scores)
-    yield "Largest error of the mean", f"{scores.max_error_um:.2f} µm"
+    """Yield titles and texts of the other rows, the levels from the widest band."""
     yield "CRPS", f"{scores.crps_um:.3f} µm"
     for level in sorted(LEVELS, reverse=True):
-        yield f"{level} % sensor band covers readings", covered(scores, "sensor", level) or UNKNOWN
         yield (
             f"{level} % displacement band covers displacement",
-            covered(scores, "displacement", level) or UNKNOWN,
+            covered(scores, "displacement", level),
         )
         yield f"{level} % sensor band: worst second", f"{100 * scores.worst_second[level]:.1f} %"
         yield f"{level} % sensor band: mean width", f"{scores.width_um[level]:.2f} µm"

@@ -12,7 +12,14 @@ from markupsafe import Markup
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.scores import Scores
 
-__all__ = ["Symbol", "covered", "digits", "error_text", "symbol"]
+__all__ = ["KINDS", "Symbol", "covered", "digits", "error_text", "mark", "symbol"]
+
+# The kind of banner that goes with how a validation, or a record of a campaign, ended; else "bad".
+KINDS = {
+    "passed": "good",
+    "inconclusive": "note",
+    "validation inconclusive": "note",
+}
 
 # A range is another where it differs by more than this part.
 OTHER_RANGE = 0.05
@@ -66,6 +73,11 @@ def digits(value: float, sd: float) -> str:
         return f"{value:.{max(leading - place, 0)}e}"
     # Adding zero takes the sign from a negative zero.
     return f"{round(value, -place) + 0.0:.{max(-place, 0)}f}"
+
+
+def mark(status: str) -> Markup:
+    """Write how something ended: on green if it passed, amber if inconclusive, red otherwise."""
+    return Markup('<span class="mark {}">{}</span>').format(KINDS.get(status, "bad"), status)
 
 
 def covered(scores: Scores, kind: str, level: int) -> str:
