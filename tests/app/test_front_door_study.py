@@ -30,7 +30,7 @@ def ordinary(folder: Path, number: int) -> Path:
     """Write a record as somebody may have it."""
     generator = np.random.default_rng([20261123, number])
     samples = int(np.exp(generator.uniform(np.log(200), np.log(8000))))
-    kind = generator.choice(["sine", "decaying", "growing", "unipolar", "chirp", "triangle"])
+    kind = str(generator.choice(["sine", "decaying", "growing", "unipolar", "chirp", "triangle"]))
     voltage = drive(kind, generator.uniform(1.5, 20), np.arange(samples) / samples)
     size = float(np.exp(generator.uniform(np.log(0.01), np.log(10))))
     displacement = size * play(voltage, generator) + generator.normal(0, 100)
