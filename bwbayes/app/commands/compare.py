@@ -56,7 +56,7 @@ def compare(
     from bwbayes.app.screen import show_comparison
 
     console = Console(stderr=True, quiet=quiet)
-    if models is None and len(paths) == 1 and paths[0].is_file():
+    if models is None and len(paths) == 1 and (paths[0].is_file() or paths[0].suffix == ".toml"):
         models = USUAL_MODELS
     if models is None:
         if len(paths) < 2:
