@@ -105,6 +105,8 @@ class Residuals:
             for values in (slow, bands.mean)
         ]
         residual = (bands.measured - bands.mean)[judged]
+        low, high = (edge["sensor", 95] for edge in (bands.lower, bands.upper))
+        inside = (low <= bands.measured) & (bands.measured <= high)
         return cls(
             bands.name,
             bands.training,
@@ -116,7 +118,8 @@ class Residuals:
             bands.voltage[judged],
             changes[0][judged],
             changes[1][judged],
-            _spikes(residual, changes[1][judged] * bands.interval),
+            # What a band covers is no outlier of it.
+            _spikes(residual, changes[1][judged] * bands.interval) & ~inside[judged],
             fitted,
             bands.time[0] if bands.lead_in is None else bands.lead_in.stop,
         )

@@ -51,6 +51,10 @@ DOUBTED = 3.0
 # Draws of the posterior, and of the Gaussian approximation without the start, that are compared.
 COMPARED, DRAWS = 1000, 400
 
+# A transient smaller than this part of the readings' range is left to the discrepancy, unless the
+# readings themselves show it: no model follows the first branch of an actuator to the last percent.
+SMALLEST = 0.05
+
 # The transient with which the parabola in A is found, as a part of the readings' range.
 TRIED = 0.05
 
@@ -134,7 +138,8 @@ def swallowed(
     sampled = posterior.prior.unconstrain(draws[:COMPARED])
     length = one.actuator.interval * (first - int(rows[0]))
     nats, size, decay = added(posterior, name, np.concatenate([everywhere, sampled]), length)
-    if nats <= DOUBTED:
+    extent = float(np.ptp(one.displacement[rows]))
+    if nats <= DOUBTED or not (seen or abs(size) > SMALLEST * extent):
         return None
     most = moved(posterior, one, draws, without)
     if most is None:
