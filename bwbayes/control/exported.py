@@ -276,4 +276,4 @@ def _in_c(value: Any) -> Any:
 
 def _plain(text: str) -> str:
     """Return a text that ends no comment of C."""
-    return re.sub(r"[^\w .,:;=+()%/-]", "_", text, flags=re.ASCII)
+    return re.sub(r"[^\w .,:;=+()%-]", "_", text, flags=re.ASCII)

@@ -284,7 +284,7 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
                 StringIO(text),
                 sep=r"\s+" if layout.separator == " " else layout.separator,
                 decimal=decimal,
-                thousands=_thousands(text, decimal),
+                thousands=_thousands(text, decimal, layout.separator),
                 header=None,
                 names=range(layout.fields),
                 usecols=range(layout.fields),
@@ -301,10 +301,11 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
     return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
 
 
-def _thousands(text: str, decimal: str) -> str | None:
+def _thousands(text: str, decimal: str, separator: str) -> str | None:
     """Return the mark between thousands, as in 1.234,5, if there are any."""
     mark = "." if decimal == "," else ","
-    return mark if re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text) else None
+    found = mark != separator and re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text)
+    return mark if found else None
 
 
 def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
