@@ -215,7 +215,9 @@ def on_cuts(posterior: Posterior, drawn: FloatArray) -> tuple[Judged, Judged]:
     results = []
     for transient in (0.0, 20.0):
         ten = ((cut(record, n, transient), np.random.default_rng(n)) for n in range(10))
-        results.append(judged([predict_record(posterior, drawn, r, Start(), g) for r, g in ten]))
+        results.append(
+            judged([predict_record(posterior, drawn, r, Start(lead_in=1.0), g) for r, g in ten])
+        )
     usual, knocked = results
     return usual, knocked
 

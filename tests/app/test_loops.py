@@ -111,7 +111,7 @@ def test_steps_are_drawn_with_their_creep(steps: dict[str, StepResponse]) -> Non
 def test_a_step_is_not_drawn_as_a_loop(steps: dict[str, StepResponse]) -> None:
     run = dataclasses.replace(example.run(), steps={"held-out": steps["one"]})
     figures = draw_all(run)
-    assert ["training (fitted)"] == [panel.get_title() for panel in figures["loop"].axes[:1]]
+    assert ["training"] == [panel.get_title() for panel in figures["loop"].axes[:1]]
     assert 2 == len(figures["loop"].axes)
     assert "bands_held-out" in figures
 
