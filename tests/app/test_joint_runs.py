@@ -218,11 +218,11 @@ def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: Ru
     assert signals[0].keys() == signals[1].keys()
     for name, voltage in signals[0].items():
         np.testing.assert_array_equal(voltage, signals[1][name])
-    with pytest.warns(InputWarning, match="inconclusive: loops"):
+    with pytest.warns(InputWarning, match="Validation inconclusive"):
         best = bwbayes.open_run(finished.path).design("alpha")[0]
     assert 0 < best.left < 1
     with (
-        pytest.warns(InputWarning, match="inconclusive: loops"),
+        pytest.warns(InputWarning, match="Validation inconclusive"),
         pytest.raises(InputError, match=r"'offset\[step\]' is not a free parameter of the act"),
     ):
         bwbayes.open_run(finished.path).design("offset[step]")
