@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from bwbayes.arrays import FloatArray, IntArray
 
@@ -18,6 +19,7 @@ __all__ = [
     "Stretch",
     "fastest",
     "monotone_stretches",
+    "rate",
     "stretch_times",
     "time_between_turns",
     "turning_points",
@@ -117,6 +119,17 @@ def time_between_turns(
         return interval
     passed = np.cumsum(times)
     return float(times[np.searchsorted(passed, passed[-1] / 2)])
+
+
+def rate(voltage: FloatArray, interval: float) -> FloatArray:
+    """Return how fast the voltage changes at each sample, (samples,), V/s.
+
+    A measured voltage is noisy, and its change noisier: it is smoothed over a five-hundredth of
+    the record.
+    """
+    slow = ndimage.uniform_filter1d(voltage, max(1, voltage.size // 500), mode="nearest")
+    change: FloatArray = np.gradient(slow, interval) if slow.size > 1 else np.zeros_like(slow)
+    return change
 
 
 def fastest(

@@ -115,6 +115,13 @@ class Bands:
         edges = np.flatnonzero(np.diff(self.inside, prepend=False, append=False))
         return [slice(*edge) for edge in edges.reshape(-1, 2).tolist()]
 
+    def covers(self, kind: Kind, level: int, values: FloatArray) -> BoolArray:
+        """Tell which values (samples,), um, a band covers; its edges belong to it."""
+        covered: BoolArray = (self.lower[kind, level] <= values) & (
+            values <= self.upper[kind, level]
+        )
+        return covered
+
     def within(self, windows: Sequence[slice]) -> Bands:
         """Return the bands of some windows: from the first sample of them to the last."""
         whole = slice(windows[0].start, windows[-1].stop)

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.data.inspection import MOST_LEFT_OUT, SETTLE_FIRST
+from bwbayes.model.drive import rate
 from bwbayes.results.bands import Bands
 
 __all__ = ["Cause", "Kind", "Residuals", "cause", "drifts", "likeliest"]
@@ -97,16 +98,10 @@ class Residuals:
     def of(cls, bands: Bands, judged: BoolArray, fitted: tuple[float, float]) -> Residuals:
         """Take the judged readings (samples,) out of bands."""
         assert bands.measured is not None
-        # A measured voltage is noisy, and its change noisier: a five-hundredth of the record.
-        smooth = max(1, bands.time.size // 500)
-        slow = ndimage.uniform_filter1d(bands.voltage, smooth, mode="nearest")
-        changes = [
-            np.gradient(values) / bands.interval if values.size > 1 else np.zeros_like(values)
-            for values in (slow, bands.mean)
-        ]
+        mean = bands.mean
+        steps = (np.gradient(mean) if mean.size > 1 else np.zeros_like(mean))[judged]
         residual = (bands.measured - bands.mean)[judged]
-        low, high = (edge["sensor", 95] for edge in (bands.lower, bands.upper))
-        inside = (low <= bands.measured) & (bands.measured <= high)
+        covered = bands.covers("sensor", 95, bands.measured)[judged]
         return cls(
             bands.name,
             bands.training,
@@ -116,10 +111,10 @@ class Residuals:
             bands.mean[judged],
             bands.measured[judged],
             bands.voltage[judged],
-            changes[0][judged],
-            changes[1][judged],
+            rate(bands.voltage, bands.interval)[judged],
+            steps / bands.interval,
             # What a band covers is no outlier of it.
-            _spikes(residual, changes[1][judged] * bands.interval) & ~inside[judged],
+            _spikes(residual, steps) & ~covered,
             fitted,
             bands.time[0] if bands.lead_in is None else bands.lead_in.stop,
         )

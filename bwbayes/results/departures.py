@@ -52,11 +52,10 @@ IN_A_ROW = 5
 def coverage(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[str, float]]:
     """Say where fewer readings lie in the sensor band than promised, with the chance of that."""
     assert bands.measured is not None
-    reading, worth = bands.measured[judged], standard.for_size
+    worth = standard.for_size
     found = []
     for level in reversed(LEVELS):
-        low, high = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
-        covered = float(np.mean((low <= reading) & (reading <= high)))
+        covered = float(np.mean(bands.covers("sensor", level, bands.measured)[judged]))
         nominal = level / 100
         odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
         if odds >= 1 / ODDS:

@@ -20,6 +20,7 @@ from scipy import ndimage, stats
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import SteadyState
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.drive import rate
 from bwbayes.results.spectrum import (
     ResidualSpectrum,
     SpectralLine,
@@ -153,15 +154,12 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     noise = posterior.only.table.noise(theta)
     white, _ = posterior.only.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
     interval = posterior.only.actuator.interval
-    # A measured voltage is noisy, and its change noisier: a five-hundredth of the record.
-    smooth = max(1, posterior.only.voltage.size // 500)
-    slow = ndimage.uniform_filter1d(posterior.only.voltage, smooth, mode="nearest")
-    rate = np.gradient(slow) / interval if slow.size > 1 else np.zeros_like(slow)
+    changes = rate(posterior.only.voltage, interval)[readings.rows]
     time = begin + interval * readings.rows.astype(np.float64)
     voltage = posterior.only.voltage[readings.rows]
     apart = interval * readings.stride
     steady = posterior.only.noise.steady_state(noise)
-    return Innovations(time, white[0, 0], voltage, rate[readings.rows], residual[0], apart, steady)
+    return Innovations(time, white[0, 0], voltage, changes, residual[0], apart, steady)
 
 
 def remarks(series: Innovations) -> tuple[str, ...]:

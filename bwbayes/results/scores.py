@@ -120,13 +120,17 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
             continue
         known = np.isfinite(values)
         known[: bands.scored_from] = False
-        hits = {level: hit[known] for level, hit in _hits(bands, kind, values).items()}
+        hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
         coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
         block = block_length((values - bands.mean)[known])
         error[kind] = _coverage_errors(hits, block, generator)
     seconds = {
-        level: _worst(hit[bands.scored_from :], judged[bands.scored_from :], bands.interval)
-        for level, hit in _hits(bands, "sensor", bands.measured).items()
+        level: _worst(
+            bands.covers("sensor", level, bands.measured)[bands.scored_from :],
+            judged[bands.scored_from :],
+            bands.interval,
+        )
+        for level in LEVELS
     }
     return Scores(
         nrmse=rmse / extent if extent > 0 else np.nan,
@@ -253,14 +257,6 @@ def _coverage_errors(
         estimate = (worth * p + 0.5) / (worth + 1)
         errors[level] = max(errors[level], float(np.sqrt(estimate * (1 - estimate) / worth)))
     return errors
-
-
-def _hits(bands: Bands, kind: Kind, values: FloatArray) -> dict[int, BoolArray]:
-    """Whether each value lies in the band, by level; its edges belong to the band."""
-    return {
-        level: (bands.lower[kind, level] <= values) & (values <= bands.upper[kind, level])
-        for level in LEVELS
-    }
 
 
 def _width(bands: Bands, level: int, judged: BoolArray) -> float:

@@ -214,8 +214,4 @@ def run(text: str, folder: Path) -> tuple[Problem, Result]:
 def covered(bands: Bands, level: int = 95) -> float:
     """Part of the judged readings inside the sensor band."""
     assert bands.measured is not None
-    judged_part = slice(bands.scored_from, None)
-    inside = (bands.lower["sensor", level] <= bands.measured) & (
-        bands.measured <= bands.upper["sensor", level]
-    )
-    return float(np.mean(inside[judged_part]))
+    return float(np.mean(bands.covers("sensor", level, bands.measured)[bands.scored_from :]))

@@ -17,7 +17,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import stats
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record
@@ -28,6 +28,7 @@ from bwbayes.data.io.formats import read_table
 from bwbayes.data.io.grid import decimals_of
 from bwbayes.data.io.table import Table
 from bwbayes.errors import InputWarning
+from bwbayes.model.drive import rate
 from bwbayes.model.registry import DYNAMICS
 
 __all__ = ["Proposal", "propose"]
@@ -260,9 +261,7 @@ def _difference(record: Record, windows: list[slice]) -> float:
     assert record.displacement is not None
     if not inside or np.ptp(other) == 0 or np.ptp(record.displacement[readings & held]) == 0:
         return 1.0
-    # A measured voltage is noisy, and its change noisier.
-    slow = ndimage.uniform_filter1d(record.voltage, max(1, record.samples // 500), mode="nearest")
-    drive = record.voltage, np.abs(np.gradient(slow))
+    drive = record.voltage, np.abs(rate(record.voltage, record.interval))
     some = slice(None, None, 1 + record.samples // SEEN)
     differences = [stats.ks_2samp(x[some][held[some]], x[some][~held[some]])[0] for x in drive]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
