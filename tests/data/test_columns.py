@@ -375,3 +375,17 @@ def test_a_gap_in_a_table_is_one_line_or_held() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Record.from_pandas(pd.DataFrame(VALUES), **COLUMNS, units=UNIT)
+
+
+def test_no_column_that_does_not_rise_is_guessed_to_be_the_time(tmp_path: Path) -> None:
+    """A thermometer's column is left, and it is the sampling rate that is asked for."""
+    voltage = 50 * np.sin(np.arange(200) / 10)
+    temperature = 20 + np.cos(np.arange(200) / 40)
+    rows = zip(voltage, 0.7 * voltage, temperature, strict=True)
+    text = "\n".join(["u_V,x_um,temperature_degC", *(f"{u},{x},{t}" for u, x, t in rows), ""])
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ColumnsError, match="which is the sampling rate") as caught:
+        read_record(path)
+    assert {"columns": {}, "units": {}} == caught.value.guess
+    assert caught.value.fs is not None

@@ -278,14 +278,15 @@ def _open(
     moving = [s for s in rest[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
     rest = _alike(moving or rest, chosen)
     guess_columns, guess_units = dict(naming.columns), dict(naming.units)
-    # Where one column is missing it is that of the time.
-    timeless = "time" in columns and len(rest) == len(columns) - 1
+    clocks = [s for s in rest[:_MOST_LOADED] if _rises(s)]
+    timeless = "time" in columns and not clocks
     if timeless:
         columns = [quantity for quantity in columns if quantity != "time"]
     for quantity in unknown:
         guess_units[quantity] = _COMMON_UNITS[quantity][0]
     for quantity in columns:
-        fitting = [s for s in rest if _stated(s, quantity)] or rest
+        some = clocks if quantity == "time" else rest
+        fitting = [s for s in some if _stated(s, quantity)] or some
         if fitting:
             # One without a name goes by its number.
             guess_columns[quantity] = fitting[0].name.removeprefix("column ")
@@ -319,6 +320,14 @@ def _listed(series: Sequence[Series]) -> str:
         more = ", ..." if len(alike) > _MOST_LISTED else ""
         parts.append(f"{size} values each: {', '.join(texts)}{more}")
     return f"There are {'; '.join(parts)}" if parts else "There are no series of numbers"
+
+
+def _rises(series: Series) -> bool:
+    """Tell whether a series may be the time."""
+    try:
+        return bool(np.all(np.diff(np.asarray(series.load(), dtype=np.float64)) > 0))
+    except ValueError:
+        return False
 
 
 def _extent(series: Series) -> tuple[float, float]:
