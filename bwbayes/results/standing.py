@@ -56,6 +56,11 @@ class Standing:
         return STATUSES[self.holds]
 
     @property
+    def exit_status(self) -> int:
+        """What a command ends with that builds on it."""
+        return {True: 0, False: 3, None: 5}[self.holds]
+
+    @property
     def headline(self) -> str:
         """What stands above the lines; nothing if validation passed."""
         titles = {True: "", False: "VALIDATION FAILED", None: "Validation inconclusive"}

@@ -318,17 +318,17 @@ def _in_sds(bands: Bands, size: float) -> float:
 
 
 def _offset_advice(bands: Bands, judged: BoolArray, standard: Standard) -> str:
-    """Say that the offset is why nothing can be told, and which lead-in would do."""
+    """Name a large share of the offset in the variance, and the lead-in that makes it small."""
     lead = bands.lead_in
     if lead is None or standard.common <= SETTLED:
         return ""
     # The variance of a mean of correlated readings falls with their time.
     length = (lead.stop - lead.start) * standard.common / SETTLED
     left = float(np.ptp(bands.time[judged])) / 2
-    enough = f"lead_in = {length:.2g}" if length < left else f"a record of {3 * length:.2g} s"
+    longer = f"lead_in = {length:.2g}" if length < left else f"a record of {3 * length:.2g} s"
     return (
         f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
-        f"{percent(standard.common)} of the band's variance: {enough} would suffice"
+        f"{percent(standard.common)} of the band's variance; use {longer} for {percent(SETTLED)}"
     )
 
 

@@ -206,5 +206,5 @@ def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
     made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
 
     assert 4 == finish(made.path, 1, quiet=True)
-    with pytest.raises(NotConvergedError, match=r"run: not converged: .* `bwbayes resume"):
+    with pytest.raises(NotConvergedError, match=r"run: budget of .* `bwbayes resume"):
         compensate_draws(drawn(made.path), shaped("sine", 0.02, 30.0, 0.5))

@@ -83,11 +83,9 @@ def test_a_file_in_the_way_is_one_line(run: Path, tmp_path: Path) -> None:
 def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
     made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
     assert 4 == finish(made.path, 1, quiet=True)
-    with pytest.raises(
-        NotConvergedError, match=r"run: not converged: .* go on with `bwbayes resume"
-    ):
+    with pytest.raises(NotConvergedError, match=r"run: budget of .* go on with `bwbayes resume"):
         export(made.path)
-    with pytest.raises(NotConvergedError, match=r"run: not converged: .* go on with `bwb"):
+    with pytest.raises(NotConvergedError, match=r"run: budget of .* go on with `bwb"):
         track_run(made.path, None, Setup())
     fit = bw.open_run(made.path)
     with pytest.raises(NotConvergedError, match="not converged"):

@@ -31,6 +31,7 @@ COMMANDS = {
     "track": ("--frequency", "2", "--draws", "5"),
     "design": ("--parameter", "d"),
     "export": (),
+    "predict": ("--signal", "step50", "--from-rest"),
 }
 IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
     "compensate": lambda fit, _: fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
@@ -72,15 +73,17 @@ def test_each_command_says_it_first_and_ends_with_its_status(
     name: str, judged: Path, holds: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    arguments = [name, str(judged), *COMMANDS[name], "--out", str(out)]
+    where = out / "bands.csv" if name == "predict" else out
+    arguments = [name, str(judged), *COMMANDS[name], "--out", str(where)]
     assert cli.main(arguments, standalone_mode=False) == STATUS[holds]
     said = capsys.readouterr()
-    # Design shows its table on the screen, and the verdict above it.
-    first = (said.out if name == "design" else said.err).partition("\n")[0]
+    # Two of them show a table on the screen, and the verdict above it.
+    first = (said.out if name in {"design", "predict"} else said.err).partition("\n")[0]
     assert first.startswith(f"{HEADLINE[holds]}: held-out")
     assert OFF in first
     (numbers,) = out.glob("*.json")
-    known = json.loads(numbers.read_text())["validation"]
+    key = "run_validation" if name == "predict" else "validation"
+    known = json.loads(numbers.read_text())[key]
     assert known["status"] == ("inconclusive" if holds is None else "failed")
     assert [OFF in line for line in known["verdicts"]] == [True]
     for page in out.glob("*.html"):
@@ -92,7 +95,7 @@ def test_each_command_says_it_first_and_ends_with_its_status(
     for code in out.glob("*.c"):
         comment = re.sub(r"\s*\n \* ", " ", code.read_text().partition("*/")[0])
         assert OFF in comment
-    assert name == "export" or any(out.glob("*.html"))
+    assert name in {"export", "predict"} or any(out.glob("*.html"))
 
 
 @pytest.fixture(scope="module")

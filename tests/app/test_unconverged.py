@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bwbayes.app.commands import cli
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
-from bwbayes.app.jobs.predict import predict
 from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
@@ -19,7 +19,6 @@ from bwbayes.app.running.run import carry_on
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.prediction import Start
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.ensemble import Block, EnsembleState
 from bwbayes.sampling.storage import ChainFile
@@ -73,12 +72,34 @@ def test_line_on_the_screen_says_what_to_do(
     assert f"`bwbayes resume {tmp_path / 'a'} --steps 50`" in printed.err
 
 
-def test_prediction_from_it_is_refused(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:
-    made, _ = cut_short
-    out = tmp_path / "bands.csv"
-    start = Start(from_rest=True)
-    assert 4 == predict(made.path, None, "step10", start, out, small.quiet())
-    assert not out.exists()
+@pytest.mark.parametrize(
+    "command",
+    [
+        "predict RUN --signal step10 --from-rest",
+        "compensate RUN sine --amplitude 20 --frequency 1",
+        "design RUN --parameter d",
+        "export RUN",
+        "track RUN",
+    ],
+)
+def test_whatever_builds_on_it_is_refused_with_its_status(
+    cut_short: tuple[RunFolder, int],
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = command.replace("RUN", str(cut_short[0].path)).split()
+    monkeypatch.setattr("sys.argv", ["bwbayes", *words, "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 4
+    said = capsys.readouterr()
+    assert "" == said.out
+    assert said.err.startswith("NOT CONVERGED: ")
+    assert "`bwbayes resume " in said.err
+    assert 1 == said.err.count("\n")
+    assert not any(tmp_path.iterdir())
 
 
 def test_larger_budget_converges_to_what_it_would_have_been(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.jobs.at_work import Drawn
+from bwbayes.app.jobs.at_work import RunDraws
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
@@ -123,8 +123,8 @@ def test_truths_are_where_a_command_for_a_dac_says(measured: Problem, asked: Ref
 def test_a_model_is_exported_for_a_dac(measured: Problem, tmp_path: Path) -> None:
     """Whatever the voltage did in the record, unless it is said."""
     flat = about(measured, 0.001, 3, np.random.default_rng(1))
-    held, _ = export_draws(Drawn(measured, flat), tmp_path / "held")
-    straight, _ = export_draws(Drawn(measured, flat), tmp_path / "straight", hold="foh")
+    held, _ = export_draws(RunDraws(measured, flat), tmp_path / "held")
+    straight, _ = export_draws(RunDraws(measured, flat), tmp_path / "straight", hold="foh")
     assert ["zero", "first"] == [one.model.actuator.hold for one in (held, straight)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.jobs.at_work import Drawn, command_limits
+from bwbayes.app.jobs.at_work import RunDraws, command_limits
 from bwbayes.app.jobs.export import export_draws
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
@@ -64,7 +64,7 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     same = made(of, at_zero, asked, from_rest=True)
     np.testing.assert_allclose(same.voltage, command, atol=1e-9)
 
-    model, _ = export_draws(Drawn(of, flat), tmp_path, voltage=(-100.0, 100.0))
+    model, _ = export_draws(RunDraws(of, flat), tmp_path, voltage=(-100.0, 100.0))
     state, stepped = model.model.begin(np.zeros(1)), []
     reference = np.asarray(asked.displacement)[1:]
     for target in reference:

@@ -172,7 +172,8 @@ def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> Non
     rows = [f"{v!r},{d!r}" for v, d in zip(VOLTAGE.tolist(), DISPLACEMENT.tolist(), strict=True)]
     path.write_text("\n".join(["voltage_V,displacement_um", *rows]) + "\n")
     with pytest.raises(
-        InputError, match=r"which is the sampling rate, Hz, as there is no time\?.*; say fs=1000"
+        InputError,
+        match=r"what is the sampling rate, Hz \(no column can be the time\)\?.*; say fs=1000",
     ):
         read_record(path)
     assert_same(read_record(path, fs=100.0))
@@ -385,7 +386,7 @@ def test_no_column_that_does_not_rise_is_guessed_to_be_the_time(tmp_path: Path) 
     text = "\n".join(["u_V,x_um,temperature_degC", *(f"{u},{x},{t}" for u, x, t in rows), ""])
     path = tmp_path / "a.csv"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ColumnsError, match="which is the sampling rate") as caught:
+    with pytest.raises(ColumnsError, match="what is the sampling rate") as caught:
         read_record(path)
     assert {"columns": {}, "units": {}} == caught.value.guess
     assert caught.value.fs is not None

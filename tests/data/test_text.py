@@ -356,7 +356,7 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
     (
         "column missing",
         "\n".join(line.partition(",")[2] for line in LINES),
-        "record.csv:1: which is the sampling rate, Hz, as there is no time? There are",
+        "record.csv:1: what is the sampling rate, Hz (no column can be the time)? There",
     ),
     ("empty file", "", "record.csv: the file is empty"),
     ("blank file", " \n\n", "record.csv: the file is empty"),

@@ -179,7 +179,7 @@ def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     assert verdict.cause is None
 
 
-def test_an_offset_that_may_have_had_bad_luck_is_named_with_a_lead_in_that_suffices() -> None:
+def test_an_offset_that_may_have_had_bad_luck_is_named_with_a_longer_lead_in() -> None:
     """Three of its sds off: one lead-in in 400. Of a record that is short it is not the reason."""
     record = made(np.random.default_rng(4), 60, memory=0.1, discrepancy=0.3, parameters=0.02)
     wide = {kind: np.sqrt(sd**2 + 1) for kind, sd in record.sds.items()}
@@ -189,7 +189,7 @@ def test_an_offset_that_may_have_had_bad_luck_is_named_with_a_lead_in_that_suffi
     assert verdict is not None
     assert verdict.holds is None
     assert "the offset, estimated from a lead-in of 1 s, makes 8" in verdict.reasons[0]
-    assert "lead_in = 5.6 would suffice" in verdict.reasons[0]
+    assert "use lead_in = 5.6 for 15%" in verdict.reasons[0]
     few = bands_of(made(np.random.default_rng(1), length=3, memory=1.0))
     short = assess(replace(few, lead_in=lead, common_sd=1.0), Background(1.0, 0.0, FITTED))
     assert short is not None

@@ -28,11 +28,11 @@ from bwbayes.app.commands.predict import predict
 from bwbayes.app.commands.reference import config, models
 from bwbayes.app.commands.report import report
 from bwbayes.app.commands.run import resume, run
-from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED
+from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED, NOT_CONVERGED
 from bwbayes.app.commands.simulate import simulate
 from bwbayes.app.commands.track import track
 from bwbayes.app.commands.wording import as_typed
-from bwbayes.errors import ColumnsError, InputError
+from bwbayes.errors import ColumnsError, InputError, NotConvergedError
 
 __all__ = ["main"]
 
@@ -84,6 +84,9 @@ def main() -> None:
     warnings.formatwarning = _one_line
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
+    except NotConvergedError as error:
+        click.echo(f"NOT CONVERGED: {as_typed(str(error))}", err=True)
+        status = NOT_CONVERGED
     except InputError as error:
         line = error.in_config() if isinstance(error, ColumnsError) else error
         click.echo(f"bwbayes: {as_typed(str(line))}", err=True)

@@ -9,7 +9,6 @@ from rich.console import Console
 
 from bwbayes.app.commands.shared import (
     FILE,
-    NOT_CONVERGED,
     capacitance_option,
     conclude,
     current_option,
@@ -17,7 +16,6 @@ from bwbayes.app.commands.shared import (
     slew_option,
     voltage_option,
 )
-from bwbayes.errors import NotConvergedError
 
 __all__ = ["design"]
 
@@ -60,22 +58,18 @@ def design(
     from bwbayes.app.jobs.design import design as rank
     from bwbayes.app.running.folder import RunFolder
 
-    try:
-        rank(
-            folder,
-            out or folder / "design",
-            Console(),
-            candidates=candidates,
-            parameter=parameter,
-            drive=drive,
-            voltage=voltage,
-            slew=slew,
-            current=current,
-            capacitance=capacitance,
-            overwrite=overwrite,
-        )
-    except NotConvergedError as error:
-        click.echo(f"NOT CONVERGED: {error}", err=True)
-        return NOT_CONVERGED
+    rank(
+        folder,
+        out or folder / "design",
+        Console(),
+        candidates=candidates,
+        parameter=parameter,
+        drive=drive,
+        voltage=voltage,
+        slew=slew,
+        current=current,
+        capacitance=capacitance,
+        overwrite=overwrite,
+    )
     # The screen begins with it.
     return conclude(RunFolder.open(folder).standing(), say=False)

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BAD_INPUT",
-    "DOES_NOT_HOLD",
     "FILE",
-    "INCONCLUSIVE",
     "INTERRUPTED",
     "NOT_CONVERGED",
     "NamingOptions",
@@ -43,9 +41,7 @@ __all__ = [
 ]
 
 BAD_INPUT = 2
-DOES_NOT_HOLD = 3
 NOT_CONVERGED = 4
-INCONCLUSIVE = 5
 INTERRUPTED = 130
 
 
@@ -214,4 +210,4 @@ def conclude(standing: Standing, *, say: bool = True) -> int:
     """Say that the bands of a run do not hold, or that nobody knows; return the exit status."""
     for line in standing.said if say else ():
         click.echo(line, err=True)
-    return {True: 0, False: DOES_NOT_HOLD, None: INCONCLUSIVE}[standing.holds]
+    return standing.exit_status

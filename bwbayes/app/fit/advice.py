@@ -8,7 +8,7 @@ from typing import Any
 from bwbayes.app.fit.compared import Compared, Finished, compared, named
 from bwbayes.app.fit.options import options_of
 from bwbayes.app.fit.surroundings import warn
-from bwbayes.app.jobs.at_work import Drawn
+from bwbayes.app.jobs.at_work import RunDraws
 from bwbayes.app.jobs.compensate import Compensated, compensate_draws
 from bwbayes.app.jobs.design import design_draws
 from bwbayes.app.jobs.export import export_draws
@@ -151,10 +151,10 @@ def require_converged(fit: Finished) -> None:
         )
 
 
-def _drawn(fit: Finished) -> Drawn:
+def _drawn(fit: Finished) -> RunDraws:
     """Return what a fit that has converged gives; warn if its validation did not pass."""
     require_converged(fit)
     posterior, standing = fit.problem.posterior, fit.result.standing
     warn(standing.said, 5)
     flat = draws(posterior, fit.chain).reshape(-1, len(posterior.names))
-    return Drawn(fit.problem, flat, standing)
+    return RunDraws(fit.problem, flat, standing)

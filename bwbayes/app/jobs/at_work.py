@@ -16,10 +16,10 @@ from bwbayes.model.operator import Span
 from bwbayes.results.standing import Standing
 from bwbayes.sampling.sampler import draws
 
-__all__ = ["Drawn", "command_limits", "drawn", "limits_of", "refuse_existing"]
+__all__ = ["RunDraws", "command_limits", "drawn", "limits_of", "refuse_existing"]
 
 
-class Drawn(NamedTuple):
+class RunDraws(NamedTuple):
     """What a run that has converged gives to whatever builds on it.
 
     ``problem`` is what was fitted; ``flat`` its draws, (draws, free), parameters in their own
@@ -31,7 +31,7 @@ class Drawn(NamedTuple):
     standing: Standing = Standing()
 
 
-def drawn(path: Path) -> Drawn:
+def drawn(path: Path) -> RunDraws:
     """Return what the run in a folder gives.
 
     Raises
@@ -45,10 +45,10 @@ def drawn(path: Path) -> Drawn:
     problem, chain, outcome = finished(folder)
     if not outcome.converged:
         raise NotConvergedError(
-            f"{path}: not converged: {outcome.stop_reason}; go on with `{going_on(path, problem)}`"
+            f"{path}: {outcome.stop_reason}; go on with `{going_on(path, problem)}`"
         )
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
-    return Drawn(problem, flat, folder.standing())
+    return RunDraws(problem, flat, folder.standing())
 
 
 def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:

@@ -16,7 +16,7 @@ import numpy as np
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.compensation import draw_compensation, draw_compensations
-from bwbayes.app.jobs.at_work import Drawn, command_limits, refuse_existing
+from bwbayes.app.jobs.at_work import RunDraws, command_limits, refuse_existing
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.compensation_report import render
 from bwbayes.control.compensation import compensate
@@ -99,7 +99,7 @@ class Compensated(Compensation):
 
 
 def compensate_draws(
-    run: Drawn,
+    run: RunDraws,
     reference: Any,
     *,
     command: Choice = "mean",

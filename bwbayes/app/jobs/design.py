@@ -23,7 +23,7 @@ from bwbayes.app.config.config import SignalConfig
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.design import draw_design
-from bwbayes.app.jobs.at_work import Drawn, drawn, limits_of, refuse_existing
+from bwbayes.app.jobs.at_work import RunDraws, drawn, limits_of, refuse_existing
 from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.app.report.design_report import render
 from bwbayes.app.screen import show_standing
@@ -161,7 +161,7 @@ def write(asked: Asked, made: Sequence[Promise], out: Path) -> None:
 
 
 def design_draws(
-    run: Drawn,
+    run: RunDraws,
     target: str | ArrayLike,
     *,
     candidates: Mapping[str, ArrayLike] | None = None,
@@ -199,7 +199,7 @@ def design_draws(
 
 
 def promised(
-    run: Drawn,
+    run: RunDraws,
     signals: Mapping[str, FloatArray],
     target: str | FloatArray,
     amplifier: Limits,

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.jobs.at_work import Drawn, command_limits, drawn, refuse_existing
+from bwbayes.app.jobs.at_work import RunDraws, command_limits, drawn, refuse_existing
 from bwbayes.control.exported import Exported, exported
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -34,7 +34,7 @@ def export(path: Path, out: Path | None = None, **options: Any) -> tuple[Exporte
 
 
 def export_draws(
-    run: Drawn,
+    run: RunDraws,
     folder: Path,
     *,
     voltage: tuple[float, float] | None = None,

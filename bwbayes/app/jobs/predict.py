@@ -14,6 +14,7 @@ import click
 from rich.console import Console
 
 from bwbayes.app.figures import save_one
+from bwbayes.app.jobs.at_work import drawn
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import (
@@ -21,7 +22,6 @@ from bwbayes.app.running.predictions import (
     predict_another,
     training_record,
 )
-from bwbayes.app.running.run import finished
 from bwbayes.app.screen import show_scores, show_standing
 from bwbayes.data import Record, read_record
 from bwbayes.data.io.columns import Naming
@@ -30,13 +30,8 @@ from bwbayes.errors import ColumnsError, InputError
 from bwbayes.results.outputs import write_bands, write_summary
 from bwbayes.results.prediction import Start
 from bwbayes.results.standing import Standing
-from bwbayes.sampling.sampler import draws
 
-__all__ = ["DOES_NOT_HOLD", "predict"]
-
-DOES_NOT_HOLD = 3
-NOT_CONVERGED = 4
-INCONCLUSIVE = 5
+__all__ = ["predict"]
 
 
 def predict(
@@ -58,6 +53,8 @@ def predict(
 
     Raises
     ------
+    NotConvergedError
+        The sampling has not converged.
     InputError
         No such run, a record that cannot be used, or a file that exists already.
     """
@@ -70,28 +67,23 @@ def predict(
     for target in (table, numbers, picture):
         if target.exists() and not overwrite:
             raise InputError(f"{target}: exists; choose another name, or give `overwrite=True`")
-    problem, chain, outcome = finished(folder)
-    if not outcome.converged:
-        click.echo(
-            f"NOT CONVERGED: {path} gives no interval; go on with `bwbayes resume {path}`", err=True
-        )
-        return NOT_CONVERGED
+    problem, flat, standing = drawn(path)
     of = training_record(problem, of)
     other = _record(problem, of, path, record, naming or Naming(), waveform)
-    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     if record is None and start.after:
         bands = predict_after(problem, flat, other.voltage, name, of)
     else:
         bands = predict_another(problem, flat, other, start, name, window, of)
     scores, verdict = bands.scores, bands.verdict
-    standing = Standing.of([verdict] if verdict else [])
-    show_standing(standing, console)
+    own = Standing.of([verdict] if verdict else [])
+    for each in (standing, own):
+        show_standing(each, console)
     for remark in bands.remarks:
         click.echo(f"bwbayes: {name}: {remark}", err=True)
     try:
         table.parent.mkdir(parents=True, exist_ok=True)
         write_bands(table, [bands])
-        write_summary(numbers, bands.numbers())
+        write_summary(numbers, bands.numbers() | {"run_validation": standing.numbers})
         save_one(bands.plot(), picture)
     except OSError as error:
         raise InputError(f"{table}: {error.strerror}; choose another place") from None
@@ -99,7 +91,8 @@ def predict(
         show_scores({name: scores}, console, {name: verdict})
     for target in (table, numbers, picture):
         console.print(f"wrote {target}", highlight=False, soft_wrap=True)
-    return {True: 0, False: DOES_NOT_HOLD, None: INCONCLUSIVE}[standing.holds]
+    # The worse of the two.
+    return (own if own.holds is False or standing.holds else standing).exit_status
 
 
 def _record(

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bwbayes.app.figures import save_one
 from bwbayes.app.figures.tracking import draw_tracking
-from bwbayes.app.jobs.at_work import Drawn, command_limits, drawn, refuse_existing
+from bwbayes.app.jobs.at_work import RunDraws, command_limits, drawn, refuse_existing
 from bwbayes.app.jobs.export import at_rate
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.track_report import render
@@ -86,7 +86,7 @@ class Setup:
         return Robustness(self.gain_margin, self.phase_margin)
 
 
-def track_draws(run: Drawn, setup: Setup) -> Tracking:
+def track_draws(run: RunDraws, setup: Setup) -> Tracking:
     """Follow the paper's signals with the draws of a run for actuators.
 
     Raises

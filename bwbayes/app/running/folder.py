@@ -66,7 +66,7 @@ class RunFolder:
             The run is not finished.
         """
         if not self.summary.is_file():
-            raise InputError(f"{self.path}: is not finished; resume it: `{self.GO_ON} {self.path}`")
+            raise InputError(f"{self.path}: is not finished; resume it: {self.resuming}")
         return Standing.read(json.loads(self.summary.read_text(encoding="utf-8")))
 
     @classmethod

@@ -303,7 +303,7 @@ def _open(
             f"which unit has {', which '.join(f'{chosen[q].name!r} ({q})' for q in unknown)}"
         )
     if timeless:
-        questions.append("which is the sampling rate, Hz, as there is no time")
+        questions.append("what is the sampling rate, Hz (no column can be the time)")
     problem = f"{where}: {', and '.join(questions)}? {there}"
     return ColumnsError(problem, guess_columns, guess_units, fs=_COMMON_FS if timeless else None)
 
