@@ -22,7 +22,7 @@ from tests.measured import keep, measured
 from tests.results.runs import Judged, Stand, covered, judge, problem_of
 
 RATE = 100.0
-GOOD, SPOILT = 200, 25
+GOOD, SPOILT = 400, 50
 
 # A record that holds is right where its 95 % band covers this much of it; a fit, where d and gamma
 # are so few sds from the truth.
@@ -225,7 +225,7 @@ def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
 
 @pytest.mark.slow
 def test_good_runs_hold(tmp_path: Path) -> None:
-    """At most 1 % of the verdicts of 200 good runs, three each, say no."""
+    """At most 1 % of the verdicts of 400 good runs, three each, say no."""
     counts, lines = good_runs(20261125, GOOD, tmp_path)
     keep("good runs hold", {"runs": GOOD, **counts, "said no": lines})
     assert len(lines) <= 0.01 * 3 * GOOD
@@ -234,7 +234,7 @@ def test_good_runs_hold(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT_KINDS)
 def test_no_spoilt_run_holds(tmp_path: Path, kind: str) -> None:
-    """Of 25 of each kind none is missed; the cause is right in nine of ten of those seen."""
+    """Of 50 of each kind none is missed; the cause is right in nine of ten of those seen."""
     counts = spoilt_runs(kind, 20261126, SPOILT, tmp_path)
     every = measured().get("spoilt runs do not hold", {})
     keep("spoilt runs do not hold", every | {kind: dict(counts)})
