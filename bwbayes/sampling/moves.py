@@ -15,11 +15,18 @@ from __future__ import annotations
 import numpy as np
 from emcee import moves
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.nearby import Nearby
 from bwbayes.sampling.proposals import Proposal, StudentMixture
 
-__all__ = ["MOVES", "SnookerMove", "pilot_moves", "sampling_moves", "spreading_moves"]
+__all__ = [
+    "MOVES",
+    "AmongPlaces",
+    "SnookerMove",
+    "pilot_moves",
+    "sampling_moves",
+    "spreading_moves",
+]
 
 # Names of the moves, in the order in which the functions below return them.
 MOVES = ("differential evolution", "snooker", "mixture", "nearby")
@@ -62,27 +69,66 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
         return z + proposed * direction, factor[:, 0]
 
 
-def pilot_moves(proposal: Proposal | None = None) -> Weighted:
+class AmongPlaces(moves.MHMove):  # type: ignore[misc]  # emcee has no types
+    """A step to one of several places that a proposal q proposes independently of the walker.
+
+    With w = π/q, places x₁ … xₙ drawn from q, and the walker at x₀, one of them is chosen with the
+    probability wᵢ / (w₁ + … + wₙ), and taken with
+
+        min(1, (w₁ + … + wₙ) / (w₀ + … + wₙ − wᵢ)),
+
+    after Liu (1996), Biometrika 83, 681-682. A walker where q is too small by a factor leaves n
+    times as soon. One place is a Metropolis step, as ``emcee.moves.MHMove`` makes it.
+    """
+
+    def __init__(self, proposal: Proposal, places: int = 1) -> None:
+        super().__init__(proposal)
+        self.places = places
+
+    def choose(
+        self, here: FloatArray, weight: FloatArray, chance: FloatArray
+    ) -> tuple[IntArray, BoolArray, FloatArray]:
+        """Choose for each walker, at log w₀ (walkers,), one of log wᵢ (places, walkers).
+
+        Return which, whether it is taken, and its log weight, each (walkers,). One number from 0 to
+        1 does both: it falls into the part of the range that belongs to a place, and where in that
+        part it falls is again such a number.
+        """
+        rows = np.arange(here.size)
+        if len(weight) == 1:  # to the last bit as emcee
+            return np.zeros_like(rows), np.log(chance) < weight[0] - here, weight[0]
+        largest = np.maximum(np.max(weight, axis=0), here)
+        parts = np.exp(weight - largest)
+        ends = np.cumsum(parts, axis=0)
+        point = chance * ends[-1]
+        one = np.minimum(np.sum(point >= ends, axis=0), len(weight) - 1)
+        own, chosen = parts[one, rows], weight[one, rows]
+        others = ends[-1] - own + np.exp(here - largest)
+        taken = (point - (ends[one, rows] - own)) * others < own * ends[-1]
+        return one, taken, chosen
+
+
+def pilot_moves(proposal: Proposal | None = None, places: int = 1) -> Weighted:
     """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
     if proposal is None:
         return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
-    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (moves.MHMove(proposal), 0.5)]
+    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (AmongPlaces(proposal, places), 0.5)]
 
 
-def sampling_moves(proposal: Proposal | None) -> Weighted:
+def sampling_moves(proposal: Proposal | None, places: int = 1) -> Weighted:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()
-    return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (moves.MHMove(proposal), 0.85)]
+    return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (AmongPlaces(proposal, places), 0.85)]
 
 
-def spreading_moves(proposal: StudentMixture | None) -> Weighted:
+def spreading_moves(proposal: StudentMixture | None, places: int = 1) -> Weighted:
     """Return moves and weights for tuning with a poor fit; as the pilot's without a proposal."""
     if proposal is None:
         return pilot_moves()
     return [
         (moves.DEMove(), 0.12),
         (SnookerMove(), 0.03),
-        (moves.MHMove(proposal), 0.35),
+        (AmongPlaces(proposal, places), 0.35),
         (moves.MHMove(Nearby(proposal)), 0.5),
     ]

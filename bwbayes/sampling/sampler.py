@@ -54,6 +54,7 @@ __all__ = [
     "Outcome",
     "SamplingPlan",
     "Watcher",
+    "best_places",
     "best_together",
     "draws",
     "first_chain",
@@ -90,6 +91,9 @@ FIRST_PART = 0.5
 LIGHT = 1 << 16
 MEDIUM = 1 << 18
 
+# Walkers times samples up to which a step may choose from several places.
+CHEAP = 1 << 14
+
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
 
@@ -119,6 +123,8 @@ class SamplingPlan:
     together
         Ensembles that are moved with one call of the density. A property of what is sampled, not
         of who computes it: on the compiled engine the last bits of densities may depend on it.
+    places
+        Places that a step of the mixture has to choose from.
     """
 
     ess: float = 2000.0
@@ -129,6 +135,7 @@ class SamplingPlan:
     least_pilot_steps: int = 50
     most_pilot_steps: int = 3_000
     together: int = 1
+    places: int = 1
 
     def __post_init__(self) -> None:
         if self.ensembles < 4:
@@ -157,6 +164,14 @@ def best_together(ensembles: int, walkers: int, samples: int) -> int:
     """
     size = walkers * samples
     return ensembles if size <= LIGHT else ensembles // 2 if size <= MEDIUM else 1
+
+
+def best_places(walkers: int, samples: int) -> int:
+    """Return how many places a step of the mixture has to choose from, on so many samples.
+
+    As many as cost no more than one on a longer record, which tells more of its parameters.
+    """
+    return max(1, CHEAP // (walkers * samples))
 
 
 def first_chain(
@@ -332,7 +347,7 @@ def _extend(
     futures = []
     for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
         # Moves of its own for each: some of emcee's write to themselves.
-        moves = [make(proposal) for _ in group]
+        moves = [make(proposal, plan.places) for _ in group]
         futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
     blocks: list[Block] = []
     for future in futures:

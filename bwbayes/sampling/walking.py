@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
+from bwbayes.sampling.moves import AmongPlaces
 from bwbayes.sampling.proposals import Proposal
 
 __all__ = ["Steps", "Walk", "walk"]
@@ -87,7 +88,7 @@ def walk(
         elif not isinstance(move, MHMove):
             raise InputError(f"moves: {type(move).__name__} is neither a RedBlueMove nor an MHMove")
         elif isinstance(move.get_proposal, Proposal):
-            yield from _independent_steps(move.get_proposal, kind, chosen, place, density, made)
+            yield from _independent_steps(move, kind, chosen, place, density, made)
         else:
             proposed, factor = move.get_proposal(place, random)
             offered = yield proposed
@@ -146,31 +147,29 @@ def _split_step(
 
 
 def _independent_steps(
-    proposal: Proposal,
-    kind: int,
-    chosen: _Choice,
-    place: FloatArray,
-    density: FloatArray,
-    made: Steps,
+    move: MHMove, kind: int, chosen: _Choice, place: FloatArray, density: FloatArray, made: Steps
 ) -> _Step:
     """Make a step of an independence proposal, and all further ones that follow at once."""
-    walkers, random = len(place), chosen.random
-    proposed, chances = [place.copy()], []
+    (walkers, free), random, proposal = place.shape, chosen.random, move.get_proposal
+    among = move if isinstance(move, AmongPlaces) else AmongPlaces(proposal)
+    proposed, chances = [], []
     while True:
-        proposed.append(proposal.draw(random, walkers))
+        proposed.append(proposal.draw(random, among.places * walkers))
         chances.append(random.rand(walkers))
         if made.done + len(chances) == len(made.coordinates) or not chosen.is_next(kind):
             break
-    every = np.stack(proposed)
-    weight = proposal.log_density(every)
-    offered = yield every[1:].reshape(-1, every.shape[2])
-    offered = offered.reshape(-1, walkers)
-    logs, here = np.log(chances), weight[0].copy()
-    for step, chance in enumerate(logs):
-        # As emcee adds them up, so that these are its very bits.
-        accepted = chance < offered[step] - density + (here - weight[step + 1])
-        _go(place, density, accepted, every[step + 1], offered[step])
-        np.copyto(here, weight[step + 1], where=accepted)
+    every = np.concatenate([place, *proposed])
+    weight = -proposal.log_density(every)
+    offered = yield every[walkers:]
+    here = density + weight[:walkers]
+    weight = (offered + weight[walkers:]).reshape(-1, among.places, walkers)
+    offered = offered.reshape(weight.shape)
+    every = every[walkers:].reshape(*weight.shape, free)
+    rows = np.arange(walkers)
+    for step, chance in enumerate(chances):
+        one, accepted, taken = among.choose(here, weight[step], chance)
+        _go(place, density, accepted, every[step, one, rows], offered[step, one, rows])
+        np.copyto(here, taken, where=accepted)
         made.add(kind, place, density, accepted)
 
 

@@ -16,12 +16,15 @@ import emcee
 import numpy as np
 import pytest
 from emcee.moves import DEMove, MHMove, Move
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import (
     MOVES,
+    AmongPlaces,
     SnookerMove,
     pilot_moves,
     sampling_moves,
@@ -152,6 +155,45 @@ def test_twin_a_wrong_ratio_of_the_mixture_is_found_among_the_other_moves(name: 
 
 
 @pytest.mark.parametrize("name", TARGETS)
+def test_steps_to_one_of_several_places_leave_the_right_distribution(name: str) -> None:
+    moves = [(AmongPlaces(TARGETS[name].proposal, 5), 1.0)]
+    assert worst_score(TARGETS[name], moves, steps=60) < ALARM
+
+
+class Eager(AmongPlaces):
+    """Takes the place it has chosen, whatever place it leaves."""
+
+    def choose(
+        self, here: FloatArray, weight: FloatArray, chance: FloatArray
+    ) -> tuple[IntArray, BoolArray, FloatArray]:
+        """Choose as the move does, and always take."""
+        one, taken, chosen = super().choose(here, weight, chance)
+        return one, np.ones_like(taken), chosen
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_twin_steps_that_take_every_chosen_place_are_found(name: str) -> None:
+    """The best of two places is no draw of the target."""
+    moves = [(Eager(TARGETS[name].proposal, 2), 1.0)]
+    assert worst_score(TARGETS[name], moves, steps=60) > ALARM
+
+
+@given(st.lists(st.floats(-30, 30), min_size=2, max_size=6))
+def test_a_step_to_one_of_several_places_and_its_way_back_are_in_balance(logs: list[float]) -> None:
+    """With the other places given, w₀ P(0 → 1) = w₁ P(1 → 0), by a fine grid of chances."""
+    grid = (np.arange(100_000) + 0.5) / 100_000
+    move = AmongPlaces(TARGETS["banana"].proposal, len(logs) - 1)
+    flows = []
+    for first, second in ((0, 1), (1, 0)):
+        here = np.full(grid.size, logs[first])
+        weight = np.repeat(np.array([[logs[second], *logs[2:]]]).T, grid.size, axis=1)
+        one, taken, chosen = move.choose(here, weight, grid)
+        assert (chosen == weight[one, np.arange(grid.size)]).all()
+        flows.append(np.exp(logs[first] - max(logs)) * np.mean(taken & (one == 0)))
+    assert flows[0] == pytest.approx(flows[1], abs=5e-5)
+
+
+@pytest.mark.parametrize("name", TARGETS)
 def test_nearby_steps_leave_the_right_distribution(name: str) -> None:
     assert worst_score(TARGETS[name], [(MHMove(Nearby(fitted(name))), 1.0)], steps=60) < ALARM
 
@@ -244,7 +286,7 @@ def test_a_seventh_of_the_steps_stays_differential_evolution_and_snooker() -> No
     weights = {type(move).__name__: weight for move, weight in sampling_moves(proposal)}
     assert 1.0 == pytest.approx(sum(weights.values()))
     assert 0.15 == pytest.approx(weights["DEMove"] + weights["SnookerMove"])
-    assert {"MHMove", "DEMove", "SnookerMove"} == set(weights)
+    assert {"AmongPlaces", "DEMove", "SnookerMove"} == set(weights)
 
 
 def test_without_a_proposal_the_pilots_moves_go_on() -> None:
@@ -256,7 +298,7 @@ def test_without_a_proposal_the_pilots_moves_go_on() -> None:
 def test_half_of_the_pilots_steps_try_places_of_the_point_fits_guess() -> None:
     proposal = TARGETS["banana"].proposal
     weights = {type(move).__name__: weight for move, weight in pilot_moves(proposal)}
-    assert {"MHMove": 0.5, "DEMove": 0.4, "SnookerMove": 0.1} == weights
+    assert {"AmongPlaces": 0.5, "DEMove": 0.4, "SnookerMove": 0.1} == weights
 
 
 @pytest.mark.parametrize(
@@ -268,6 +310,8 @@ def test_half_of_the_pilots_steps_try_places_of_the_point_fits_guess() -> None:
     ],
 )
 def test_moves_come_in_the_order_of_their_names(moves: Callable[[], Moves]) -> None:
-    kinds = {"differential evolution": DEMove, "snooker": SnookerMove}
-    for name, (move, _) in zip(MOVES, moves(), strict=False):
-        assert kinds.get(name, MHMove) is type(move)
+    kinds = (DEMove, SnookerMove, AmongPlaces, MHMove)
+    for kind, (move, _) in zip(
+        dict(zip(MOVES, kinds, strict=True)).values(), moves(), strict=False
+    ):
+        assert kind is type(move)

@@ -52,7 +52,7 @@ from bwbayes.inference.table import JointTable
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import Extrapolation, beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan, best_together
+from bwbayes.sampling.sampler import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
@@ -306,6 +306,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         most_steps=given.steps,
         most_pilot_steps=given.pilot_steps,
         together=best_together(given.ensembles, walkers, samples),
+        places=best_places(walkers, samples),
     )
 
 
