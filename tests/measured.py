@@ -23,6 +23,7 @@ def measured() -> dict[str, Any]:
 
 
 def keep(promise: str, figures: Mapping[str, Any]) -> None:
-    """Store the figures of a promise in place of older ones."""
-    every = (measured() if PATH.is_file() else {}) | {promise: figures}
-    PATH.write_text(json.dumps(every, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    """Store the figures of a promise in place of older ones; a line for each promise."""
+    every = sorted((measured() | {promise: figures}).items())
+    lines = (f"{json.dumps(name)}: {json.dumps(one, sort_keys=True)}" for name, one in every)
+    PATH.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

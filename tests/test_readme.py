@@ -389,11 +389,6 @@ def long_fit() -> str:
     return f"{gib:.2f} GiB at most, of a new process with all that it loads"
 
 
-def defects() -> str:
-    one = measured()["defects"]
-    return f"{one['planted']} planted, {one['caught']} caught"
-
-
 FINDINGS = [
     coverage,
     calibration,
@@ -419,7 +414,6 @@ FINDINGS = [
     specimens,
     populations,
     long_fit,
-    defects,
 ]
 
 
