@@ -1,7 +1,7 @@
 """The figures of the slow tests and benchmarks from when they last ran in full.
 
-They are kept in ``measured.json``, and the README's figures are compared with them, so that none is
-quoted from memory.
+They are kept in ``measured.json``, and the figures of ``README.md`` beside it are compared with
+them, so that none is quoted from memory.
 """
 
 from __future__ import annotations
