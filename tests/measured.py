@@ -9,7 +9,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
+
+from filelock import FileLock
 
 __all__ = ["keep", "measured"]
 
@@ -24,6 +27,8 @@ def measured() -> dict[str, Any]:
 
 def keep(promise: str, figures: Mapping[str, Any]) -> None:
     """Store the figures of a promise in place of older ones; a line for each promise."""
-    every = sorted((measured() | {promise: figures}).items())
-    lines = (f"{json.dumps(name)}: {json.dumps(one, sort_keys=True)}" for name, one in every)
-    PATH.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    # Studies may run side by side.
+    with FileLock(Path(gettempdir()) / "bwbayes-measured.lock"):
+        every = sorted((measured() | {promise: figures}).items())
+        lines = (f"{json.dumps(name)}: {json.dumps(one, sort_keys=True)}" for name, one in every)
+        PATH.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

@@ -40,6 +40,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import LIMIT, Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
+from tests.measured import keep
 from tests.together import LEVEL, Plant, narrowed, narrowed_a_tenth, shifted, together_test, widened
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
@@ -115,7 +116,19 @@ def test_twin_planted_defect_is_found(
 def test_five_hundred_replicates_find_small_defects(
     sound: list[Replicate], prior: JointPrior
 ) -> None:
-    assert judged(sound).power["20 % too small"] > 0.98
+    outcome = judged(sound)
+    keep(
+        "calibration",
+        {
+            "replicates": outcome.replicates,
+            "unconverged": len(outcome.unconverged),
+            "tests": len(outcome.statistics),
+            "shortcomings": len(outcome.shortcomings),
+            "power": round(outcome.power["20 % too small"], 3),
+            "bands": {name: round(band.mean, 4) for name, band in outcome.bands.items()},
+        },
+    )
+    assert outcome.power["20 % too small"] > 0.98
     assert together_test(sound, prior, narrowed_a_tenth) < LEVEL
 
 
