@@ -20,11 +20,6 @@ from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def copied(run: Path, tmp_path: Path) -> RunFolder:
     shutil.copytree(run, tmp_path / "small")
     return RunFolder(tmp_path / "small")

@@ -17,19 +17,8 @@ from bwbayes.app.commands.track import track as command
 from bwbayes.app.jobs.track import Setup, track_run
 from bwbayes.control.tracking import CONTROLLERS
 from bwbayes.errors import InputError
-from tests.app import small
 
 FEW = ("--frequency", "2", "--frequency", "5", "--draws", "5")
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def fit(run: Path) -> bw.Fit:
-    return bw.open_run(run)
 
 
 def test_numbers_table_and_picture_agree(
