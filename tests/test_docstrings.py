@@ -75,6 +75,7 @@ def test_what_a_docstring_refers_to_exists() -> None:
     assert [] == missing
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("pdoc") is None, reason="pdoc is not installed: pip install '.[docs]'"
 )
