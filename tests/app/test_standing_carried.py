@@ -45,7 +45,12 @@ def verdict(holds: bool | None) -> Verdict:
     return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
 
 
-@pytest.fixture(params=[False, None], ids=["failed", "inconclusive"])
+@pytest.fixture(
+    params=[
+        pytest.param(False, id="failed"),
+        pytest.param(None, id="inconclusive", marks=pytest.mark.slow),
+    ]
+)
 def holds(request: pytest.FixtureRequest) -> bool | None:
     answer: bool | None = request.param
     return answer

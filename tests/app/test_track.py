@@ -76,6 +76,7 @@ def test_options_that_make_no_sense_are_one_line(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_draws_that_are_simulated_are_some_of_those_that_must_be_stable(fit: bw.Fit) -> None:
     made = fit.track(frequencies=(5.0,), draws=4, rate=500.0, delay=2)
     assert (4, 4) == made.rms.shape[2:]
