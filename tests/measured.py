@@ -1,7 +1,7 @@
 """The figures of the slow tests and benchmarks from when they last ran in full.
 
-They are kept in ``measured.json``, and the README's figures are compared with them, so that none is
-quoted from memory.
+They are kept in ``measured.json``, and the figures of ``README.md`` beside it are compared with
+them, so that none is quoted from memory.
 """
 
 from __future__ import annotations
@@ -9,7 +9,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
+
+from filelock import FileLock
 
 __all__ = ["keep", "measured"]
 
@@ -23,6 +26,9 @@ def measured() -> dict[str, Any]:
 
 
 def keep(promise: str, figures: Mapping[str, Any]) -> None:
-    """Store the figures of a promise in place of older ones."""
-    every = (measured() if PATH.is_file() else {}) | {promise: figures}
-    PATH.write_text(json.dumps(every, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    """Store the figures of a promise in place of older ones; a line for each promise."""
+    # Studies may run side by side.
+    with FileLock(Path(gettempdir()) / "bwbayes-measured.lock"):
+        every = sorted((measured() | {promise: figures}).items())
+        lines = (f"{json.dumps(name)}: {json.dumps(one, sort_keys=True)}" for name, one in every)
+        PATH.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

@@ -11,16 +11,16 @@ Default priors are so wide that some truths have next to no hysteresis; their po
 and curved, and take more steps than the budget has. There a replicate ends, and is ranked as it is;
 at most one in ten may.
 
-The default suite makes 150 replicates with the lag, and with priors of someone who knows the kind
+The default suite makes 50 replicates with the lag, and with priors of someone who knows the kind
 of actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are
 tested together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a
 wrong width and a bias on the draws (sds a fifth too small, or a bias of 0.3 sd, are seen nearly
 always). Coverages of the 18 bands are held to the spread between replicates: by chance one in 100
-sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` keeps the figures
-of this, and makes 150 with default priors for all with the lag, the second order, and the lag with
-little noise; and 50, each of 6,000 steps at most, with a free exponent beside known hysteresis:
-four seconds of a record do not tell an exponent, a loop and its shape of which nothing is known,
-and each takes most of a minute.
+sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` makes 150 of this
+and keeps their figures, and 150 with default priors for all with the lag, the second order, and the
+lag with little noise; and 50, each of 6,000 steps at most, with a free exponent beside known
+hysteresis: four seconds of a record do not tell an exponent, a loop and its shape of which nothing
+is known, and each takes most of a minute.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ from tests.measured import keep
 from tests.together import LEVEL, Plant, narrowed, shifted, together_test
 
 SEED = 1
+
+# Replicates of the default suite.
+QUICK = 50
 
 # Part of the replicates that may end before they have converged.
 MOST_UNCONVERGED = 0.1
@@ -194,8 +197,7 @@ def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Experiment, list[Replicate]]:
-    count = VARIANTS["known hysteresis"].replicates
-    return made("known hysteresis", tmp_path_factory.mktemp("typical"), count)
+    return made("known hysteresis", tmp_path_factory.mktemp("typical"), QUICK)
 
 
 Sound = tuple[Experiment, list[Replicate]]

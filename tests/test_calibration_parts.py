@@ -4,17 +4,15 @@ As in :mod:`tests.test_calibration_moving`: default priors are resolved once, fr
 of a ring bender cut out of a running drive, and replicates draw their truth from them, with another
 record that starts in a state and a history of its own.
 
-The default suite makes 150 replicates of backlash-like hysteresis beside a gain, with priors of
-someone who knows the kind of actuator for the hysteresis; with Bouc-Wen in
-:mod:`tests.test_calibration_moving` these are three parts. The slow one does it with
-Prandtl-Ishlinskii too, whose memory is a stack of extrema. All parameters of a replicate are tested
-together (:mod:`tests.together`) at a level of 0.01. That raises a false alarm in one of 100; sds a
-fifth too small, or a bias of 0.3 sd, it finds nearly always, and twins plant both on the draws.
-Means of coverages are held to the spread between replicates (Bonferroni's bound: one false alarm in
-100 for each model).
+150 replicates are of backlash-like hysteresis beside a gain, and of Prandtl-Ishlinskii, whose
+memory is a stack of extrema, with priors of someone who knows the kind of actuator for the
+hysteresis. All parameters of a replicate are tested together (:mod:`tests.together`) at a level of
+0.01. That raises a false alarm in one of 100; sds a fifth too small, or a bias of 0.3 sd, it finds
+nearly always, and twins plant both on the draws. Means of coverages are held to the spread between
+replicates (Bonferroni's bound: one false alarm in 100 for each model).
 
-``-m slow`` makes 150 replicates of each part with default priors, and asks what a calibration asks;
-they may take twice as many steps, for posteriors from four seconds may be long and curved.
+150 replicates of each part have default priors, and are asked what a calibration asks; they may
+take twice as many steps, for posteriors from four seconds may be long and curved.
 """
 
 from __future__ import annotations
@@ -44,6 +42,8 @@ from tests.test_calibration_moving import (
 )
 from tests.together import LEVEL, Plant, narrowed, shifted, together_test
 
+pytestmark = pytest.mark.slow
+
 REPLICATES = 150
 
 PLAYS_KNOWN = """\
@@ -63,7 +63,6 @@ KNOWN = {
     "prandtl-ishlinskii": ('hysteresis = "prandtl-ishlinskii"\n', PLAYS_KNOWN),
     "backlash-like and gain": (f'hysteresis = "backlash-like"\n{GAIN}', BACKLASH_KNOWN),
 }
-QUICKEST = "backlash-like and gain"
 # Ten plays, or five shape terms, have 15 to 17 parameters, of which four seconds tell few.
 OPTIONS = {
     "plays": "thresholds = 4\n",
@@ -98,10 +97,7 @@ def made(common: Experiment, count: int) -> list[Replicate]:
 Sound = tuple[Experiment, list[Replicate]]
 
 
-@pytest.fixture(
-    scope="module",
-    params=[QUICKEST, *(pytest.param(n, marks=pytest.mark.slow) for n in KNOWN if n != QUICKEST)],
-)
+@pytest.fixture(scope="module", params=KNOWN)
 def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Sound:
     common = resolved(*KNOWN[request.param], tmp_path_factory.mktemp("typical"))
     return common, made(common, REPLICATES)
@@ -123,7 +119,6 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
     assert together_test(every, common.posterior.prior, defect) < LEVEL
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("part", EVERY)
 def test_every_part_is_calibrated(part: str, tmp_path: Path) -> None:
     common = resolved(EVERY[part], "", tmp_path, LONG_STEPS)

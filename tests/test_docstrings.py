@@ -33,15 +33,11 @@ SHOWN = {
 }
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_the_examples_of_a_module_do_what_they_say(name: str) -> None:
-    failed, _ = doctest.testmod(MODULES[name])
-    assert 0 == failed
-
-
-@pytest.mark.parametrize("name", sorted(SHOWN))
-def test_an_entry_point_has_an_example(name: str) -> None:
-    assert ">>> " in (inspect.getdoc(getattr(bwbayes, name)) or "")
+def test_examples_do_what_they_say_and_entry_points_have_one() -> None:
+    assert [] == [name for name, module in MODULES.items() if doctest.testmod(module).failed]
+    assert [] == [
+        name for name in SHOWN if ">>> " not in (inspect.getdoc(getattr(bwbayes, name)) or "")
+    ]
 
 
 def exists(module: ModuleType, target: str) -> bool:
@@ -69,13 +65,17 @@ def all_attributes(thing: object, names: list[str]) -> bool:
     return True
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_what_a_docstring_refers_to_exists(name: str) -> None:
-    source = inspect.getsource(MODULES[name])
-    targets = [full or short for full, short in ROLE.findall(source)]
-    assert [] == [target for target in targets if not exists(MODULES[name], target)]
+def test_what_a_docstring_refers_to_exists() -> None:
+    missing = [
+        (name, full or short)
+        for name, module in MODULES.items()
+        for full, short in ROLE.findall(inspect.getsource(module))
+        if not exists(module, full or short)
+    ]
+    assert [] == missing
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("pdoc") is None, reason="pdoc is not installed: pip install '.[docs]'"
 )

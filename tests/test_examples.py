@@ -2,7 +2,7 @@
 
 They are collected from these texts, so that a new one is run by itself. What the README does in
 Python is in ``test_readme.py``, docstrings are run by ``test_docstrings.py``, and the notebooks'
-cells by ``test_notebooks.py``.
+cells by ``test_notebooks.py``. Each command is run once; ``-m slow`` runs every line and config.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from bwbayes.app.commands import cli
+from bwbayes.app.config.config import load
+from bwbayes.app.problem.problem import resolve
 from tests.app import small
 from tests.examples import (
     LEAVES,
@@ -68,14 +70,26 @@ def test_every_line_is_run_somewhere() -> None:
     assert set(cli.cli.commands) == set(LEAVES)
 
 
-@pytest.mark.parametrize("line", PATTERNS)
-def test_a_pattern_is_one_that_the_command_takes(line: str) -> None:
-    _, name, *given = shlex.split(line)
-    assert cli.cli.commands[name].make_context(name, given).params
+def test_each_command_takes_its_lines() -> None:
+    for line in COMMANDS:
+        _, name, *given = shlex.split(line)
+        assert cli.cli.commands[name].make_context(name, given).params
+
+
+RUN_HERE = [line for line in COMMANDS if line not in PATTERNS + FIRST and not elsewhere(line)]
+
+# The first line of each command that is not among those of a first record.
+QUICK_LINES = {line.split()[1]: line for line in reversed(RUN_HERE)}
+for line in FIRST:
+    QUICK_LINES.pop(line.split()[1], None)
 
 
 @pytest.mark.parametrize(
-    "line", [one for one in COMMANDS if one not in PATTERNS + FIRST and not elsewhere(one)]
+    "line",
+    [
+        pytest.param(line, marks=() if line in QUICK_LINES.values() else pytest.mark.slow)
+        for line in RUN_HERE
+    ],
 )
 def test_a_command_leaves_what_it_promises(line: str, empty: Path, run: Path) -> None:
     with_files(line, empty, run)
@@ -95,20 +109,14 @@ def test_the_commands_for_a_first_record_follow_each_other(empty: Path) -> None:
 CONFIGS = [text for page in (README, *guides().values()) for text in blocks("toml", page)][1:]
 
 
-@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" not in text])
-def test_a_config_is_run(text: str, empty: Path) -> None:
-    typed(f"bwbayes run {written(text, empty)}")
-
-
-@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" in text])
-def test_a_config_of_a_large_model_is_fitted(text: str, empty: Path) -> None:
-    """Its posterior has twenty parameters and takes minutes."""
-    typed(f"bwbayes check {written(text, empty)}")
+@pytest.mark.parametrize("text", CONFIGS)
+def test_a_config_is_understood(text: str, empty: Path) -> None:
+    assert resolve(load(Path(written(text, empty))), empty).posterior.prior.dimensions
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", [text for text in CONFIGS if "thresholds" in text])
-def test_a_config_of_a_large_model_is_run(text: str, empty: Path) -> None:
+@pytest.mark.parametrize("text", CONFIGS)
+def test_a_config_is_run(text: str, empty: Path) -> None:
     typed(f"bwbayes run {written(text, empty)}")
 
 

@@ -88,6 +88,7 @@ def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any) -> None:
     assert held_out["width_95_um"] <= 1.6
 
 
+@pytest.mark.slow
 def test_white_noise_scores_worse_and_its_parameters_look_too_sure(honest: Any, white: Any) -> None:
     """The twin: the same test fails for the noise model that ignores the discrepancy."""
     for name in ("crps_um", "interval_score_95_um"):
@@ -107,6 +108,7 @@ def parts(parts_folder: Path) -> Any:
     return run(parts_folder, ROOT / "runs/measured_stack_parts.toml")
 
 
+@pytest.mark.slow
 def test_parts_halve_the_error_and_narrow_the_bands(honest: Any, parts: Any) -> None:
     """NRMSE at most 0.42 %, every sensor band within two errors, at least 35 % narrower."""
     assert parts["converged"]
@@ -148,7 +150,9 @@ def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
     return missed
 
 
-@pytest.mark.parametrize(("name", "limit"), [("plain", 0.0085), ("parts", 0.0045)])
+@pytest.mark.parametrize(
+    ("name", "limit"), [("plain", 0.0085), pytest.param("parts", 0.0045, marks=pytest.mark.slow)]
+)
 def test_the_voltage_computed_for_the_held_out_displacement_is_the_applied_one(
     name: str, limit: float, request: pytest.FixtureRequest
 ) -> None:
@@ -222,6 +226,7 @@ def on_cuts(posterior: Posterior, drawn: FloatArray) -> tuple[Judged, Judged]:
     return usual, knocked
 
 
+@pytest.mark.slow
 def test_records_cut_out_in_motion_are_predicted(plain_on_cuts: tuple[Judged, Judged]) -> None:
     """Ten records that start anywhere in the drive; a transient at their start changes little.
 
@@ -236,6 +241,7 @@ def test_records_cut_out_in_motion_are_predicted(plain_on_cuts: tuple[Judged, Ju
     np.testing.assert_allclose(usual, knocked, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     parts_folder: Path, parts: Any, plain_on_cuts: tuple[Judged, Judged]
 ) -> None:
@@ -252,6 +258,7 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     np.testing.assert_allclose(usual, knocked, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_whole_file_is_fitted_in_spite_of_its_start(tmp_path: Path, honest: Any) -> None:
     """The first readings lie 25 um away; d is that of the fit of 25 to 36 s all the same."""
     config = tmp_path / "whole.toml"

@@ -1,5 +1,7 @@
 """The notebooks run from top to bottom, and are stored as such a run leaves them.
 
+Two run in the default suite, all with ``-m slow``.
+
 After a change, ``jupyter execute --inplace notebooks/NAME.ipynb`` stores the new outputs.
 """
 
@@ -22,29 +24,28 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST_FILE = 600_000
 LONGEST_CELL = 300  # s
 
+QUICK = {"quickstart", "reading_the_paper"}
+
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
-def code_cells(notebook: Any) -> list[Any]:
-    return [cell for cell in notebook.cells if cell.cell_type == "code"]
-
-
-def outputs_as_text(notebook: Any) -> str:
+def outputs_as_text(outputs: list[Any]) -> str:
     """All outputs but the pictures."""
     parts = []
-    for cell in code_cells(notebook):
-        for output in cell.outputs:
-            parts.append(output.get("text", ""))
-            data = output.get("data", {})
-            parts += [str(v) for kind, v in data.items() if not kind.startswith("image/")]
+    for output in outputs:
+        parts.append(output.get("text", ""))
+        data = output.get("data", {})
+        parts += [str(v) for kind, v in data.items() if not kind.startswith("image/")]
     return "\n".join(parts)
 
 
-def test_there_is_a_notebook() -> None:
-    assert NOTEBOOKS
-
-
-@every_notebook
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
+        for path in NOTEBOOKS
+    ],
+)
 def test_a_notebook_runs_without_an_error(path: Path, tmp_path: Path) -> None:
     """Its own assertions included; on this checkout, and leaving nothing beside it."""
     notebook = nbformat.read(path, as_version=4)
@@ -61,24 +62,14 @@ def test_a_notebook_runs_without_an_error(path: Path, tmp_path: Path) -> None:
 
 @every_notebook
 def test_a_notebook_is_stored_with_the_outputs_of_one_run(path: Path) -> None:
-    cells = code_cells(nbformat.read(path, as_version=4))
+    """Small, with pictures, and naming no absolute path, no warning and no address in memory."""
+    cells = [c for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
     assert list(range(1, len(cells) + 1)) == [cell.execution_count for cell in cells]
-    pictures = [o for c in cells for o in c.outputs if "image/png" in o.get("data", {})]
-    assert pictures
-
-
-@every_notebook
-def test_a_notebooks_outputs_name_no_place_and_no_error(path: Path) -> None:
-    """Neither an absolute path, nor a warning or an address in memory."""
-    notebook = nbformat.read(path, as_version=4)
-    for cell in code_cells(notebook):
-        for output in cell.outputs:
-            assert output.output_type != "error"
-            assert output.get("name") != "stderr"
-    text = outputs_as_text(notebook)
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    for output in outputs:
+        assert output.output_type != "error"
+        assert output.get("name") != "stderr"
+    text = outputs_as_text(outputs)
     assert [] == re.findall(r"(?<![\w.])/(?:\w+/)+\w*|[A-Z]:\\\w*|0x[0-9a-f]{6,}", text)
-
-
-@every_notebook
-def test_a_notebook_is_a_small_file(path: Path) -> None:
     assert LARGEST_FILE > path.stat().st_size

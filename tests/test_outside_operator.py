@@ -174,7 +174,10 @@ def test_a_truth_may_be_stated_of_its_own_parameters(tmp_path: Path) -> None:
     assert bwbayes.resolve(stated, tmp_path).config.truth == {"width": 9.0}
 
 
-@pytest.mark.parametrize(("kind", "engine"), [("TanhLoop", "numba"), ("SinglePlay", "numpy")])
+@pytest.mark.parametrize(
+    ("kind", "engine"),
+    [("TanhLoop", "numba"), pytest.param("SinglePlay", "numpy", marks=pytest.mark.slow)],
+)
 def test_an_operator_from_outside_goes_all_the_way(kind: str, engine: str, tmp_path: Path) -> None:
     """Resolved, fitted, sampled, predicted and reported; the truth is within four sds.
 

@@ -124,6 +124,7 @@ def test_every_dependency_says_its_oldest_version() -> None:
         constraints(["numpy<3"])
 
 
+@pytest.mark.slow
 def test_the_wheel_works_in_an_empty_environment(installed: Path) -> None:
     """A tiny config comes to a report; a check works without numba, from nothing of a checkout."""
     folder = installed.parents[1] / "elsewhere"

@@ -52,7 +52,9 @@ class Reference:
     result: Mapping[str, Any]
 
 
-@pytest.fixture(scope="module", params=["virtual", pytest.param("measured", marks=absent)])
+@pytest.fixture(
+    scope="module", params=["virtual", pytest.param("measured", marks=[absent, pytest.mark.slow])]
+)
 def reference(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Reference:

@@ -90,7 +90,7 @@ def width(bands: Bands) -> float:
 ASIDE = "[model]\noutliers = true\n"
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: int) -> None:
     record, rows = spiky(measured(seed), seed)
     clean, aside, left_in = (

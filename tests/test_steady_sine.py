@@ -78,7 +78,7 @@ def sampled(problem: Problem) -> tuple[Outcome, Chain]:
         return sample(posterior, problem.plan, chain, pool), chain
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_steady_sine_converges_within_hundreds_of_steps(seed: int, tmp_path: Path) -> None:
     """Pilot and all. Two of four ensembles in the hopeless mode took 3,000 for the pilot alone."""
     outcome, chain = sampled(steady_sine(seed, tmp_path))

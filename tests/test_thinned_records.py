@@ -254,6 +254,7 @@ def test_the_variances_to_compare_with_are_those_of_dense_covariances() -> None:
     np.testing.assert_allclose(list(of_noise(interval).values()), expected, 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_thinned_readings_lead_to_the_truth_as_all_of_them_do(tmp_path: Path, seed: int) -> None:
     """``decimate = 8`` at 100 Hz: what the voltage did between the readings is not forgotten."""

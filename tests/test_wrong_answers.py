@@ -18,7 +18,8 @@ Which test keeps which:
 ``inference/test_default_units.py``, ``app/test_remarks.py`` |
 
 Runs are whole but for their files: a config, a fit, draws until they have converged, bands and
-verdicts. Each answer is right, within four posterior sds, or does not hold for the right cause.
+verdicts. Each answer is right, within four posterior sds, or does not hold for the right cause. All
+with ``-m slow``; the quick twins are in the other files.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ from bwbayes.results.result import Result
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.results import moving
 from tests.results.runs import CONVERGED, Judged, Stand, covered, judge, problem_of, run
+
+pytestmark = pytest.mark.slow
 
 STAND = Stand(lag=0.03)
 SLOW = Stand(lag=0.05)

@@ -145,8 +145,15 @@ class Opened:
         self.page.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    ("width", "scheme"),
+    [
+        (400, "dark"),
+        pytest.param(400, "light", marks=pytest.mark.slow),
+        pytest.param(1400, "dark", marks=pytest.mark.slow),
+        pytest.param(1400, "light", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_is_whole_alone_and_readable(
     chromium: Any, pages: dict[str, Path], name: str, width: int, scheme: str
@@ -179,6 +186,7 @@ CUES = """[...document.querySelectorAll(".scroll")].map(region => [
   parseFloat(getComputedStyle(region.firstElementChild, "::before").width)])"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [400, 700, 1000, 1400])
 @pytest.mark.parametrize("name", PAGES)
 def test_a_table_that_scrolls_says_so_and_no_other(

@@ -75,11 +75,6 @@ def bwbayes(
     return typed
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def assert_one_line(said: Said, *parts: str) -> None:
     assert 2 == said.status
     assert "" == said.out

@@ -117,6 +117,7 @@ KEYS: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_models_of_a_record_are_compared(tmp_path: Path) -> None:
     """Named in one text or in a list, with nothing left or a folder, and its runs: the same."""
     record = measured()

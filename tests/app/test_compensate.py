@@ -27,11 +27,6 @@ from tests.app import small
 VOLTAGE = (-100.0, 100.0)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def asked_file(folder: Path, values: Any, interval: float = 0.02) -> Path:
     path = folder / "asked.csv"
     time = interval * np.arange(len(values))

@@ -17,7 +17,6 @@ from bwbayes.comparison.design import Asked, Promise
 from bwbayes.data import read_record
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.standing import Standing
-from tests.app import small
 
 CANDIDATES = """\
 [steady]
@@ -36,11 +35,6 @@ amplitude = 1.0
 frequency = 1.0
 duration = 3.0
 """
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
 
 
 def command(arguments: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> int:

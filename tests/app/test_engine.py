@@ -20,11 +20,6 @@ from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def copied(run: Path, tmp_path: Path) -> RunFolder:
     shutil.copytree(run, tmp_path / "small")
     return RunFolder(tmp_path / "small")
@@ -57,6 +52,7 @@ def test_machine_without_the_engine_says_what_to_do(
         carry_on(folder, small.quiet(), workers=1)
 
 
+@pytest.mark.slow
 def test_asked_for_another_engine_goes_on_and_is_said(run: Path, tmp_path: Path) -> None:
     folder, said = copied(run, tmp_path), StringIO()
     ess = 2 * small.lowest_ess(run)
@@ -66,6 +62,7 @@ def test_asked_for_another_engine_goes_on_and_is_said(run: Path, tmp_path: Path)
     assert "numpy" == load(folder.config).sampling.engine
 
 
+@pytest.mark.slow
 def test_engines_agree_on_the_posterior(run: Path, tmp_path: Path) -> None:
     """Within five Monte Carlo errors of the difference: a false alarm in 10^5 runs."""
     made = small.begun(tmp_path / "small", ("block = 25", 'block = 25\nengine = "numpy"'))

@@ -156,6 +156,7 @@ def test_a_worker_killed_within_a_block_costs_no_bit(
     assert killed
 
 
+@pytest.mark.slow
 def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
     """One line says so, the blocks that are there stay, and the end is the same to the bit."""
     one, begun = posterior(), chain()
@@ -199,6 +200,7 @@ def _kill_at_first_block(folder: RunFolder, process: Any) -> None:
     process.kill()
 
 
+@pytest.mark.slow
 def test_the_readmes_commands_for_a_cluster_work_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,11 +19,6 @@ from bwbayes.errors import InputError, NotConvergedError
 from tests.app import small
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
     made, files = export(run, tmp_path / "new" / "here")
     assert ["model.json", "actuator.c"] == [path.name for path in files]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,23 +21,6 @@ from bwbayes.errors import InputError
 from bwbayes.results.prediction import Start
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture
-def copy(run: Path, tmp_path: Path) -> RunFolder:
-    """Return a copy of the finished run, to be changed."""
-    shutil.copytree(run, tmp_path / "copy")
-    return RunFolder.open(tmp_path / "copy")
-
-
-@pytest.fixture
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
 
 
 def edit(folder: RunFolder, old: str, new: str) -> None:

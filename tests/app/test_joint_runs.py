@@ -184,6 +184,7 @@ def test_any_other_record_is_predicted(finished: RunFolder) -> None:
     np.testing.assert_array_equal(predicted.mean, made.bands["sine"].mean)
 
 
+@pytest.mark.slow
 def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_path: Path) -> None:
     """What a model has no parameter for is left out of its scopes; every record has a future."""
     scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))

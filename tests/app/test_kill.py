@@ -42,11 +42,6 @@ RUNS = max(KILLS // 10, 1)
 Moment = Callable[[Path], bool]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 def follow(where: Path, arguments: list[str], last_write: int, last_step: str) -> None:
     """Do what the command line would, in a session of its own.
 

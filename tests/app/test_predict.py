@@ -17,11 +17,6 @@ from bwbayes.results.prediction import Start
 from tests.app import small
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
 @pytest.fixture
 def record(run: Path) -> Record:
     return read_record(run / "records/sine.h5")

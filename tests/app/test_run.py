@@ -37,24 +37,6 @@ FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "d
 LEVELS = {"50", "90", "95"}
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture
-def copy(run: Path, tmp_path: Path) -> RunFolder:
-    """Return a copy of the finished run, to be changed."""
-    shutil.copytree(run, tmp_path / "copy")
-    return RunFolder.open(tmp_path / "copy")
-
-
-@pytest.fixture
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the time that pictures take, where they are not what is tested."""
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
-
-
 # What a run leaves
 
 
@@ -420,6 +402,7 @@ def test_chain_without_draws_predicts_nothing(
         module.finished(made)
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_fit_that_misses_its_own_readings_does_not_hold(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,6 @@ import bwbayes as bw
 from bwbayes.app.commands.cli import cli
 from bwbayes.results.causes import Cause
 from bwbayes.results.verdict import Verdict
-from tests.app import small
 
 OFF = "95 % bands cover 55 % of 50 readings"
 STATUS = {False: 3, None: 5}
@@ -46,12 +45,12 @@ def verdict(holds: bool | None) -> Verdict:
     return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture(params=[False, None], ids=["failed", "inconclusive"])
+@pytest.fixture(
+    params=[
+        pytest.param(False, id="failed"),
+        pytest.param(None, id="inconclusive", marks=pytest.mark.slow),
+    ]
+)
 def holds(request: pytest.FixtureRequest) -> bool | None:
     answer: bool | None = request.param
     return answer
@@ -96,11 +95,6 @@ def test_each_command_says_it_first_and_ends_with_its_status(
         comment = re.sub(r"\s*\n \* ", " ", code.read_text().partition("*/")[0])
         assert OFF in comment
     assert name in {"export", "predict"} or any(out.glob("*.html"))
-
-
-@pytest.fixture(scope="module")
-def fit(run: Path) -> bw.Fit:
-    return bw.open_run(run)
 
 
 @pytest.mark.parametrize("name", IN_PYTHON)

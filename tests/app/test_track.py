@@ -17,19 +17,8 @@ from bwbayes.app.commands.track import track as command
 from bwbayes.app.jobs.track import Setup, track_run
 from bwbayes.control.tracking import CONTROLLERS
 from bwbayes.errors import InputError
-from tests.app import small
 
 FEW = ("--frequency", "2", "--frequency", "5", "--draws", "5")
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def fit(run: Path) -> bw.Fit:
-    return bw.open_run(run)
 
 
 def test_numbers_table_and_picture_agree(
@@ -87,6 +76,7 @@ def test_options_that_make_no_sense_are_one_line(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_draws_that_are_simulated_are_some_of_those_that_must_be_stable(fit: bw.Fit) -> None:
     made = fit.track(frequencies=(5.0,), draws=4, rate=500.0, delay=2)
     assert (4, 4) == made.rms.shape[2:]

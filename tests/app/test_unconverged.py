@@ -27,11 +27,6 @@ from tests.sampling.hard_chains import BLOCK, HARD, good, moved
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small.finished(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
 def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]:
     """Return a run that used up its budget, and the exit status of its command."""
     path = tmp_path_factory.mktemp("short") / "small"

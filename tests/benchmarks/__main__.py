@@ -47,7 +47,7 @@ WIDTH = 110
     show_default=True,
     help="Where the figures go.",
 )
-@click.option("--keep", "kept", is_flag=True, help="Store what the README quotes.")
+@click.option("--keep", "kept", is_flag=True, help="Store what tests/README.md quotes.")
 def main(*, quick: bool, out: Path, kept: bool) -> None:
     """Measure what the likelihood, the sampling and a start cost on this machine."""
     console = Console()

@@ -147,6 +147,7 @@ def test_the_right_operator_is_named_or_left_open() -> None:
     assert np.sum(named) >= 18
 
 
+@pytest.mark.slow
 def test_a_bouc_wen_record_is_told_from_other_operators_and_from_none() -> None:
     """The quick twin, with three operators."""
     made = compared(simulated("bouc-wen", 1), ("bouc-wen", "maxwell-slip", "linear"))

@@ -16,7 +16,14 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from tests.control import cases
 
-every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
+QUICK = {"bouc-wen", "bouc-wen, second-order", "plays, lag, gain"}
+every_actuator = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in cases.ACTUATORS
+    ],
+)
 
 
 def models(name: str, count: int = 20, interval: float = 1e-3) -> SampledModel:

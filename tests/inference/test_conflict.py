@@ -186,6 +186,7 @@ def judged(posterior: Posterior, ranges: Ranges) -> list[str]:
     )
 
 
+@pytest.mark.slow
 def test_forty_good_records_raise_no_remark() -> None:
     """With white noise and a discrepancy, with and without a lag, from rest and not."""
     alarms = []

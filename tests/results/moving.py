@@ -22,11 +22,22 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, made
-from bwbayes.results.bands import Bands
+from bwbayes.results.bands import KINDS, Bands, Kind
 from bwbayes.results.prediction import Start, predict_record
+from bwbayes.results.verdict import LEAD_IN_ALARM
 from tests.inference.problems import posterior_of
 
-__all__ = ["Case", "Cut", "covered", "errors_off", "posterior_of_case", "record_of", "studied"]
+__all__ = [
+    "Case",
+    "Cut",
+    "alarms",
+    "covered",
+    "errors_off",
+    "posterior_of_case",
+    "record_of",
+    "studied",
+    "widening",
+]
 
 Cut = Literal["any", "turn", "speed", "knocked"]
 
@@ -138,3 +149,28 @@ def covered(every: list[Bands], level: int, width: float = 1.0) -> FloatArray:
 def errors_off(parts: FloatArray, level: int) -> float:
     """Distance of the mean coverage from nominal, in standard errors between records."""
     return float((parts.mean() - level / 100) / (parts.std(ddof=1) / np.sqrt(parts.size)))
+
+
+def alarms(every: list[Bands]) -> int:
+    """Lead-ins that are said not to fit."""
+    p = [bands.lead_in.p_value for bands in every if bands.lead_in is not None]
+    assert len(p) == len(every)
+    return int(np.sum(np.array(p) < LEAD_IN_ALARM))
+
+
+def width(bands: Bands, kind: Kind) -> float:
+    """Mean width of the 95 % band where it is judged, um."""
+    return float(np.mean((bands.upper[kind, 95] - bands.lower[kind, 95])[bands.scored_from :]))
+
+
+def widening(case: Case, records: int) -> float:
+    """How many times as wide bands are where nobody says that a record starts from rest."""
+    rested = replace(case, from_rest=True)
+    posterior, generator = posterior_of_case(case), np.random.default_rng(2)
+    ratios = []
+    for number in range(records):
+        record = record_of(rested, generator)
+        known = predicted(rested, posterior, record, number)
+        unknown = predicted(case, posterior, record, number)
+        ratios.append([width(unknown, kind) / width(known, kind) for kind in KINDS[1:]])
+    return float(np.max(np.mean(ratios, axis=0)))

@@ -112,11 +112,13 @@ def off(hits: FloatArray) -> float:
     return min(stats.binomtest(int(n), len(hits), 0.95).pvalue for n in counts)
 
 
+@pytest.mark.slow
 def test_forecasts_cover_what_they_promise_at_every_distance() -> None:
     """Of 100 records; fails by chance once in 2,000. It sees a coverage of 80 % in 9 of 10."""
     assert off(inside(RECORDS)) > 1e-4
 
 
+@pytest.mark.slow
 def test_a_forecast_that_takes_the_discrepancy_for_known_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

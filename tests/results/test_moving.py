@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import product
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -31,7 +32,7 @@ from bwbayes.data.record import Record
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import start
-from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.prediction import Start
 from bwbayes.results.start import started
 from bwbayes.results.verdict import LEAD_IN_ALARM
@@ -40,12 +41,14 @@ from tests.results.moving import (
     RATE,
     Case,
     Cut,
+    alarms,
     covered,
     errors_off,
     posterior_of_case,
     predicted,
     record_of,
     studied,
+    widening,
 )
 
 QUICK = 40
@@ -69,6 +72,11 @@ EVERY = [
 ]
 
 
+def few(quick: object, *cases: object) -> list[Any]:
+    """Return cases of which the first alone is in the default suite."""
+    return [quick, *(pytest.param(case, marks=pytest.mark.slow) for case in cases)]
+
+
 def name_of(case: Case) -> str:
     """Name the dynamics of a case."""
     return f"lag {1e3 * case.lag:g} ms" if case.dynamics == "lag" else case.dynamics
@@ -79,17 +87,7 @@ def off(every: list[Bands]) -> dict[int, float]:
     return {level: errors_off(covered(every, level), level) for level in LEVELS}
 
 
-def alarms(every: list[Bands]) -> int:
-    """Lead-ins that are said not to fit."""
-    return sum(_alarm(bands) for bands in every)
-
-
-def _alarm(bands: Bands) -> bool:
-    assert bands.lead_in is not None
-    return bands.lead_in.p_value < LEAD_IN_ALARM
-
-
-@pytest.mark.parametrize("case", [Case(cut="any"), Case(cut="speed"), SECOND], ids=str)
+@pytest.mark.parametrize("case", few(Case(cut="any"), Case(cut="speed"), SECOND), ids=str)
 def test_bands_cover_records_cut_from_a_running_drive(case: Case) -> None:
     every = studied(case, QUICK, seed=1)
     assert {} == {level: t for level, t in off(every).items() if abs(t) > QUICK_LIMIT}
@@ -114,25 +112,12 @@ def at_rest(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     return sd
 
 
-def width(bands: Bands, kind: Kind) -> float:
-    """Mean width of the 95 % band where it is judged, um."""
-    return float(np.mean((bands.upper[kind, 95] - bands.lower[kind, 95])[bands.scored_from :]))
-
-
-@pytest.mark.parametrize("case", [Case(), Case(discrepancy=1.5), SECOND], ids=str)
+@pytest.mark.parametrize("case", few(Case(), Case(discrepancy=1.5), SECOND), ids=str)
 def test_not_knowing_that_a_record_starts_from_rest_costs_little(case: Case) -> None:
-    rested = replace(case, from_rest=True)
-    posterior, generator = posterior_of_case(case), np.random.default_rng(2)
-    ratios = []
-    for number in range(10):
-        record = record_of(rested, generator)
-        known = predicted(rested, posterior, record, number)
-        unknown = predicted(case, posterior, record, number)
-        ratios.append([width(unknown, kind) / width(known, kind) for kind in KINDS[1:]])
-    assert np.max(np.mean(ratios, axis=0)) < 1.1
+    assert widening(case, 10) < 1.1
 
 
-@pytest.mark.parametrize("case", [Case(), Case(discrepancy=1.5, lead_in=0.3), SECOND], ids=str)
+@pytest.mark.parametrize("case", few(Case(), Case(discrepancy=1.5, lead_in=0.3), SECOND), ids=str)
 def test_a_seed_does_not_show(case: Case) -> None:
     """Edges of the bands move by less than a twentieth of their half width."""
     posterior = posterior_of_case(case)
@@ -215,11 +200,12 @@ def p_value(case: Case, posterior: Posterior, record: Record, seed: int) -> floa
 SPOILT = [gain, drift, transient, jump]
 
 
-@pytest.mark.parametrize("spoil", SPOILT)
+@pytest.mark.parametrize("spoil", few(*SPOILT))
 def test_a_lead_in_that_does_not_fit_is_found(spoil: Spoil) -> None:
     assert max(lead_ins(Case(), spoil, 50, seed=4)) < LEAD_IN_ALARM
 
 
+@pytest.mark.slow
 def test_a_drift_is_found_within_a_discrepancy_of_its_pace() -> None:
     """The sum of all squares does not see it in half of the records."""
     case = Case(discrepancy=1.5)
@@ -230,6 +216,7 @@ def test_a_drift_is_found_within_a_discrepancy_of_its_pace() -> None:
     assert np.sum(p >= LEAD_IN_ALARM) > 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [Case(), SECOND, Case(discrepancy=1.5, lead_in=0.3)], ids=str)
 def test_good_lead_ins_raise_no_more_false_alarms_than_stated(case: Case) -> None:
     """At any level; a p-value that takes the better of two tests may be too large, not too small.

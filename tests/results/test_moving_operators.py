@@ -25,23 +25,25 @@ from bwbayes.inference.engine import Engine
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
-from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.verdict import LEAD_IN_ALARM
 from tests.measured import keep
 from tests.results.moving import (
     Case,
+    alarms,
     covered,
     errors_off,
     posterior_of_case,
     predicted,
     record_of,
     studied,
+    widening,
 )
 
 QUICK = 40
 QUICK_LIMIT = 4.0
 # Of those that remember extrema the quicker one.
-FEW = ("preisach", "duhem")
+FEW = ("preisach", pytest.param("duhem", marks=pytest.mark.slow))
 
 RECORDS = 200
 LEAST, MOST = 0.93, 0.97
@@ -54,12 +56,6 @@ def coverages(every: list[Bands]) -> dict[str, list[float]]:
         str(level): [round(float(np.mean(part)), 4), round(errors_off(part, level), 2)]
         for level, part in parts.items()
     }
-
-
-def alarms(every: list[Bands]) -> int:
-    """Lead-ins that are said not to fit."""
-    p = [bands.lead_in.p_value for bands in every if bands.lead_in is not None]
-    return int(np.sum(np.array(p) < LEAD_IN_ALARM))
 
 
 @pytest.mark.parametrize("name", FEW)
@@ -77,24 +73,7 @@ def test_twin_earlier_drives_taken_for_as_large_as_the_range_do_not_cover_them()
     assert np.mean(covered(every, 95)) < LEAST
 
 
-def width(bands: Bands, kind: Kind) -> float:
-    """Mean width of the 95 % band where it is judged, um."""
-    return float(np.mean((bands.upper[kind, 95] - bands.lower[kind, 95])[bands.scored_from :]))
-
-
-def widening(case: Case, records: int) -> float:
-    """How many times as wide bands are where nobody says that a record starts from rest."""
-    rested = replace(case, from_rest=True)
-    posterior, generator = posterior_of_case(case), np.random.default_rng(2)
-    ratios = []
-    for number in range(records):
-        record = record_of(rested, generator)
-        known = predicted(rested, posterior, record, number)
-        unknown = predicted(case, posterior, record, number)
-        ratios.append([width(unknown, kind) / width(known, kind) for kind in KINDS[1:]])
-    return float(np.max(np.mean(ratios, axis=0)))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEW)
 def test_not_knowing_that_a_record_starts_from_rest_costs_little(name: str) -> None:
     assert widening(Case(hysteresis=name, discrepancy=1.5), 5) < 1.1

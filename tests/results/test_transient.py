@@ -77,27 +77,26 @@ def test_what_a_transient_adds_is_the_largest_of_all_sizes() -> None:
     assert plainly(size, decay) - plainly(0.0, 1.0) == pytest.approx(nats, abs=1e-6)
 
 
-def another(transient: float, seed: int) -> Switched:
+def another(posterior: Posterior, draws: FloatArray, transient: float, seed: int) -> Switched:
     """Predict another record, cut from a running drive, with a transient of so many sds."""
-    posterior = fitted(1)
     record = Stand(lag=0.0, rate=50.0).measure(
         90 * np.sin(2 * np.pi * 0.02 * np.arange(700)), np.random.default_rng(seed), cut=115
     )
     assert record.displacement is not None
     faded = transient * np.exp(-0.02 * np.arange(record.samples) / 0.6)
     record = replace(record, displacement=record.displacement + faded)
-    bands = predict_record(
-        posterior, drawn(posterior), record, Start(lead_in=1.0), np.random.default_rng(3)
-    )
+    bands = predict_record(posterior, draws, record, Start(lead_in=1.0), np.random.default_rng(3))
     assert bands.lead_in is not None
     assert bands.lead_in.transient is not None
     return bands.lead_in.transient
 
 
 def test_a_transient_of_another_record_is_told_by_all_its_readings() -> None:
+    posterior = fitted(1)
+    draws = drawn(posterior)
     for seed in range(3):
-        assert another(0.0, seed).nats < 4
-        told = another(15.0, seed)
+        assert another(posterior, draws, 0.0, seed).nats < 4
+        told = another(posterior, draws, 15.0, seed)
         assert told.nats > 20
         assert told.size == pytest.approx(15.0, abs=4.0)
         assert told.decay == pytest.approx(0.6, rel=0.2)

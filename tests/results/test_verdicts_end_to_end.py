@@ -200,7 +200,10 @@ HARDEST = [
 ]
 
 
-@pytest.mark.parametrize(("seed", "kind", "holds"), HARDEST)
+@pytest.mark.parametrize(
+    ("seed", "kind", "holds"),
+    [HARDEST[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in HARDEST[1:])],
+)
 def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
     tmp_path: Path, seed: tuple[int, int], kind: str, holds: bool | None
 ) -> None:

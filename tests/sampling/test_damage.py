@@ -35,20 +35,6 @@ BLOCKS = sum(count for _, count in PLAN)
 Place = tuple[int, int]
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a run that was never interrupted."""
-    path = tmp_path_factory.mktemp("whole") / "chain.h5"
-    with new(path) as chain:
-        finish(chain)
-    return path
-
-
-@pytest.fixture(scope="module")
-def expected(whole: Path) -> dict[str, Any]:
-    return arrays(ChainFile.read(whole))
-
-
 def die_at_the_end(path: Path) -> None:
     finish(new(path))
     os.kill(os.getpid(), signal.SIGKILL)

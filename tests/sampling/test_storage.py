@@ -33,20 +33,6 @@ from tests.sampling.chains import (
 from tests.sampling.samplings import assert_same_proposal
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a run that was never interrupted."""
-    path = tmp_path_factory.mktemp("whole") / "chain.h5"
-    with new(path) as chain:
-        finish(chain)
-    return path
-
-
-@pytest.fixture(scope="module")
-def expected(whole: Path) -> dict[str, Any]:
-    return arrays(ChainFile.read(whole))
-
-
 def test_what_is_read_is_what_was_written(whole: Path, expected: dict[str, Any]) -> None:
     chain = ChainFile.read(whole)
     assert [count for _, count in PLAN] == [chain.blocks(phase) for phase in PHASES]
