@@ -13,7 +13,6 @@ wide as ever. (An Ornstein-Uhlenbeck process; the filter is that of
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +21,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.likelihood import Likelihood
 
 __all__ = ["Carried", "carried"]
-
-# A stretch for which one variance stands in is this part of the time since the last reading: k²
-# changes by so little in it that an sd is right to half a percent.
-PART = 0.02
 
 
 @dataclass(frozen=True)
@@ -49,25 +44,18 @@ class Carried:
 
     def means(self, first: int, samples: int) -> FloatArray:
         """Mean (draws, samples) from a sample on, um; before the last reading that there."""
-        after = np.maximum(first + np.arange(samples) - self.last, 0)
-        known: FloatArray = self.mean[:, np.newaxis] * np.exp(-np.outer(self.rate, after))
+        known: FloatArray = self.mean[:, np.newaxis] * self._kept(first, samples)
         return known
 
-    def less(self, sample: float) -> FloatArray:
-        """By how much the variance (draws,) at a sample is less than σ², um²."""
-        kept = np.exp(-self.rate * max(sample - self.last, 0.0))
-        return kept**2 * self.gained
+    def less(self, first: int, samples: int) -> FloatArray:
+        """By how much the variance (draws, samples) is less than σ², um²."""
+        known: FloatArray = self.gained[:, np.newaxis] * self._kept(first, samples) ** 2
+        return known
 
-    def stretches(self, first: int, samples: int) -> Iterator[slice]:
-        """Cut samples from one on into stretches in which the variance hardly changes."""
-        begin = 0
-        while begin < samples:
-            since = max(first + begin - self.last, 0)
-            # Of what is forgotten nothing changes any more.
-            forgotten = bool((self.rate * since > -np.log(np.finfo(float).eps)).all())
-            length = samples if forgotten else max(int(PART * since), 1)
-            yield slice(begin, min(begin + length, samples))
-            begin += length
+    def _kept(self, first: int, samples: int) -> FloatArray:
+        """Return k (draws, samples)."""
+        after = np.maximum(first + np.arange(samples) - self.last, 0)
+        return np.exp(-np.outer(self.rate, after))
 
 
 def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) -> Carried:

@@ -1,10 +1,10 @@
 """Prediction: from posterior draws to displacement bands, for any voltage.
 
 Every draw simulates the record from its first sample; given a draw, a reading is normal around its
-simulation, and the bands are quantiles of the mixture over all draws, to 2e-4 of its standard
-deviation. The record is walked through in pieces, so memory does not grow with its length. But for
-a forecast, the discrepancy enters by its marginal distribution, on training windows too, where the
-smoothed one would promise more than a new record can keep.
+simulation, and the bands are quantiles of the mixture over all draws. The record is walked through
+in pieces, so memory does not grow with its length. But for a forecast, the discrepancy enters by
+its marginal distribution, on training windows too, where the smoothed one would promise more than a
+new record can keep.
 
 Windows of the training record share its simulation and its offset. Another record has a start of
 its own, see :mod:`bwbayes.results.start`.
@@ -18,13 +18,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import mixture
-from bwbayes.results.along import moments_of, quantiles_and_spread
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.start import Start, Started, fitted, going_on, started
 
@@ -33,9 +33,9 @@ __all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "t
 # Posterior draws in the mixture.
 DRAWS = 1000
 
-# Samples that are simulated and summarised at once. Not a power of two: rows of draws that far
-# apart would take each other's place in the cache.
-PIECE = 4000
+# Samples that are simulated and summarised at once: few enough for a core's own cache. Not a power
+# of two: rows of draws that far apart would take each other's place in it.
+PIECE = 400
 
 # Threads that summarise pieces, while this one simulates the next.
 THREADS = 2
@@ -43,21 +43,25 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class _Draws:
-    """The start of every draw's simulation, and the sds (draws,) of what is added to it, um."""
+    """The start of every draw's simulation, and the sds (draws,) of what is added to it, um.
+
+    ``scores`` (scores, draws) are what it is added with, the same along the whole record.
+    """
 
     start: Started
     discrepancy: FloatArray
     sensor: FloatArray
+    scores: FloatArray
 
-    def sds(self, kind: Kind, sample: float) -> FloatArray:
-        """Sd of a band's quantity at a sample, given a draw, um."""
-        variance = self.start.offset_sd**2
+    def sds(self, kind: Kind, first: int, samples: int) -> FloatArray:
+        """Sd of a band's quantity given a draw, um: (draws, samples), (draws, 1) if all alike."""
+        variance = self.start.offset_sd[:, np.newaxis] ** 2
         if kind != "parameter":
-            variance = variance + self.discrepancy**2
+            variance = variance + self.discrepancy[:, np.newaxis] ** 2
             if self.start.carried is not None:
-                variance = np.maximum(variance - self.start.carried.less(sample), 0.0)
+                variance = np.maximum(variance - self.start.carried.less(first, samples), 0.0)
         if kind == "sensor":
-            variance = variance + self.sensor**2
+            variance = variance + self.sensor[:, np.newaxis] ** 2
         return np.sqrt(variance)
 
 
@@ -91,7 +95,7 @@ def predict_windows(
         Draws the state of the dynamics at the record's start, where that is unknown.
     """
     theta = posterior.prior.theta(draws)
-    mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
+    mixed = _draws(posterior, theta, fitted(posterior, theta, generator), generator)
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(part.start, part.stop) for parts in several.values() for part in parts]
     first = min(start for start, _ in edges)
@@ -146,7 +150,7 @@ def forecast(
     theta = posterior.prior.theta(draws)
     begun = fitted(posterior, theta, generator)
     begun = going_on(begun, posterior.likelihood, theta, generator)
-    return _bands(name, _draws(posterior, theta, begun), longer, after)
+    return _bands(name, _draws(posterior, theta, begun, generator), longer, after)
 
 
 def predict_record(
@@ -186,13 +190,18 @@ def predict_record(
     begun = started(posterior, theta, record, start, generator, part.stop)
     if part.stop <= begun.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, _draws(posterior, theta, begun), record, part)
+    bands = _bands(name, _draws(posterior, theta, begun, generator), record, part)
     scored_from = max(begun.judged_from - part.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=begun.lead_in, separate=True)
 
 
-def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    return _Draws(start, *posterior.only.noise.marginal_sd(posterior.only.table.noise(theta)))
+def _draws(
+    posterior: Posterior, theta: FloatArray, start: Started, generator: np.random.Generator
+) -> _Draws:
+    sds = posterior.only.noise.marginal_sd(posterior.only.table.noise(theta))
+    # From a stream of its own: what else the generator is for does not depend on them.
+    scores = mixture.stratified_scores(len(theta), generator.spawn(1)[0])
+    return _Draws(start, *sds, scores)
 
 
 def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
@@ -253,52 +262,22 @@ def _summarised(
     mixed: _Draws, record: Record, first: int, simulated: FloatArray
 ) -> dict[str, FloatArray]:
     """Mean, band edges, and the judgement of the readings, each (samples,)."""
-    carried = mixed.start.carried
-    if carried is None:
-        return _stretch(mixed, record, first, simulated, simulated)
-    expected = simulated + carried.means(first, simulated.shape[1])
-    parts = [
-        _stretch(mixed, record, first + part.start, simulated[:, part], expected[:, part])
-        for part in carried.stretches(first, simulated.shape[1])
-    ]
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-
-
-def _stretch(
-    mixed: _Draws, record: Record, first: int, simulated: FloatArray, expected: FloatArray
-) -> dict[str, FloatArray]:
-    """Do it along a stretch in which the sds do not change.
-
-    ``simulated`` (draws, samples) are the model's displacements, ``expected`` with what is known of
-    the discrepancy.
-    """
-    tails = np.array([(100 - level) / 200 for level in LEVELS])
-    middle = first + simulated.shape[1] / 2
+    samples = simulated.shape[1]
+    expected, carried = simulated, mixed.start.carried
+    if carried is not None:
+        expected = simulated + carried.means(first, samples)
     summarised = {"mean": np.mean(expected, axis=0)}
-    spread = {}
-    of_kind = {kind: mixed.sds(kind, middle) for kind in KINDS}
-    alike = [kind for kind in KINDS if expected is simulated or kind != "parameter"]
-    shared = moments_of(expected, [of_kind[kind] for kind in alike])
-    moments = dict(zip(alike, shared, strict=True))
-    for kind, sds in of_kind.items():
-        edges, spread[kind] = quantiles_and_spread(
-            expected if kind in alike else simulated,
-            sds,
-            np.concatenate([tails, 1 - tails]),
-            moments.get(kind),
-        )
-        for i, level in enumerate(LEVELS):
-            summarised[f"{kind} {level} lower"] = edges[i]
-            summarised[f"{kind} {level} upper"] = edges[len(LEVELS) + i]
-    if record.displacement is not None:
-        reading = record.displacement[first : first + simulated.shape[1]]
-        seen = np.isfinite(reading)
-        judged = np.full((3, reading.size), np.nan)
-        if seen.any():
-            of = expected[:, seen], mixed.sds("sensor", middle), reading[seen]
-            judged[:2, seen] = mixture.judged(*of)
-            judged[2, seen] = mixture.log_density(*of)
-        summarised["pit"] = judged[0]
-        summarised["crps"] = judged[1] - spread["sensor"]
-        summarised["log_score"] = judged[2]
+    for kind in KINDS:
+        means, sds = expected if kind != "parameter" else simulated, mixed.sds(kind, first, samples)
+        ranked = mixture.ranked_values(means, sds, mixed.scores)
+        for level in LEVELS:
+            tail = (100 - level) / 200
+            summarised[f"{kind} {level} lower"] = mixture.quantile(ranked, tail)
+            summarised[f"{kind} {level} upper"] = mixture.quantile(ranked, 1 - tail)
+        if kind == "sensor" and record.displacement is not None:
+            reading = record.displacement[first : first + samples]
+            z = (reading - means) / sds
+            summarised["pit"] = np.mean(ndtr(z), axis=0)
+            summarised["crps"] = mixture.crps(ranked, reading)
+            summarised["log_score"] = mixture.log_density(z, sds)
     return summarised

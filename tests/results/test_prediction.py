@@ -107,11 +107,6 @@ def width(bands: Bands, kind: Kind = "parameter", level: int = 95) -> FloatArray
     return bands.upper[kind, level] - bands.lower[kind, level]
 
 
-def accuracy(column: str) -> float:
-    """Accuracy of a column, um: edges between samples at which the mixture's shape is known."""
-    return 3e-4 if "lower" in column or "upper" in column else 1e-9
-
-
 def test_bands_are_nested_in_level_and_in_kind(
     posterior: Posterior, draws: FloatArray, record: Record
 ) -> None:
@@ -134,7 +129,7 @@ def test_a_window_is_the_same_part_of_the_whole_record(
     windows = {"all": slice(0, record.samples), "late": slice(700, 900)}
     whole, late = predict_windows(posterior, draws, record, windows, random())
     for (name, expected), (_, got) in zip(whole.columns(), late.columns(), strict=True):
-        np.testing.assert_allclose(expected[700:900], got, atol=accuracy(name), err_msg=name)
+        np.testing.assert_allclose(expected[700:900], got, atol=1e-9, err_msg=name)
     assert whole.training
     assert not late.training
 
@@ -147,7 +142,7 @@ def test_walking_through_in_other_pieces_changes_nothing(
     monkeypatch.setattr(prediction, "PIECE", 97)
     got = predict_windows(posterior, draws, record, windows, random())[0]
     for (name, one), (_, two) in zip(expected.columns(), got.columns(), strict=True):
-        np.testing.assert_allclose(one, two, atol=accuracy(name), err_msg=name)
+        np.testing.assert_allclose(one, two, atol=1e-9, err_msg=name)
 
 
 def test_the_mean_is_that_of_the_draws_simulations(
@@ -369,7 +364,7 @@ def test_a_window_of_another_record_is_that_part_of_the_whole(
     )
     assert (100, 0) == (whole.scored_from, part.scored_from)
     for (name, expected), (_, got) in zip(whole.columns(), part.columns(), strict=True):
-        np.testing.assert_allclose(expected[300:700], got, atol=accuracy(name), err_msg=name)
+        np.testing.assert_allclose(expected[300:700], got, atol=1e-9, err_msg=name)
     with pytest.raises(InputError, match="lead-in leaves nothing of the window"):
         predict_record(
             posterior,
