@@ -310,8 +310,11 @@ def test_half_of_the_pilots_steps_try_places_of_the_point_fits_guess() -> None:
     ],
 )
 def test_moves_come_in_the_order_of_their_names(moves: Callable[[], Moves]) -> None:
-    kinds = (DEMove, SnookerMove, AmongPlaces, MHMove)
-    for kind, (move, _) in zip(
-        dict(zip(MOVES, kinds, strict=True)).values(), moves(), strict=False
-    ):
-        assert kind is type(move)
+    kinds = {
+        "differential evolution": DEMove,
+        "snooker": SnookerMove,
+        "mixture": AmongPlaces,
+        "nearby": MHMove,
+    }
+    for name, (move, _) in zip(MOVES, moves(), strict=False):
+        assert kinds[name] is type(move)
