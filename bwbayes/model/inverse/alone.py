@@ -1,8 +1,8 @@
 """One actuator read backwards, along stretches that go one way.
 
 The offset is taken off, creep and dynamics are undone, and what is left, the drive, is what
-hysteresis and gain must make. It turns where the voltage does, so that each stretch is one search,
-or one closed form, for all of its samples.
+hysteresis and gain must make. It turns where the voltage does, so that each stretch is one search
+for all of its samples.
 """
 
 from __future__ import annotations
@@ -199,9 +199,6 @@ class One:
         goal = here + s * np.maximum(s * (target - here), 0.0)
         if goal[-1] == here or s * (edge - start) <= 0:
             return np.full(target.shape, start)
-        if self.actuator.gain is None:
-            operator = self.actuator.hysteresis
-            return operator.inverse(self.column, goal, memory, start, edge)
         asked = abs(float(goal[-1]) - here)
         first = asked / self.slope if self.slope > 0 else 1.0
         return reached(lambda u: self._along(u, memory)[0], goal, start, edge, first)
