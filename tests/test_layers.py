@@ -35,7 +35,7 @@ KEEPERS = {
     "h5py": ("bwbayes.sampling.storage", "bwbayes.data.io.hdf5", "bwbayes.data.io.matlab"),
     "nptdms": ("bwbayes.data.io.labview",),
     # The inverse of many models, and the likelihood.
-    "numba": ("bwbayes.model.inverse.compiled.*", "bwbayes.inference.compiled.*"),
+    "numba": ("bwbayes.model.inverse.compiled", "bwbayes.inference.compiled.*"),
     "emcee": ("bwbayes.sampling.ensemble", "bwbayes.sampling.moves", "bwbayes.sampling.walking"),
     "arviz": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
     "arviz_base": ("bwbayes.sampling.diagnostics", "bwbayes.results.*", "bwbayes.app.*"),
@@ -64,7 +64,7 @@ KEEPERS = {
 # What the forward model, and so `import bwbayes.model`, needs besides the standard library; what is
 # compiled is loaded when it is asked for.
 MODEL_LIBRARIES = {"numpy", "scipy"}
-COMPILED = "bwbayes.model.inverse.compiled."
+COMPILED = "bwbayes.model.inverse.compiled"
 
 MUTABLE_LITERALS = (ast.List, ast.Dict, ast.Set, ast.ListComp, ast.DictComp, ast.SetComp)
 MUTABLE_TYPES = {"list", "dict", "set", "defaultdict", "deque", "Counter", "OrderedDict"}
