@@ -223,9 +223,9 @@ def _solve(
         low, high = (u, high) if off < 0.0 else (low, u)
         steep = factor * slope + creeping * kappa * (w if u >= 0.0 else -w)
         # On the parabola that touches, as far as that is a small correction.
-        part = factor / steep
-        step = -off / factor * part
-        better = u + step * (1.0 - min(max(0.5 * bend * step * part, -BENT), BENT))
+        one = 1.0 / steep
+        step = -off * one
+        better = u + step * (1.0 - min(max(0.5 * bend * factor * step * one, -BENT), BENT))
         if not (steep > 0.0 and low < better < high and done < NEWTON_ROUNDS):
             better = 0.5 * (low + high)
         fell = not steep > 0.0 and (u - start) * off < 0.0

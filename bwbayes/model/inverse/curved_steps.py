@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import digamma
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.model.elementwise import look_up, select
+from bwbayes.model.elementwise import anywhere, look_up, select
 from bwbayes.model.exponent import ExponentFlow
 from bwbayes.model.inverse.steps import Gone, OneStateStep, not_zero, relaxed
 from bwbayes.model.operator import Span
@@ -85,13 +85,15 @@ class AsymmetricStep(OneStateStep):
         start, travel = s * memory[0], np.abs(voltage - memory[0])
         early = np.minimum(np.maximum(-start, 0.0), travel)
         # Towards zero volts first, where s x = −1; then away from them.
-        against = select(up, parameters[4], parameters[3])
-        ahead = select(up, parameters[8], parameters[7])
-        g, slow = relaxed(s * memory[1], early, alpha, against, ahead)
+        g, slow = s * memory[1], 0.0 * s
+        if anywhere(start < 0.0):
+            against = select(up, parameters[4], parameters[3])
+            ahead = select(up, parameters[8], parameters[7])
+            g, slow = relaxed(g, early, alpha, against, ahead)
         against = select(up, parameters[5], parameters[2])
         ahead = select(up, parameters[9], parameters[6])
         g, rate = relaxed(g, travel - early, alpha, against, ahead)
-        rate = select((start < 0) & (travel <= -start), slow, rate)
+        rate = select((start < 0.0) & (travel <= -start), slow, rate)
         after[0], after[1] = voltage, s * g
         return d * voltage - s * g, d - alpha + rate * g
 
