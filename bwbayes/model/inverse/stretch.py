@@ -64,6 +64,8 @@ def reached(
     points[-1] = far
     heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
     heights = np.maximum.accumulate(heights)
+    if goal[0] >= heights[-1]:
+        return np.full(target.shape, far)
     above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
     result = searched(
         lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
