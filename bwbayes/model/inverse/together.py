@@ -28,7 +28,7 @@ MANY = 50
 # Doublings of the first reach, V at least, for the voltage at which a record starts.
 DOUBLINGS, SHORTEST = 30, 1e-9
 
-# A zero may be so far beyond the unit circle by rounding.
+# By rounding a zero may be so far beyond the unit circle, and a voltage so far from its limit.
 ROUNDED = 1e-6
 
 
@@ -91,7 +91,9 @@ def together(
     )
     right &= invert(drive.step, memory, chains, result)
     right &= np.max(np.abs(sections.zeros), axis=1, initial=0.0) <= 1 + ROUNDED
-    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < chains.farthest)
+    # Bisection ends just before what is too far away.
+    farthest = (1 - ROUNDED) * chains.farthest
+    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < farthest)
 
 
 def _carried(sections: Sections, state: State | None) -> tuple[FloatArray, FloatArray]:
