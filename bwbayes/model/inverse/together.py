@@ -92,8 +92,8 @@ def together(
     right &= invert(drive.step, memory, chains, result)
     right &= np.max(np.abs(sections.zeros), axis=1, initial=0.0) <= 1 + ROUNDED
     # Bisection ends just before what is too far away.
-    farthest = (1 - ROUNDED) * chains.farthest
-    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < farthest)
+    most = (1 - ROUNDED) * chains.farthest
+    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < most)
 
 
 def _carried(sections: Sections, state: State | None) -> tuple[FloatArray, FloatArray]:
