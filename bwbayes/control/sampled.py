@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
@@ -22,8 +21,6 @@ from bwbayes.model.inverse.stepped import DriveStep, step_of
 from bwbayes.model.inverse.steps import Gone, HysteresisStep
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
-
-ComplexArray = NDArray[np.complex128]
 
 __all__ = [
     "BISECTION_ROUNDS",
@@ -34,7 +31,6 @@ __all__ = [
     "require_inverse",
     "resolution",
     "sections_of",
-    "zeros",
 ]
 
 # Rounds of the solver at most: some of Newton's, of which it needs a few, and should they not do,
@@ -267,20 +263,10 @@ class SampledModel:
 
 def sections_of(actuator: Actuator, column: dict[str, FloatArray]) -> Sections:
     """Return dynamics and creep of models given by the columns (models,) of θ."""
-    made = actuator.sections(column)
-    taps = [
-        np.stack([_padded(getattr(one, name)) for one in made.recursions], axis=1)
-        for name in ("numerator", "denominator")
-    ]
-    gains = np.stack(made.gains, axis=1)
+    numerator, denominator, gains = actuator.sections(column).taps
     # The first is that of the dynamics.
     crept = np.broadcast_to(np.arange(gains.shape[1]) > 0, gains.shape)
-    return Sections(taps[0], taps[1], gains, crept)
-
-
-def _padded(taps: FloatArray) -> FloatArray:
-    """Return taps (models, up to 3) as (models, 3)."""
-    return np.pad(taps, ((0, 0), (0, 3 - taps.shape[1])))
+    return Sections(numerator, denominator, gains, crept)
 
 
 def require_inverse(model: SampledModel, limits: Span) -> None:
@@ -298,30 +284,14 @@ def require_inverse(model: SampledModel, limits: Span) -> None:
             f"inverse: the model's slope may be as low as {least:.3g} um/V within {limits.low:g} "
             f"to {limits.high:g} V, so that a displacement has more than one voltage"
         )
-    for row in range(model.models):
-        for zero in zeros(model.sections, row):
-            if abs(zero) >= 1 or (zero.real < 0 and abs(zero) > LARGEST_ZERO):
-                raise InputError(
-                    "inverse: from sample to sample the voltage would swing on and on (the sampled "
-                    f"dynamics have a zero at {zero.real:.4g}); sample more slowly, or hold the "
-                    "voltage"
-                )
+    zeros = model.actuator.sections(model.column).zeros
+    for zero in zeros[(abs(zeros) >= 1) | ((zeros.real < 0) & (abs(zeros) > LARGEST_ZERO))]:
+        raise InputError(
+            "inverse: from sample to sample the voltage would swing on and on (the sampled "
+            f"dynamics have a zero at {zero.real:.4g}); sample more slowly, or hold the voltage"
+        )
 
 
 def resolution(limits: Span) -> float:
     """Return the change of a voltage at which its search ends, V: some units in its last place."""
     return float(4 * np.finfo(np.float64).eps * max(abs(limits.low), abs(limits.high)))
-
-
-def zeros(sections: Sections, row: int) -> ComplexArray:
-    """Return the zeros of a model's recursion: its inverse has them for poles."""
-    total = np.zeros(1)
-    for number, gain in enumerate(sections.gains[row]):
-        part = gain * np.trim_zeros(sections.numerator[row, number], "b")
-        for other in range(sections.gains.shape[1]):
-            if other != number:
-                part = np.polymul(part, np.trim_zeros(sections.denominator[row, other], "b"))
-        # Polynomials in 1/z: they begin together.
-        longest = max(total.size, part.size)
-        total = np.pad(total, (0, longest - total.size)) + np.pad(part, (0, longest - part.size))
-    return np.asarray(np.roots(np.trim_zeros(total, "f")), dtype=np.complex128)

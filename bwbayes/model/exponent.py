@@ -14,16 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.model.exponent_curves import MasterCurve, cells_of, logit_of_log, widths
 
 __all__ = ["ExponentFlow"]
 
-# All curves share the coordinate w = log(y / (1 - y)), where y in (0, 1) is z^n below the ceiling
-# and z^-n above it. Beyond |w| = 36, y or 1 - y is lost against one.
-_REACH = 36.0
-_STEP = 0.2
-_FAR_STEP = 0.12
-_WIDEST = 3.0
-_NODES, _WEIGHTS = (array / 2 for array in np.polynomial.legendre.leggauss(8))
 # Beyond this the ceiling is out of every stretch's reach, and its powers are still finite.
 _FARTHEST_CEILING = 1e100
 # Elements worked on at once, so that the intermediate arrays stay in the processor's cache.
@@ -102,24 +96,58 @@ class ExponentFlow:
         return displacement
 
     @cached_property
-    def _rising(self) -> _Curve:
+    def _rising(self) -> MasterCurve:
         """From zero up to the ceiling: dz/dtau = 1 - z^n, the time counted from z = 0."""
-        return _Curve.inside(self._exponent, 1.0)
+        return MasterCurve.inside(self._exponent, 1.0)
 
     @cached_property
-    def _relaxing(self) -> _Curve:
+    def _relaxing(self) -> MasterCurve:
         """From one down to zero, dz/dtau = -(1 + z^n), the time counted back from z = 0."""
-        return _Curve.inside(self._exponent, -1.0)
+        return MasterCurve.inside(self._exponent, -1.0)
 
     @cached_property
     def _fall_above(self) -> _Fall:
         """From above down to the ceiling: dz/dtau = 1 - z^n."""
-        return _Fall(_Curve.outside(self._exponent, 1.0), self._row, self._up_rate)
+        return _Fall(MasterCurve.outside(self._exponent, 1.0), self._row, self._up_rate)
 
     @cached_property
     def _fall_below(self) -> _Fall:
         """From above down to one: dz/dtau = -(1 + z^n)."""
-        return _Fall(_Curve.outside(self._exponent, -1.0), self._row, self._down_rate)
+        return _Fall(MasterCurve.outside(self._exponent, -1.0), self._row, self._down_rate)
+
+    @property
+    def scales(self) -> tuple[FloatArray, FloatArray]:
+        """The ceilings (models,) that z is in units of below zero and above, um."""
+        return self._down, self._up
+
+    def table(self) -> FloatArray:
+        """Curves through z = 0 by themselves, (models, 2, 4 + 8, cells), for what goes in steps.
+
+        That of rising, dz/dτ = 1 − zⁿ, and the one that g < 0 is on, backwards. In each cell are
+        the time and the height at its beginning, the anchor and width of the polynomials' variable
+        (:class:`_Pieces`), and their coefficients. There is a power of two of cells; those to spare
+        begin at infinity.
+        """
+        rising, relaxing = cells_of(self._rising), cells_of(self._relaxing)
+        highest = float(np.max((self._up / self._down)[self._softening], initial=0.0))
+        if highest > 1:
+            fall = MasterCurve.outside(self._exponent, -1.0)
+            first = int(np.searchsorted(-fall.coefficients[0].max(axis=0), -highest))
+            relaxing = np.concatenate(
+                (
+                    relaxing,
+                    cells_of(fall, self._relaxing.time[:, -1:])[..., : fall.logit.size - first],
+                ),
+                axis=2,
+            )
+        longest = max(rising.shape[2], relaxing.shape[2])
+        both = np.zeros((self._row.size, 2, 12, 1 << (longest - 1).bit_length()))
+        both[:, :, :2] = np.inf
+        both[:, 0, :, : rising.shape[2]] = rising[self._row]
+        soft = np.flatnonzero(self._softening)
+        both[:, 1] = both[:, 0]
+        both[soft, 1, :, : relaxing.shape[2]] = relaxing[self._row[soft]]
+        return both
 
     def _join_at_zero(self) -> _Pieces:
         """Both sides of g = 0 on one clock, in V, that reads zero there."""
@@ -132,7 +160,7 @@ class ExponentFlow:
         return _Pieces(
             knots=np.hstack((-before[:, :0:-1], after[:, :-1])),
             anchors=np.hstack((-before[:, -2::-1], after[:, :-1])),
-            widths=np.hstack((-_widths(before)[:, ::-1], _widths(after))),
+            widths=np.hstack((-widths(before)[:, ::-1], widths(after))),
             coefficients=np.concatenate(
                 (-down * mirrored[:, :, ::-1], up * rising.coefficients[:, row]), axis=2
             ),
@@ -195,86 +223,13 @@ class _Pieces:
 
 
 @dataclass(frozen=True)
-class _Curve:
-    """One master curve per exponent: z(time) where |dz/dtime| = |1 - sign z^n|, tabulated.
-
-    The time to a node is the integral of dz / |1 - sign z^n|, which in the coordinate w is the
-    integral of y^power / (n (1 + (1 - sign) e^w)) with power 1/n inside and 1 - 1/n outside: it is
-    smooth, and Gauss-Legendre quadrature on each cell is exact to rounding.
-
-    exponent : shape (curves,)
-    logit : shape (nodes,), the nodes' w
-    time : shape (curves, nodes) for a curve outside; one more node, at zero, for one inside
-    coefficients : shape (8, curves, cells), of z in the fraction of each cell's time
-    """
-
-    exponent: FloatArray
-    sign: float
-    power: FloatArray
-    logit: FloatArray
-    time: FloatArray
-    coefficients: FloatArray
-
-    @classmethod
-    def inside(cls, exponent: FloatArray, sign: float) -> _Curve:
-        """Curves through 0 <= z < 1; the time is counted from z = 0, where it equals z."""
-        half = _graded_half(_STEP)
-        logit = np.concatenate((-half[:0:-1], half))
-        n = exponent[:, None]
-        z = np.exp(-np.logaddexp(0.0, -logit) / n)
-        y = np.exp(-np.logaddexp(0.0, -logit))
-        complement = np.exp(-np.logaddexp(0.0, logit))
-        speed = complement + (1.0 - sign) * y
-        time = z[:, :1] + _durations(logit, 1.0 / exponent, exponent, sign)
-        coefficients = _hermite(time, _derivatives(z, speed, -sign * y, n))
-        # Between zero and the first node z^n is lost against one: z is the time itself.
-        first = np.zeros((8, exponent.size, 1))
-        first[1, :, 0] = z[:, 0]
-        return cls(
-            exponent,
-            sign,
-            1.0 / exponent,
-            logit,
-            np.hstack((np.zeros_like(n), time)),
-            np.concatenate((first, coefficients), axis=2),
-        )
-
-    @classmethod
-    def outside(cls, exponent: FloatArray, sign: float) -> _Curve:
-        """Curves down from z^n = e^36 towards 1; the time is counted from this top."""
-        even = np.linspace(-_REACH, 0.0, round(_REACH / _FAR_STEP) + 1)
-        logit = np.concatenate((even, _graded_half(_FAR_STEP)[1:]))
-        n = exponent[:, None]
-        z = np.exp(np.logaddexp(0.0, -logit) / n)
-        y_inverse = np.exp(np.logaddexp(0.0, -logit))
-        speed = -np.exp(-logit) - (1.0 - sign)
-        time = _durations(logit, 1.0 - 1.0 / exponent, exponent, sign)
-        coefficients = _hermite(time, _derivatives(z, speed, -y_inverse, n))
-        return cls(exponent, sign, 1.0 - 1.0 / exponent, logit, time, coefficients)
-
-    def time_at(self, z: FloatArray, row: IntArray) -> FloatArray:
-        """Time at which curve row[i] passes z[i], all of shape (models,), on an inside curve."""
-        n = self.exponent[row]
-        logit = _logit_of_log(n * np.log(np.clip(z, 1e-300, 1.0)))
-        return np.where(logit <= self.logit[0], z, self.time_at_logit(logit, row, skip=1))
-
-    def time_at_logit(self, logit: FloatArray, row: IntArray, skip: int = 0) -> FloatArray:
-        """Time at the coordinates logit (models,), kept within the nodes."""
-        within = np.clip(logit, self.logit[0], self.logit[-1])
-        cell = np.searchsorted(self.logit[1:-1], within, side="right")
-        left = self.logit[cell]
-        partial = _integral(left, within, self.power[row], self.exponent[row], self.sign)
-        return self.time[row, cell + skip] + partial
-
-
-@dataclass(frozen=True)
 class _Fall:
     """Models that start above z = 1 and come down, all models on row[i] of the curve.
 
     row, rate : shape (models,); the rate is that of tau, in 1/V
     """
 
-    curve: _Curve
+    curve: MasterCurve
     row: IntArray
     rate: FloatArray
 
@@ -285,7 +240,7 @@ class _Fall:
         return _Pieces(
             knots=time[:, :-1],
             anchors=time[:, :-1],
-            widths=_widths(time),
+            widths=widths(time),
             coefficients=self.curve.coefficients[:, self.row],
         )
 
@@ -310,7 +265,7 @@ class _Fall:
         """Time (V) since the curve's top; below zero for starts above the top."""
         row = self.row[models]
         power, n = self.curve.power[row], self.curve.exponent[row]
-        logit = _logit_of_log(-n * np.log(height))
+        logit = logit_of_log(-n * np.log(height))
         excess = np.maximum(self.curve.logit[0] - logit, 0.0)
         power = np.maximum(power, 1e-100)  # n = 1: the limit, -excess
         lead = np.exp(power * self.curve.logit[0]) * np.expm1(-power * excess) / (power * n)
@@ -332,66 +287,3 @@ def _ceiling(alpha: FloatArray, slope: FloatArray, exponent: FloatArray) -> Floa
     log_slope = np.log(np.where(slope > 0, slope, 1.0))
     log_ceiling = np.where(slope > 0, (np.log(alpha) - log_slope) / exponent, np.inf)
     return np.exp(np.minimum(log_ceiling, np.log(_FARTHEST_CEILING)))
-
-
-def _graded_half(step: float) -> FloatArray:
-    """Cell ends from w = 0 to the reach, wider outwards as what they resolve fades like e^-w."""
-    ends = [0.0]
-    while ends[-1] < _REACH:
-        ends.append(ends[-1] + min(step * np.exp(ends[-1] / 8), _WIDEST))
-    return np.array(ends)
-
-
-def _widths(time: FloatArray) -> FloatArray:
-    """Lengths of the cells; none is zero, though time may stand still between the last nodes."""
-    return np.maximum(np.diff(time), 1e-290)
-
-
-def _logit_of_log(log_y: FloatArray) -> FloatArray:
-    """Return w = log(y / (1 - y)) from log y <= 0; y = 1 counts as just below one."""
-    log_y = np.minimum(log_y, -1e-17)
-    return np.asarray(log_y - np.log(-np.expm1(log_y)))
-
-
-def _integral(
-    left: FloatArray, right: FloatArray, power: FloatArray, exponent: FloatArray, sign: float
-) -> FloatArray:
-    """Time from logit `left` to `right` (arrays that broadcast with power and exponent)."""
-    width = right - left
-    w = (left + width / 2)[..., None] + width[..., None] * _NODES
-    log_y = -np.logaddexp(0.0, -w)
-    speed = 1.0 + (1.0 - sign) * np.exp(w)
-    return np.asarray(width * ((np.exp(power[..., None] * log_y) / speed) @ _WEIGHTS) / exponent)
-
-
-def _durations(
-    logit: FloatArray, power: FloatArray, exponent: FloatArray, sign: float
-) -> FloatArray:
-    """Time from the first node to each node, shape (curves, nodes)."""
-    steps = _integral(logit[:-1], logit[1:], power[:, None], exponent[:, None], sign)
-    return np.hstack((np.zeros((exponent.size, 1)), np.cumsum(steps, axis=1)))
-
-
-def _derivatives(
-    z: FloatArray, speed: FloatArray, powered: FloatArray, n: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return z and its first three time derivatives: dz/dtime = speed = constant + powered."""
-    # The powered part goes as z^n, so its derivatives by z are n/z, (n-1)/z, ... times it.
-    slope = n * powered / z
-    curvature = (n - 1.0) * slope / z
-    first = np.broadcast_to(speed, z.shape)
-    return z, first, first * slope, first * (slope**2 + first * curvature)
-
-
-def _hermite(
-    time: FloatArray, derivatives: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-) -> FloatArray:
-    """Coefficients (8, curves, cells) of the polynomials that match both ends of each cell."""
-    powers = [np.diff(time) ** order / factorial for order, factorial in enumerate((1, 1, 2, 6))]
-    a0, a1, a2, a3 = (p * d[:, :-1] for p, d in zip(powers, derivatives, strict=True))
-    b0, b1, b2, b3 = (p * d[:, 1:] for p, d in zip(powers, derivatives, strict=True))
-    # What the cubic from the left end misses at the right end fixes the four upper coefficients.
-    missed = (b0 - a0 - a1 - a2 - a3, b1 - a1 - 2 * a2 - 3 * a3, b2 - a2 - 3 * a3, b3 - a3)
-    weights = ((35, -15, 5, -1), (-84, 39, -14, 3), (70, -34, 13, -3), (-20, 10, -4, 1))
-    upper = (sum(m * r for m, r in zip(row, missed, strict=True)) for row in weights)
-    return np.stack((a0, a1, a2, a3, *upper))

@@ -43,6 +43,9 @@ ComplexArray = NDArray[np.complex128]
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
 
+# Stands for a first tap of zero.
+TINY = 1e-100
+
 
 def parse_hold(name: str) -> Hold:
     """Return the hold called "zoh" (zero-order) or "foh" (first-order).
@@ -134,6 +137,32 @@ class Sections:
         """Largest part (models,) of a free response that is left after a sample, below one."""
         return np.asarray(np.max([one.remembered for one in self.recursions], axis=0))
 
+    @property
+    def taps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Numerators and denominators (models, sections, 3), and gains (models, sections)."""
+        taps = np.zeros((2, self.gains[0].size, len(self.gains), 3))
+        for number, one in enumerate(self.recursions):
+            taps[0, :, number, : one.numerator.shape[1]] = one.numerator
+            taps[1, :, number, : one.denominator.shape[1]] = one.denominator
+        return taps[0], taps[1], np.stack(self.gains, axis=1)
+
+    @property
+    def zeros(self) -> ComplexArray:
+        """Zeros (models, any) from one drive to x: the inverse has them for poles."""
+        total = np.zeros((1, 1))
+        for number, gain in enumerate(self.gains):
+            product = gain[:, np.newaxis] * self.recursions[number].numerator
+            for other in self.recursions[:number] + self.recursions[number + 1 :]:
+                product = _multiplied(product, other.denominator)
+            total = total + product
+        # A drive that is held has no first tap.
+        total = total[:, int(np.argmax(total.any(axis=0))) :]
+        first = np.where(total[:, :1] == 0, TINY, total[:, :1])
+        companions = np.zeros((len(total), total.shape[1] - 1, total.shape[1] - 1))
+        companions[:, :1] = (-total[:, 1:] / first)[:, np.newaxis]
+        companions[:, 1:, :-1] = np.eye(companions.shape[1])[1:, 1:]
+        return np.asarray(np.linalg.eigvals(companions), dtype=np.complex128)
+
     def begin(self, unrest: FloatArray | None) -> tuple[FloatArray, ...]:
         """Return the states of sections that are ``unrest`` (models, unknowns) away from rest."""
         if unrest is None or not unrest.size:
@@ -162,6 +191,14 @@ class Sections:
         parts = zip(self.recursions, self.gains, strict=True)
         responses = [gain[:, None, None] * one.free_responses(samples) for one, gain in parts]
         return np.concatenate(responses, axis=1)
+
+
+def _multiplied(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the products of polynomials (models, taps)."""
+    result = np.zeros((len(one), one.shape[1] + other.shape[1] - 1))
+    for place in range(other.shape[1]):
+        result[:, place : place + one.shape[1]] += one * other[:, place : place + 1]
+    return result
 
 
 def no_dynamics(models: int, hold: Hold) -> Recursion:

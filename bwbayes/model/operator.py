@@ -15,7 +15,6 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.inverse.stretch import reached
 
 __all__ = ["UNIT", "Operator", "Span", "narrower"]
 
@@ -94,25 +93,6 @@ class Operator(ABC):
 
         The memory that is given stays as it is.
         """
-
-    def inverse(
-        self, column: Values, displacement: FloatArray, memory: Any, start: float, edge: float
-    ) -> FloatArray:
-        """Return the voltages (samples,) at which one model has displacements, V.
-
-        These (samples,), um, go one way from where the ``memory`` is, which is at the voltage
-        ``start``, V; the voltage goes towards ``edge``, and stays there where that does not
-        suffice. By default a safeguarded search along :meth:`advance`; an operator with a closed
-        form has it here.
-        """
-
-        def along(voltage: FloatArray) -> FloatArray:
-            path: FloatArray = self.advance(column, voltage, memory)[0][0]
-            return path
-
-        slope = abs(float(self.gain(column, Span(min(start, edge), max(start, edge)))[0]))
-        asked = float(np.max(np.abs(displacement - along(np.array([start]))[0])))
-        return reached(along, displacement, start, edge, asked / slope if slope > 0 else 1.0)
 
     @abstractmethod
     def reachable(

@@ -1,8 +1,8 @@
 """One actuator read backwards, along stretches that go one way.
 
 The offset is taken off, creep and dynamics are undone, and what is left, the drive, is what
-hysteresis and gain must make. It turns where the voltage does, so that each stretch is one search,
-or one closed form, for all of its samples.
+hysteresis and gain must make. It turns where the voltage does, so that each stretch is one search
+for all of its samples.
 """
 
 from __future__ import annotations
@@ -173,20 +173,32 @@ class One:
         whole = Path(path.low, path.high)
         here, memory = self._along(np.array([start]), memory)
         joined = np.concatenate([here, drive[done:]])
-        longest = LONGEST if math.isinf(path.step) else 1
-        for first, last, _ in monotone_stretches(joined, longest):
-            if last == first:
-                continue
-            limit = whole
-            # The first voltage of a record is not a step from anything.
-            if first + done > 0 or self.state is not None:
-                limit = Path(max(path.low, start - path.step), min(path.high, start + path.step))
-            part = self._stretch(
-                joined[first + 1 : last + 1], float(here[-1]), start, memory, limit
-            )
-            result[done + first : done + last] = part
-            here, memory = self._along(part, memory)
-            start = float(part[-1])
+        free, behind = done == 0 and self.state is None, False
+        for begin, last, _ in monotone_stretches(joined, LONGEST):
+            first = begin
+            while first < last:
+                end, limit = last, whole
+                if behind and not free:
+                    end = first + 1
+                    limit = Path(
+                        max(path.low, start - path.step), min(path.high, start + path.step)
+                    )
+                part = self._stretch(
+                    joined[first + 1 : end + 1], float(here[-1]), start, memory, limit
+                )
+                fast = np.abs(np.diff(part, prepend=start)) > path.step
+                # The first voltage of a record is not a step from anything.
+                fast[0] &= not free
+                if behind:
+                    behind = bool(part[0] in (limit.low, limit.high))
+                elif fast.any():
+                    # From there on a sample at a time, until the drive is where it is to be.
+                    part, behind = part[: int(np.argmax(fast))], True
+                if part.size:
+                    result[done + first : done + first + part.size] = part
+                    here, memory = self._along(part, memory)
+                    start, free = float(part[-1]), False
+                first += part.size
         return result
 
     def _stretch(
@@ -199,9 +211,6 @@ class One:
         goal = here + s * np.maximum(s * (target - here), 0.0)
         if goal[-1] == here or s * (edge - start) <= 0:
             return np.full(target.shape, start)
-        if self.actuator.gain is None:
-            operator = self.actuator.hysteresis
-            return operator.inverse(self.column, goal, memory, start, edge)
         asked = abs(float(goal[-1]) - here)
         first = asked / self.slope if self.slope > 0 else 1.0
         return reached(lambda u: self._along(u, memory)[0], goal, start, edge, first)

@@ -2,8 +2,8 @@
 
 The offset is taken off, creep and dynamics are undone (:mod:`bwbayes.model.inverse.dynamics`), and
 what is left, the drive, is what hysteresis and gain must make. They do so along stretches that go
-one way: the drive turns where the voltage does, so that each stretch is one search, or one closed
-form, for all of its samples (:meth:`bwbayes.model.operator.Operator.inverse`).
+one way: the drive turns where the voltage does, so that each stretch is one search for all of its
+samples (:func:`bwbayes.model.inverse.stretch.reached`), whatever the operator.
 
 What is done to each model is done to it alone (:mod:`bwbayes.model.inverse.alone`): the models of a
 batch have voltages of their own. Where there are many, those whose hysteresis has a step go side by

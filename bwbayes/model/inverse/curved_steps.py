@@ -12,14 +12,16 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.special import digamma, hyp2f1
+from scipy.special import digamma
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.inverse.steps import Gone, HysteresisStep, not_zero, of_one_state, relaxed
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.model.elementwise import anywhere, look_up, select
+from bwbayes.model.exponent import ExponentFlow
+from bwbayes.model.inverse.steps import Gone, OneStateStep, not_zero, relaxed
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.duhem import phi_functions
 
-__all__ = ["POWER_ROUNDS", "AsymmetricStep", "DuhemStep", "PowerStep"]
+__all__ = ["AsymmetricStep", "DuhemStep", "PowerStep", "clock", "find_cell", "height_at"]
 
 # Voltages at which a slope is looked at.
 LOOKED = 1001
@@ -37,29 +39,17 @@ SLOW = 1e-6
 # Stands for a rate of zero, beside the others.
 SMALL = 1e-30
 
+# Where the table begins among the numbers of a power's step; rounds of Newton's rule in a cell.
+TABLE, NEWTON_ROUNDS = 7, 4
+
+# By so much of itself h may be above its ceiling.
+ROUNDED = 1e-9
+
 EPSILON = float(np.finfo(np.float64).eps)
 
 
-class _OneState(HysteresisStep):
-    """A step that remembers the voltage and one displacement, (models, 2)."""
-
-    d: FloatArray
-
-    def demagnetised(self) -> FloatArray:
-        """Return zero volts and h = 0."""
-        return np.zeros((self.d.size, 2))
-
-    def remembered(self, memory: Any) -> FloatArray:
-        """Return voltage and h."""
-        return of_one_state(memory)
-
-    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
-        """Return voltage and h."""
-        return np.stack([voltage, initial], axis=1)
-
-
 @dataclass(frozen=True)
-class AsymmetricStep(_OneState):
+class AsymmetricStep(OneStateStep):
     """w = d u − h with asymmetric n = 1 Bouc-Wen hysteresis, in closed form.
 
     It is :class:`~bwbayes.model.operators.bouc_wen_asymmetric.BoucWenAsymmetric`.
@@ -79,24 +69,33 @@ class AsymmetricStep(_OneState):
     against: FloatArray
     ahead: FloatArray
 
-    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return d u − h, its slope d − α + c g, and the voltage with h."""
-        up = voltage >= memory[:, 0]
-        s = np.where(up, 1.0, -1.0)
-        start, travel = s * memory[:, 0], np.abs(voltage - memory[:, 0])
-        early = np.clip(-start, 0.0, travel)
-        # Towards zero volts first, where s x = −1; then away from them.
-        before, after = ([np.where(up, c[1, x], c[0, 1 - x]) for c in self.rates] for x in (0, 1))
-        g, slow = relaxed(s * memory[:, 1], early, self.alpha, *before)
-        g, rate = relaxed(g, travel - early, self.alpha, *after)
-        rate = np.where((start < 0) & (travel <= -start), slow, rate)
-        h = s * g
-        return Gone(self.d * voltage - h, self.d - self.alpha + rate * g, np.stack([voltage, h], 1))
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """d, α, and the rates c below zero and above, by s and x, not exactly zero."""
+        models = self.d.size
+        rates = [not_zero(c).reshape(-1, models) for c in (self.against, self.ahead)]
+        return np.vstack([self.d, self.alpha, *rates]).T
 
-    @property
-    def rates(self) -> tuple[FloatArray, FloatArray]:
-        """The rates c below zero and above, not exactly zero."""
-        return not_zero(self.against), not_zero(self.ahead)
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return d u − h and its slope d − α + c g."""
+        d, alpha = parameters[0], parameters[1]
+        up = voltage >= memory[0]
+        s = select(up, 1.0, -1.0)
+        start, travel = s * memory[0], np.abs(voltage - memory[0])
+        early = np.minimum(np.maximum(-start, 0.0), travel)
+        # Towards zero volts first, where s x = −1; then away from them.
+        g, slow = s * memory[1], 0.0 * s
+        if anywhere(start < 0.0):
+            against = select(up, parameters[4], parameters[3])
+            ahead = select(up, parameters[8], parameters[7])
+            g, slow = relaxed(g, early, alpha, against, ahead)
+        against = select(up, parameters[5], parameters[2])
+        ahead = select(up, parameters[9], parameters[6])
+        g, rate = relaxed(g, travel - early, alpha, against, ahead)
+        rate = select((start < 0.0) & (travel <= -start), slow, rate)
+        after[0], after[1] = voltage, s * g
+        return d * voltage - s * g, d - alpha + rate * g
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d − α + c g at the ceilings: h is steepest just after a turn."""
@@ -110,13 +109,13 @@ class AsymmetricStep(_OneState):
 
     def coefficients(self) -> dict[str, Any]:
         """Return d, α and the rates c by direction and sign."""
-        against, ahead = (rate[..., 0].tolist() for rate in self.rates)
+        against, ahead = self.parameters[0, 2:].reshape(2, 2, 2).tolist()
         numbers = {"d": float(self.d[0]), "alpha": float(self.alpha[0])}
         return {"kind": "asymmetric", **numbers, "against": against, "ahead": ahead}
 
 
 @dataclass(frozen=True)
-class DuhemStep(_OneState):
+class DuhemStep(OneStateStep):
     """w = f(u) − h with Duhem hysteresis, exact.
 
     It is :class:`~bwbayes.model.operators.duhem.Duhem`. Along a step of direction
@@ -138,29 +137,28 @@ class DuhemStep(_OneState):
     strength: FloatArray
     beta: FloatArray
 
-    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return f(u) − h, its slope f′ − α(u) + s β h, and the voltage with h."""
-        start, h = memory.T
-        s = np.where(voltage < start, -1.0, 1.0)
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """d, d₂, d₃, α, α₁, α₂ and β."""
+        return np.stack([self.d, *self.curve, *self.strength, self.beta], axis=1)
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return f(u) − h and its slope f′ − α(u) + s β h."""
+        d, d2, d3 = parameters[0], parameters[1], parameters[2]
+        alpha, alpha1, alpha2, beta = parameters[3], parameters[4], parameters[5], parameters[6]
+        start, h = memory[0], memory[1]
+        s = select(voltage < start, -1.0, 1.0)
         v = s * (voltage - start)
-        strength, tilt, half = self._about(start)
-        one, two, three = phi_functions(self.beta * v)
-        step = v * (tilt * two + v * (2 * s * half * three))
-        h = h + v * ((s * strength - self.beta * h) * one + step)
-        d2, d3 = self.curve
-        w = voltage * (self.d + voltage * (d2 + voltage * d3)) - h
-        return Gone(w, self._slope(voltage) + s * self.beta * h, np.stack([voltage, h], axis=1))
-
-    def _about(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return α, α′ and α″/2 at a voltage."""
-        first, second, third = self.strength
-        return first + voltage * (second + voltage * third), second + 2 * voltage * third, third
-
-    def _slope(self, voltage: FloatArray) -> FloatArray:
-        """Return f′ − α(u)."""
-        d2, d3 = self.curve
-        rise: FloatArray = self.d + voltage * (2 * d2 + 3 * voltage * d3) - self._about(voltage)[0]
-        return rise
+        one, two, three = phi_functions(beta * v)
+        tilt = alpha1 + 2 * start * alpha2
+        step = v * (tilt * two + v * (2 * s * alpha2 * three))
+        strength = alpha + start * (alpha1 + start * alpha2)
+        h = h + v * ((s * strength - beta * h) * one + step)
+        after[0], after[1] = voltage, h
+        slope = d + voltage * (2 * d2 + 3 * voltage * d3)
+        slope = slope - (alpha + voltage * (alpha1 + voltage * alpha2)) + s * beta * h
+        return voltage * (d + voltage * (d2 + voltage * d3)) - h, slope
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return f′ − α(u) ∓ β h, with h on the loop over all of the limits: none is larger."""
@@ -169,17 +167,19 @@ class DuhemStep(_OneState):
         alike = replace(self, beta=beta)
         kept = np.exp(-beta * (high - low))
 
-        def swept(start: float, end: float, h: FloatArray) -> FloatArray:
-            return alike.go(np.stack([np.full_like(h, start), h], 1), np.full_like(h, end)).memory
+        def swept(start: float, end: float, h: FloatArray) -> Gone:
+            return alike.go(np.stack([np.full_like(h, start), h], 1), np.full_like(h, end))
 
         nothing = np.zeros_like(beta)
-        rise, fall = swept(low, high, nothing)[:, 1], swept(high, low, nothing)[:, 1]
+        rise, fall = (swept(*ends, nothing).memory[:, 1] for ends in ((low, high), (high, low)))
         at_high = (kept * fall + rise) / (1 - kept**2)
         at_low = kept * at_high + fall
         least, most = np.full_like(beta, np.inf), np.full_like(beta, -np.inf)
         for u in np.linspace(low, high, LOOKED):
-            h = np.maximum(swept(low, u, at_low)[:, 1], -swept(high, u, at_high)[:, 1])
-            slope = self._slope(np.full_like(beta, u))
+            up, down = swept(low, u, at_low), swept(high, u, at_high)
+            h = np.maximum(up.memory[:, 1], -down.memory[:, 1])
+            # Without any h it is f′ − α.
+            slope = swept(u, u, nothing).slope
             least = np.minimum(least, slope - self.beta * h)
             most = np.maximum(most, slope + self.beta * h)
         return least, most
@@ -193,16 +193,13 @@ class DuhemStep(_OneState):
 
 
 @dataclass(frozen=True)
-class PowerStep(_OneState):
+class PowerStep(OneStateStep):
     """w = d u − h with Bouc-Wen hysteresis h of any exponent n ≥ 1.
 
     Along a step of direction s, g = s h follows dg/dv = α − c gⁿ with c = β + γ from zero on; below
-    zero −g follows the same with c = γ − β, backwards. The voltage from g = 0 on is
-
-        v(g) = (g/α) F(x),   F(x) = ₂F₁(1, 1/n; 1 + 1/n; x),   x = (c/α) gⁿ,
-
-    so that a step adds to v(g), and g is where v(g) then is: Newton's rule between bounds, and
-    bisection should that not do.
+    zero −g follows the same with c = γ − β, backwards. In units of the ceiling it is on a curve
+    that depends on n alone (:class:`~bwbayes.model.exponent.ExponentFlow`), whose time is looked up
+    in a table; a step adds to that time, and the table says which g is there.
 
     Parameters
     ----------
@@ -227,50 +224,37 @@ class PowerStep(_OneState):
         with np.errstate(divide="ignore", over="ignore"):
             return np.asarray((1 / self.rates[1]) ** (1 / self.exponent))
 
-    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return d u − h, its slope d − α + c gⁿ, and the voltage with h."""
-        s = np.where(voltage < memory[:, 0], -1.0, 1.0)
-        travel = np.abs(voltage - memory[:, 0])
-        top = self.ceiling
-        g = np.clip(s * memory[:, 1], -top, top)
-        g = self._reached(g, travel)
-        h = s * g
-        slope = self.d - self.alpha * (1 - self._x(g))
-        return Gone(self.d * voltage - h, slope, np.stack([voltage, h], axis=1))
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """d, α, c/α, scales and rates below zero and above, n, and the curves' table."""
+        flow = ExponentFlow(self.alpha, self.beta, self.gamma, self.exponent)
+        numbers = self.d, self.alpha, *self.rates, *flow.scales, self.exponent
+        return np.column_stack([*numbers, flow.table().reshape(self.d.size, -1)])
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return d u − h and its slope d − α + c gⁿ."""
+        d, alpha, n = parameters[0], parameters[1], parameters[6]
+        s = select(voltage < memory[0], -1.0, 1.0)
+        g = s * memory[1]
+        scale = select(g < 0.0, parameters[4], parameters[5])
+        time = clock(parameters, g < 0.0, np.abs(g) / scale) * scale / alpha
+        time = select(g < 0.0, -time, time) + np.abs(voltage - memory[0])
+        scale = select(time < 0.0, parameters[4], parameters[5])
+        height = scale * height_at(parameters, time < 0.0, np.abs(time) * alpha / scale)
+        h = s * select(time < 0.0, -height, height)
+        after[0], after[1] = voltage, h
+        x = select(time < 0.0, parameters[2], parameters[3]) * height**n
+        return d * voltage - h, d - alpha * (1 - x)
+
+    def holds(self, memory: FloatArray) -> BoolArray:
+        """Tell which models' h is not above the ceiling, from where it would come down."""
+        return np.asarray(np.abs(memory[:, 1]) <= self.ceiling * (1 + ROUNDED))
 
     def _x(self, g: FloatArray) -> FloatArray:
         """Return x with the sign that 1 − x = h′/α asks for, (models,)."""
         below, above = self.rates
         return np.where(g < 0, below, above) * np.abs(g) ** self.exponent
-
-    def _clock(self, g: FloatArray) -> FloatArray:
-        """Return v(g), V; infinite at the ceiling."""
-        part = 1 / self.exponent
-        x = np.minimum(self._x(g), 1.0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            v = g / self.alpha * hyp2f1(1.0, part, 1 + part, x)
-        return np.where(x < 1, v, np.copysign(np.inf, g))
-
-    def _reached(self, start: FloatArray, travel: FloatArray) -> FloatArray:
-        """Return g (models,), um, after a travel (models,), V, from a start; a ceiling is kept."""
-        until = self._clock(start) + travel
-        # Nowhere is it steeper than at its start, or at zero.
-        farthest = self.alpha * np.maximum(1 - self._x(start), 1.0) * travel
-        low, high = start, np.minimum(self.ceiling, start + farthest)
-        close = CLOSE * (np.abs(start) + farthest)
-        newton, bisection = POWER_ROUNDS
-        g = start
-        for done in range(newton + bisection):
-            with np.errstate(invalid="ignore"):
-                off = self._clock(g) - until
-                better = g - off * self.alpha * (1 - self._x(g))
-            low, high = np.where(off < 0, g, low), np.where(off < 0, high, g)
-            inside = (better >= low) & (better <= high) & (done < newton)
-            better = np.where(inside, better, (low + high) / 2)
-            moved, g = np.abs(better - g), better
-            if np.all(moved <= close):
-                break
-        return np.where(np.isfinite(until) & (travel > 0), g, start)
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return d − max(α, 2 α β / (β + γ)) and d: h is steepest just after a turn."""
@@ -300,3 +284,46 @@ class PowerStep(_OneState):
             "close": CLOSE,
             "ceiling": above ** (-1 / n),
         }
+
+
+def clock(parameters: Any, below: Any, height: Any) -> Any:
+    """Return the time at which the curve below zero, or above, is at a height."""
+    cells = (len(parameters) - TABLE) // 24
+    cell = find_cell(parameters, below, 1, height)
+    start, width = look_up(parameters, cell + 2 * cells), look_up(parameters, cell + 3 * cells)
+    low = look_up(parameters, cell + 4 * cells)
+    ends = 0.0 * low
+    for order in range(1, 8):
+        ends = ends + look_up(parameters, cell + (4 + order) * cells)
+    part = (height - low) / select(ends == 0.0, 1.0, ends)
+    for _ in range(NEWTON_ROUNDS):
+        part = np.minimum(np.maximum(part, 0.0), 1.0)
+        value, slope = 0.0 * low, 0.0 * low
+        for order in range(7, -1, -1):
+            slope = slope * part + value
+            value = value * part + look_up(parameters, cell + (4 + order) * cells)
+        part = part - (value - height) / select(slope == 0.0, 1.0, slope)
+    return start + width * np.minimum(np.maximum(part, 0.0), 1.0)
+
+
+def height_at(parameters: Any, below: Any, time: Any) -> Any:
+    """Return the height at which the curve below zero, or above, is at a time."""
+    cells = (len(parameters) - TABLE) // 24
+    cell = find_cell(parameters, below, 0, time)
+    part = (time - look_up(parameters, cell + 2 * cells)) / look_up(parameters, cell + 3 * cells)
+    part, value = np.minimum(np.maximum(part, 0.0), 1.0), 0.0 * time
+    for order in range(7, -1, -1):
+        value = value * part + look_up(parameters, cell + (4 + order) * cells)
+    return value
+
+
+def find_cell(parameters: Any, below: Any, row: int, value: Any) -> Any:
+    """Return where the cell of a curve begins in whose range a value of the row lies."""
+    cells = (len(parameters) - TABLE) // 24
+    first = select(below, 1.0 * TABLE + 12 * cells, 1.0 * TABLE)
+    cell, half = first, cells // 2
+    while half > 0:
+        later = cell + half
+        cell = select(look_up(parameters, later + row * cells) <= value, later, cell)
+        half //= 2
+    return cell

@@ -1,9 +1,8 @@
-"""Where along one monotone stretch a displacement is reached: for any operator, and in closed form.
+"""Where along one monotone stretch a displacement is reached, for any operator.
 
 Along a stretch the voltage goes one way, and so does the displacement. So each sample asks for one
 root of one rising curve. :func:`reached` finds all of them together for any curve that can be
-walked along; :func:`travel` is the closed form for a slope that settles exponentially, which n = 1
-Bouc-Wen and Prandtl-Ishlinskii with exponential thresholds share.
+walked along.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.special import lambertw, wrightomega
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["reached", "searched", "travel"]
+__all__ = ["reached", "searched"]
 
 # Places at which a curve is looked at first.
 GRID = 33
@@ -24,12 +22,6 @@ GRID = 33
 DOUBLINGS, ROUNDS = 60, 100
 
 EPSILON = float(np.finfo(np.float64).eps)
-
-# Below this rate times travel a curve counts as straight for the first guess.
-STRAIGHT = 1e-6
-
-# Newton's steps after the closed form: they take away what cancels in it.
-POLISHED = 2
 
 
 def reached(
@@ -72,6 +64,8 @@ def reached(
     points[-1] = far
     heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
     heights = np.maximum.accumulate(heights)
+    if goal[0] >= heights[-1]:
+        return np.full(target.shape, far)
     above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
     result = searched(
         lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
@@ -141,37 +135,3 @@ def searched(
             narrow = np.minimum(np.nan_to_num(narrow, nan=0.5), 0.5)
             part = np.clip(part, narrow, 1 - narrow)
     return best
-
-
-def travel(steepness: float, missing: float, rate: float, rise: FloatArray) -> FloatArray:
-    """Return the v ≥ 0 (samples,), V, at which d v − m (1 − exp(−c v)) / c is the rise.
-
-    Parameters
-    ----------
-    steepness
-        d, the slope far along the stretch, um/V.
-    missing
-        m < d, by how much less the slope is at its start, um/V.
-    rate
-        c, 1/V, of any sign, not zero.
-    rise
-        (samples,), um, not negative.
-
-    Notes
-    -----
-    With y = c v, A = m/d and B = A + c rise / d it is y + A exp(−y) = B, so y = B + W(−A exp(−B))
-    with Lambert's W; for A < 0, where its argument could overflow, by Wright's ω
-    (:func:`scipy.special.wrightomega`). Newton's steps take away what cancels where c v is small.
-    """
-    part, goal = missing / steepness, (missing + rate * rise) / steepness
-    if abs(rate) * rise.max(initial=0.0) < STRAIGHT * (steepness - missing) or part == 0:
-        v = rise / (steepness - missing)
-    elif part > 0:
-        turned = lambertw(-part * np.exp(-goal))  # type: ignore[call-overload]  # takes arrays too
-        v = (goal + turned.real) / rate
-    else:
-        v = (goal + wrightomega(np.log(-part) - goal)) / rate
-    for _ in range(POLISHED):
-        gone = np.expm1(-rate * v)
-        v = v - (steepness * v + missing * gone / rate - rise) / (steepness - missing * (1 + gone))
-    return np.maximum(v, 0.0)

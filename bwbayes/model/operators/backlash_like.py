@@ -14,7 +14,6 @@ from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
-    Memory,
     OneState,
     alpha,
     below_d,
@@ -22,7 +21,6 @@ from bwbayes.model.operators.one_state import (
     d,
     initial,
     refuse,
-    relaxed,
 )
 
 __all__ = ["BacklashLike"]
@@ -71,15 +69,6 @@ class BacklashLike(OneState):
         after = h[:, -1].copy()
         np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
         return h, after
-
-    def inverse(
-        self, column: Values, displacement: FloatArray, memory: Memory, start: float, edge: float
-    ) -> FloatArray:
-        """Return the voltages (samples,) of displacements, by Lambert's W."""
-        closed = relaxed(column, displacement, memory, edge)
-        if closed is None:
-            return super().inverse(column, displacement, memory, start, edge)
-        return closed
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""

@@ -23,14 +23,12 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     HIGHEST_CEILING,
-    Memory,
     OneState,
     alpha,
     below_d,
     d,
     initial,
     refuse,
-    relaxed,
 )
 
 __all__ = ["BoucWen"]
@@ -137,17 +135,6 @@ class BoucWen(OneState):
         after = h[:, -1].copy()
         np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
         return h, after
-
-    def inverse(
-        self, column: Values, displacement: FloatArray, memory: Memory, start: float, edge: float
-    ) -> FloatArray:
-        """Return the voltages (samples,) of displacements, by Lambert's W for n = 1."""
-        closed = None
-        if column["exponent"][0] == 1.0:
-            closed = relaxed(column, displacement, memory, edge)
-        if closed is None:
-            return super().inverse(column, displacement, memory, start, edge)
-        return closed
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""

@@ -7,7 +7,9 @@ voltage. With constants for both, it is the backlash-like model.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from bwbayes.model.boucwen import PIECE
 from bwbayes.model.declaration import Context, Declaration, Values, normal, rounded
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     OneState,
@@ -32,6 +35,7 @@ __all__ = ["Duhem", "phi_functions"]
 # Below this argument the φ functions are summed as a series of so many terms, which is exact there;
 # above it nothing cancels in their recursion.
 NEAR, SERIES_TERMS = 1.0, 16
+TERMS = tuple(1 / math.factorial(order) for order in range(SERIES_TERMS + 2, 2, -1))
 
 # Bounds that other parameters put on one may be rounded.
 SLACK = 1e-12
@@ -180,30 +184,26 @@ class Duhem(OneState):
         return column["beta"] * half_range
 
 
-def phi_functions(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0 of any shape, to rounding.
+def phi_functions(z: Any) -> tuple[Any, Any, Any]:
+    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0, a number or an array, to rounding.
 
     φ₁(−z) = (1 − exp(−z))/z, φ₂(−z) = (1 − φ₁)/z, φ₃(−z) = (1/2 − φ₂)/z; at zero they are 1, 1/2
     and 1/6. Each falls with z and stays positive.
     """
     near = np.minimum(z, NEAR)
-    three = np.full(z.shape, _one_over_factorial(SERIES_TERMS + 2))
-    for order in range(SERIES_TERMS + 1, 2, -1):
+    three = 0.0 * near
+    for term in TERMS:
         three *= -near
-        three += _one_over_factorial(order)
-    if not (z > NEAR).any():
-        two = 0.5 - near * three
-        return 1.0 - near * two, two, three
-    far = np.maximum(z, NEAR)
-    one_far = -np.expm1(-far) / far
-    two_far = (1.0 - one_far) / far
-    three = np.where(z > NEAR, (0.5 - two_far) / far, three)
-    two = np.where(z > NEAR, two_far, 0.5 - near * three)
-    return np.where(z > NEAR, one_far, 1.0 - near * two), two, three
-
-
-def _one_over_factorial(order: int) -> float:
-    return float(1.0 / np.prod(np.arange(1.0, order + 1.0)))
+        three += term
+    two = 0.5 - near * three
+    one = 1.0 - near * two
+    if anywhere(z > NEAR):
+        far = np.maximum(z, NEAR)
+        one_far = -np.expm1(-far) / far
+        two_far = (1.0 - one_far) / far
+        three = select(z > NEAR, (0.5 - two_far) / far, three)
+        two, one = select(z > NEAR, two_far, two), select(z > NEAR, one_far, one)
+    return one, two, three
 
 
 def _coefficient(name: str, power: int, label: str, description: str, part: float) -> Declaration:

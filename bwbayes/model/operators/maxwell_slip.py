@@ -8,7 +8,6 @@ and the work is done by :mod:`bwbayes.model.operators.prandtl_ishlinskii`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from bwbayes.model.operators.prandtl_ishlinskii import (
     Lines,
     checked_thresholds,
     lines_branch,
-    lines_travels,
     numbered,
     of_gain,
     plays_lines,
@@ -95,10 +93,6 @@ class MaxwellSlip(RemembersExtrema):
     def branch(self, column: Values) -> Branch:
         """Return the Everett function of the plays."""
         return lines_branch(self.lines(column))
-
-    def travels(self, column: Values) -> Callable[[FloatArray], FloatArray]:
-        """Return the inverse of the lines."""
-        return lines_travels(self.lines(column))
 
     def lines(self, column: Values) -> Lines:
         """Return the lines that E is made of."""

@@ -105,35 +105,6 @@ class RemembersExtrema(Operator):
         It must be the same whichever of its two voltages is the start.
         """
 
-    def travels(self, column: Values) -> Callable[[FloatArray], FloatArray] | None:
-        """Return what says how far, V, one model's voltage went from an extremum, by E, um.
-
-        None, as by default, if E depends on more than the distance, or has no inverse that can be
-        written down.
-        """
-        del column
-        return None
-
-    def inverse(
-        self, column: Values, displacement: FloatArray, memory: Memory, start: float, edge: float
-    ) -> FloatArray:
-        """Return the voltages (samples,) of displacements; with :meth:`travels` as it stands.
-
-        The extrema are those of the displacement too: where it comes back to an earlier one, so
-        does the voltage.
-        """
-        travels = self.travels(column)
-        if travels is None:
-            return super().inverse(column, displacement, memory, start, edge)
-        direction = 1.0 if edge >= start else -1.0
-        extrema = list(memory.extrema)
-        if direction == -memory.direction:
-            extrema.append(Extremum(start, memory.displacement))
-        result = np.empty(displacement.size)
-        _climb(travels, extrema, direction, displacement, result)
-        low, high = min(start, edge), max(start, edge)
-        return np.clip(direction * np.maximum.accumulate(direction * result), low, high)
-
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         for parameter in self.parameters:
@@ -249,34 +220,6 @@ def _follow(
             return
         done = max(end, done)
         # A loop is closed and forgotten, or the first curve is joined again.
-        del extrema[-2 if extrema[2:] else -1 :]
-
-
-def _climb(
-    travels: Callable[[FloatArray], FloatArray],
-    extrema: list[Extremum],
-    direction: float,
-    displacement: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the voltage along one model's stretch (samples,) to ``out``, as :func:`_follow`."""
-    done = 0
-    while True:
-        closing = extrema[-2] if extrema[2:] else extrema[-1]
-        level = direction * float(closing.displacement[0]) * (1 if extrema[2:] else -1)
-        end = displacement.size
-        if extrema[1:]:
-            end = max(int(np.searchsorted(direction * displacement, level)), done)
-        part, last = displacement[done:end], extrema[-1]
-        if part.size and not extrema[1:]:
-            out[done:end] = np.sign(part) * travels(2 * np.abs(part)) / 2
-        elif part.size:
-            turned = last.voltage if last.own is None else float(last.own[0])
-            rise = np.maximum(direction * (part - last.displacement[0]), 0.0)
-            out[done:end] = turned + direction * travels(rise)
-        if end == displacement.size:
-            return
-        done = end
         del extrema[-2 if extrema[2:] else -1 :]
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
-from bwbayes.model.inverse.stretch import travel
 from bwbayes.model.operator import Operator, Span
 
 __all__ = [
@@ -33,15 +32,10 @@ __all__ = [
     "initial",
     "initial_anywhere",
     "refuse",
-    "relaxed",
 ]
 
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
-
-# Stands for a rate of zero, 1/V.
-TINY = 1e-100
-
 
 Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 
@@ -101,34 +95,6 @@ class OneState(Operator):
         sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
         start = np.zeros_like(column["d"])
         return [self.trace(column, np.array(sweep), start)[1] for sweep in sweeps]
-
-
-def relaxed(
-    column: Values, displacement: FloatArray, memory: Memory, edge: float
-) -> FloatArray | None:
-    """Return the voltages (samples,) at which one n = 1 Bouc-Wen model has displacements, V.
-
-    As :meth:`~bwbayes.model.operator.Operator.inverse`, by Lambert's W: from the start with the
-    rate β − γ while g = s h is below zero, and from there on with β + γ. None where the slope is
-    not positive all along.
-    """
-    d, alpha, beta = (float(column[name][0]) for name in ("d", "alpha", "beta"))
-    gamma = float(column["gamma"][0]) if "gamma" in column else 0.0
-    s = 1.0 if edge >= memory.voltage else -1.0
-    g = s * float(memory.state[0])
-    against, ahead = (rate if abs(rate) > TINY else TINY for rate in (beta - gamma, beta + gamma))
-    if alpha - min(against * min(g, 0.0), 0.0) >= d:
-        return None
-    rise = np.maximum(s * displacement - (s * d * memory.voltage - g), 0.0)
-    if g >= 0:
-        moved = travel(d, alpha - ahead * g, ahead, rise)
-    else:
-        crossing = float(np.log1p(-against * g / alpha) / against)
-        part = np.minimum(rise, d * crossing + g)
-        moved = travel(d, alpha - against * g, against, part)
-        late = rise > part
-        moved[late] = crossing + travel(d, alpha, ahead, rise[late] - part[late])
-    return np.clip(memory.voltage + s * moved, min(edge, memory.voltage), max(edge, memory.voltage))
 
 
 def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:

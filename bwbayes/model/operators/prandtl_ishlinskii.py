@@ -18,7 +18,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Context, Declaration, Values, lognormal, rounded
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.inverse.stretch import travel
 from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
 
 __all__ = [
@@ -28,7 +27,6 @@ __all__ = [
     "PrandtlIshlinskii",
     "checked_thresholds",
     "lines_branch",
-    "lines_travels",
     "numbered",
     "of_gain",
     "plays_lines",
@@ -115,12 +113,6 @@ class PrandtlIshlinskii(RemembersExtrema):
 
         return everett
 
-    def travels(self, column: Values) -> Callable[[FloatArray], FloatArray]:
-        """Return the inverse of the loading curve, by Lambert's W."""
-        steepest, alpha = float((column["d"] + column["alpha"])[0]), float(column["alpha"][0])
-        rate = 1 / (2 * float(column["threshold"][0]))
-        return lambda rise: travel(steepest, alpha, rate, rise)
-
 
 @dataclass(frozen=True)
 class Plays(RemembersExtrema):
@@ -163,10 +155,6 @@ class Plays(RemembersExtrema):
     def branch(self, column: Values) -> Branch:
         """Return E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0)."""
         return lines_branch(self.lines(column))
-
-    def travels(self, column: Values) -> Callable[[FloatArray], FloatArray]:
-        """Return the inverse of the lines."""
-        return lines_travels(self.lines(column))
 
     def lines(self, column: Values) -> Lines:
         """Return the lines that E is made of."""
@@ -275,19 +263,3 @@ def lines_branch(lines: Lines) -> Branch:
         return moved
 
     return everett
-
-
-def lines_travels(lines: Lines) -> Callable[[FloatArray], FloatArray]:
-    """Return the inverse of one model's lines: again lines, with corners where theirs rise to."""
-    corners, steepness, level = (each[0] for each in lines)
-    heights = steepness[:-1] * corners + level[:-1]
-
-    def travels(rise: FloatArray) -> FloatArray:
-        passed = np.searchsorted(heights, rise)
-        # Where a line is level, which is only at a turn, any rise lies beyond it.
-        above = rise - level[passed]
-        steep = steepness[passed]
-        far: FloatArray = np.divide(above, steep, out=np.zeros_like(above), where=steep > 0)
-        return far
-
-    return travels

@@ -13,15 +13,16 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inverse import together as side
 from bwbayes.model.inverse.alone import One
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.stepped import DriveStep, step_of
-from bwbayes.model.inverse.together import MANY, follow
+from bwbayes.model.inverse.together import MANY
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.one_state import Memory
 from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
 
@@ -62,9 +63,24 @@ def followed(
     gain: PolynomialGain | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Return voltages of drives from h (models,) at zero volts on, and which models' are right."""
-    shaped = DriveStep(step_of(operator, column), gain, column)
-    memory, made = np.stack([np.zeros_like(state), state], axis=1), drive.copy()
-    right = follow(shaped, memory, np.zeros(state.size), made)
+    actuator = Actuator("none", "first", 1e-3, operator, gain, span=SPAN)
+    columns = {**column, "offset": np.zeros_like(state)}
+    models = enumerate(columns["d"].tolist())
+    ones = [
+        One(
+            actuator,
+            {name: values[row : row + 1] for name, values in columns.items()},
+            False,
+            None,
+            d,
+        )
+        for row, d in models
+    ]
+    here = State(Memory(0.0, state), (np.zeros_like(state),), (np.empty((state.size, 0)),))
+    made = np.empty_like(drive)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(side, "MANY", 1)
+        right = side.together(ones, columns, here, drive, made)
     return made, right
 
 

@@ -1,0 +1,29 @@
+"""What a formula needs that is written once, for a number and for arrays of them.
+
+With arrays NumPy works it out for all models at once; compiled with numbers it goes from model to
+model (:mod:`bwbayes.model.inverse.compiled`). Besides these it has arithmetic, and NumPy's
+functions of a number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["anywhere", "look_up", "select"]
+
+
+def anywhere(condition: Any) -> Any:
+    """Tell whether a condition holds, or does so at any place of an array."""
+    return np.any(condition)
+
+
+def select(condition: Any, yes: Any, no: Any) -> Any:
+    """Return one of two numbers, or of two at each place of arrays."""
+    return np.where(condition, yes, no)
+
+
+def look_up(rows: Any, place: Any) -> Any:
+    """Return the number at a place, a whole float, in a row, or at one in each column of rows."""
+    return np.take_along_axis(rows, place[np.newaxis].astype(np.intp), 0)[0]
