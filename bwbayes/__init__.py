@@ -121,7 +121,8 @@ if TYPE_CHECKING:
     from bwbayes.results.steps import Step, StepResponse, measure_step
     from bwbayes.results.verdict import Background, Verdict, assess
     from bwbayes.sampling.chain import Chain
-    from bwbayes.sampling.sampler import Outcome, SamplingPlan, draws, first_chain, sample
+    from bwbayes.sampling.plan import SamplingPlan
+    from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
 else:
     # The module of each name, and what it is called there if not the same.
     HOMES = {
@@ -150,7 +151,7 @@ else:
         "Problem": "app.problem.problem",
         "Record": "data.record",
         "Replicate": "results.replicates",
-        "SamplingPlan": "sampling.sampler",
+        "SamplingPlan": "sampling.plan",
         "Scores": "results.scores",
         "Start": "results.start",
         "Step": "results.steps",

@@ -12,7 +12,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.problem.problem import generator
-from bwbayes.control.loop import Noise, Stand
+from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, Wishes, track
 from bwbayes.data.teststand import PROCESS_SD, PROCESS_TIME
 from bwbayes.model.operator import Span
@@ -52,7 +52,7 @@ def on_the_stand(fit: bw.Fit) -> Tracking:
     return track(
         stand.actuator,
         np.tile(truth, (DRAWS, 1)),
-        Noise(
+        LoopNoise(
             np.full(DRAWS, known["sensor_sd"]),
             np.full(DRAWS, PROCESS_SD),
             np.full(DRAWS, PROCESS_TIME),

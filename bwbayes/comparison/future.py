@@ -23,7 +23,8 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.prediction import DRAWS, predict_windows, thinned
 from bwbayes.sampling.diagnostics import smoothed_weights
-from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, sample
+from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import draws, first_chain, sample
 
 __all__ = ["BELIEVED_K", "Future", "cut", "future", "joint_log_score", "reweighted"]
 

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from scipy.signal import StateSpace
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.control.sampled import Sections, sections_of
+from bwbayes.control.sampled import SampledSections, sections_of
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 
@@ -75,7 +75,7 @@ def linear_part(actuator: Actuator, theta: ArrayLike) -> Any:
     return StateSpace(block_diag(*a), np.vstack(b), np.hstack(c), d, dt=actuator.interval)
 
 
-def frequency_response(sections: Sections, turns: FloatArray) -> FloatArray:
+def frequency_response(sections: SampledSections, turns: FloatArray) -> FloatArray:
     """Return the complex response (models, frequencies) of dynamics and creep together.
 
     ``turns`` (frequencies,) are angles per sample, rad.

@@ -20,7 +20,7 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.data.teststand import Amplifier, LaserSensor
 from bwbayes.model.operator import Span
 
-__all__ = ["Followed", "Noise", "Plan", "Stand", "follow"]
+__all__ = ["LoopNoise", "LoopPlan", "Stand", "TrackingErrors", "follow"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Stand:
     sensor: LaserSensor = field(default_factory=LaserSensor)
 
 
-class Noise(NamedTuple):
+class LoopNoise(NamedTuple):
     """What each draw has beside its actuator: sds, um, and the discrepancy's time, s; (draws,)."""
 
     sensor: FloatArray
@@ -53,7 +53,7 @@ class Noise(NamedTuple):
     time: FloatArray
 
 
-class Plan(NamedTuple):
+class LoopPlan(NamedTuple):
     """What controllers do on some signals.
 
     ``ahead`` (controllers, signals, samples), V, is fed forward; ``targets`` (controllers, signals,
@@ -69,7 +69,7 @@ class Plan(NamedTuple):
     begins: int
 
 
-class Followed(NamedTuple):
+class TrackingErrors(NamedTuple):
     """How well: ``rms`` and ``largest`` error, um, and the share of samples at a limit.
 
     All are (controllers, signals, draws). The error is that of the actuator itself, its discrepancy
@@ -82,13 +82,13 @@ class Followed(NamedTuple):
 
 
 def follow(
-    plan: Plan,
+    plan: LoopPlan,
     gains: Gains,
     draws: SampledModel,
-    noise: Noise,
+    noise: LoopNoise,
     stand: Stand,
     generator: np.random.Generator,
-) -> Followed:
+) -> TrackingErrors:
     """Close the loop around every draw.
 
     Parameters
@@ -148,4 +148,4 @@ def follow(
         state = draws.forward(state, held.ravel())[1]
         drift = kept * drift + shock * generator.standard_normal(count)
     judged = samples - plan.begins
-    return Followed(np.sqrt(squares / judged), largest, limited / judged)
+    return TrackingErrors(np.sqrt(squares / judged), largest, limited / judged)

@@ -26,7 +26,7 @@ __all__ = [
     "BISECTION_ROUNDS",
     "NEWTON_ROUNDS",
     "SampledModel",
-    "Sections",
+    "SampledSections",
     "SteppedState",
     "require_inverse",
     "resolution",
@@ -41,7 +41,7 @@ NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
 LARGEST_ZERO = 0.999
 
 
-class Sections(NamedTuple):
+class SampledSections(NamedTuple):
     """Linear recursions side by side, (models, sections, 3) and (models, sections).
 
     ``crept`` (models, sections) tells the sections whose drive is that of the creep.
@@ -93,7 +93,7 @@ class SampledModel:
     actuator: Actuator
     column: dict[str, FloatArray]
     step: HysteresisStep
-    sections: Sections
+    sections: SampledSections
 
     @classmethod
     def of(cls, actuator: Actuator, theta: FloatArray) -> Self:
@@ -261,12 +261,12 @@ class SampledModel:
         return slope
 
 
-def sections_of(actuator: Actuator, column: dict[str, FloatArray]) -> Sections:
+def sections_of(actuator: Actuator, column: dict[str, FloatArray]) -> SampledSections:
     """Return dynamics and creep of models given by the columns (models,) of θ."""
     numerator, denominator, gains = actuator.sections(column).taps
     # The first is that of the dynamics.
     crept = np.broadcast_to(np.arange(gains.shape[1]) > 0, gains.shape)
-    return Sections(numerator, denominator, gains, crept)
+    return SampledSections(numerator, denominator, gains, crept)
 
 
 def require_inverse(model: SampledModel, limits: Span) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.discrete import frequency_response
 from bwbayes.control.gains import Gains, Margins, Robustness, design
-from bwbayes.control.loop import Followed, Noise, Plan, Stand, follow
+from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, TrackingErrors, follow
 from bwbayes.control.references import SHAPES, reference
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
@@ -183,7 +183,7 @@ def _of(name: str, values: FloatArray) -> dict[str, float]:
 def track(
     actuator: Actuator,
     theta: FloatArray,
-    noise: Noise,
+    noise: LoopNoise,
     stand: Stand,
     wishes: Wishes,
     generator: np.random.Generator,
@@ -238,7 +238,7 @@ def track(
         actuator, np.tile(every.mean(axis=0), (len(frequencies) * len(names), 1))
     )
     fed = _fed(models, [desired for desired, _ in references], stand)
-    followed: list[Followed] = []
+    followed: list[TrackingErrors] = []
     for (desired, begins), (command, reached) in zip(references, fed, strict=True):
         plan = _plan(desired, begins, command, reached, ends, limits)
         followed.append(follow(plan, gains, rows, noise, stand, generator))
@@ -292,12 +292,12 @@ def _plan(
     reached: FloatArray,
     ends: Span,
     limits: Span,
-) -> Plan:
+) -> LoopPlan:
     """Return what the four controllers do to follow references (signals, samples)."""
     slope = ends.half / limits.half
     linear = np.clip(limits.middle + (desired - ends.middle) / slope, *limits)
     nothing = np.zeros_like(desired)
-    return Plan(
+    return LoopPlan(
         np.stack([linear, command, nothing, command]),
         np.stack([nothing, nothing, desired, reached]),
         LOOKS,

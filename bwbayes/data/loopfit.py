@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.data.patterns import Decay, turning_points
+from bwbayes.data.patterns import DecayingStart, turning_points
 from bwbayes.data.record import Record
 
 __all__ = ["LoopFit", "fit_loop"]
@@ -59,7 +59,7 @@ class LoopFit:
     residual: FloatArray
     gain: float
     lag: float
-    decay: Decay
+    decay: DecayingStart
     start: float
     trend: float
     trend_told: float
@@ -106,7 +106,7 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
         residual,
         float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
         lag,
-        Decay(float(coefficients[-1]), float(times[which])),
+        DecayingStart(float(coefficients[-1]), float(times[which])),
         float(whole[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :]) + coefficients[-2] / 2,
         float(coefficients[-2]),
         1 - imitated / float(trend_shape @ trend_shape),

@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
 __all__ = [
-    "Decay",
+    "DecayingStart",
     "decay",
     "find_gross_outliers",
     "runs",
@@ -39,7 +39,7 @@ GROSS = 2.0
 REWEIGHTED = 30
 
 
-class Decay(NamedTuple):
+class DecayingStart(NamedTuple):
     """``size exp(-t / time)`` from the first sample on: size in the values' unit, time in s."""
 
     size: float
@@ -152,7 +152,7 @@ def _off_median(values: FloatArray, ends: bool) -> FloatArray:
     return off
 
 
-def decay(time: FloatArray, values: FloatArray, longest: float) -> Decay:
+def decay(time: FloatArray, values: FloatArray, longest: float) -> DecayingStart:
     """Return the exponential decay from the first sample on that explains most of the values.
 
     Parameters
@@ -169,7 +169,7 @@ def decay(time: FloatArray, values: FloatArray, longest: float) -> Decay:
     centred = values - values.mean()
     sizes = shapes.T @ centred / (shapes**2).sum(axis=0)
     best = int(np.argmax(sizes**2 * (shapes**2).sum(axis=0)))
-    return Decay(float(sizes[best]), float(times[best]))
+    return DecayingStart(float(sizes[best]), float(times[best]))
 
 
 def trend(time: FloatArray, values: FloatArray) -> float:

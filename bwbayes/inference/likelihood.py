@@ -20,7 +20,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import LOG_TWO_PI, Noise
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.shown import brief
 
@@ -143,9 +143,9 @@ class Likelihood:
     offset_sd: float = 0.0
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> ParameterTable:
         """The parameters in the order of θ's columns."""
-        return Table(self.actuator, self.noise)
+        return ParameterTable(self.actuator, self.noise)
 
     @cached_property
     def values(self) -> FloatArray:

@@ -23,7 +23,7 @@ from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.table import JointTable, Table
+from bwbayes.inference.table import JointTable, ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
@@ -74,9 +74,9 @@ class Dataset:
             raise InputError("training: windows must be in order of time and must not overlap")
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> ParameterTable:
         """The parameters of this record alone."""
-        return Table(self.actuator, self.noise)
+        return ParameterTable(self.actuator, self.noise)
 
     @cached_property
     def readings(self) -> Readings:

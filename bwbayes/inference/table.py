@@ -1,9 +1,9 @@
 """The tables of a model's parameters: one order of θ's columns, and everybody asks by name.
 
-A :class:`Table` is that of one record: the actuator's parameters come first, then the noise's,
-each in the order in which their parts declare them. A :class:`JointTable` is that of several
-records that were measured on one actuator: what belongs to the actuator is there once, what belongs
-to a record (its initial state, its offset) once for each, side by side, and named after it:
+A :class:`ParameterTable` is that of one record: the actuator's parameters come first, then the
+noise's, each in the order in which their parts declare them. A :class:`JointTable` is that of
+several records that were measured on one actuator: what belongs to the actuator is there once, what
+belongs to a record (its initial state, its offset) once for each, side by side, and named after it:
 ``offset[step_10]``. Of one record both are the same.
 """
 
@@ -23,11 +23,11 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Scope
 from bwbayes.shown import brief
 
-__all__ = ["Column", "JointTable", "Table"]
+__all__ = ["Column", "JointTable", "ParameterTable"]
 
 
 @dataclass(frozen=True)
-class Table:
+class ParameterTable:
     """The parameters of an actuator and of a noise, in the order of θ's columns."""
 
     __repr__ = brief
@@ -104,7 +104,7 @@ class JointTable:
         A parameter that no part has, or that is to be both.
     """
 
-    table: Table
+    table: ParameterTable
     records: tuple[str, ...]
     per_record: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()

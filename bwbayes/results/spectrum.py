@@ -112,7 +112,7 @@ def residual_spectrum(
         (readings,), V.
     """
     rows = np.rint((time - time[0]) / interval).astype(np.int64)
-    grid = _Grid(rows, interval)
+    grid = _TimeGrid(rows, interval)
     found: list[float] = []
     left, level = white - np.mean(white), None
     for _ in range(MOST_LINES):
@@ -155,7 +155,7 @@ def without_lines(
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _TimeGrid:
     """The uniform times on which readings lie: the sample of each, and the interval, s."""
 
     rows: IntArray
@@ -203,7 +203,7 @@ class _Grid:
         return power / self.rows.size
 
 
-def _strongest(grid: _Grid, power: FloatArray, known: list[float]) -> float | None:
+def _strongest(grid: _TimeGrid, power: FloatArray, known: list[float]) -> float | None:
     """Return the frequency of the largest power over its level, if it is too large for chance."""
     frequency = grid.frequency
     allowed = frequency > PERIODS * grid.width
@@ -241,7 +241,7 @@ class _Drive:
     main: float
 
     @classmethod
-    def of(cls, grid: _Grid, time: FloatArray, voltage: FloatArray) -> _Drive:
+    def of(cls, grid: _TimeGrid, time: FloatArray, voltage: FloatArray) -> _Drive:
         whole = np.interp(grid.interval * np.arange(grid.samples), time - time[0], voltage)
         window = signal.windows.hann(grid.samples)
         centered = whole - np.sum(window * whole) / np.sum(window)
@@ -249,13 +249,13 @@ class _Drive:
         return cls(power, grid.top(power, int(np.argmax(power))))
 
 
-def _source(grid: _Grid, drive: _Drive, frequency: float) -> tuple[str, bool]:
+def _source(grid: _TimeGrid, drive: _Drive, frequency: float) -> tuple[str, bool]:
     """Return what may be the source of a line, and whether that is the drive alone."""
     names = [name for name in (_at_drive(grid, drive, frequency), _mains(grid, frequency)) if name]
     return " or ".join(names), len(names) == 1 and "drive" in names[0]
 
 
-def _at_drive(grid: _Grid, drive: _Drive, frequency: float) -> str:
+def _at_drive(grid: _TimeGrid, drive: _Drive, frequency: float) -> str:
     near = np.abs(grid.frequency - frequency) <= 2 * grid.width
     if np.max(drive.power[near]) >= DRIVEN * np.max(drive.power):
         return "the drive's frequency"
@@ -266,7 +266,7 @@ def _at_drive(grid: _Grid, drive: _Drive, frequency: float) -> str:
     return ""
 
 
-def _mains(grid: _Grid, frequency: float) -> str:
+def _mains(grid: _TimeGrid, frequency: float) -> str:
     rate = 1 / grid.interval
     for mains in MAINS:
         for times in range(1, MAINS_HARMONICS + 1):

@@ -47,15 +47,13 @@ from bwbayes.sampling.diagnostics import (
 from bwbayes.sampling.ensemble import Block, advance_together, start
 from bwbayes.sampling.judge import Judge, constrained
 from bwbayes.sampling.moves import MOVES, pilot_moves, sampling_moves, spreading_moves
+from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.shown import brief
 
 __all__ = [
     "Outcome",
-    "SamplingPlan",
     "Watcher",
-    "best_places",
-    "best_together",
     "draws",
     "first_chain",
     "log_densities",
@@ -87,61 +85,12 @@ LEAST_STRETCH = 1.2
 APART = 1.2
 FIRST_PART = 0.5
 
-# Walkers times samples below which a step is mostly Python's work, and below which half is.
-LIGHT = 1 << 16
-MEDIUM = 1 << 18
-
-# Walkers times samples up to which a step may choose from several places.
-CHEAP = 1 << 14
-
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
 
 
 def _unwatched(phase: Phase, latest: Check | None) -> None:
     """Watch nothing."""
-
-
-@dataclass(frozen=True)
-class SamplingPlan:
-    """How to sample, and when to stop.
-
-    Parameters
-    ----------
-    ess
-        Effective draws of every parameter, bulk and tail, to reach.
-    ensembles
-        Independent ensembles, at least four: R-hat compares them.
-    walkers
-        Walkers of one ensemble, even, at least twice the free parameters.
-    block
-        Steps that are made and stored at a time; checks come after whole blocks.
-    most_steps, most_pilot_steps
-        The budget: steps of each ensemble that count, and before.
-    least_pilot_steps
-        Steps of the pilot in any case.
-    together
-        Ensembles that are moved with one call of the density. A property of what is sampled, not
-        of who computes it: on the compiled engine the last bits of densities may depend on it.
-    places
-        Places that a step of the mixture has to choose from.
-    """
-
-    ess: float = 2000.0
-    ensembles: int = 4
-    walkers: int = 24
-    block: int = 50
-    most_steps: int = 20_000
-    least_pilot_steps: int = 50
-    most_pilot_steps: int = 3_000
-    together: int = 1
-    places: int = 1
-
-    def __post_init__(self) -> None:
-        if self.ensembles < 4:
-            raise InputError("sampling.ensembles: needs at least 4; R-hat compares them")
-        if self.walkers % 2:
-            raise InputError("sampling.walkers: must be even; emcee moves one half at a time")
 
 
 @dataclass(frozen=True)
@@ -154,24 +103,6 @@ class Outcome:
     stop_reason: str
     check: Check
     remarks: tuple[str, ...] = ()
-
-
-def best_together(ensembles: int, walkers: int, samples: int) -> int:
-    """Return how many ensembles to move with one call, on a record of so many samples.
-
-    All where a step is light: threads would wait for each other's Python. Half of them, for two
-    threads, where the models take as long as Python does. Else each by itself.
-    """
-    size = walkers * samples
-    return ensembles if size <= LIGHT else ensembles // 2 if size <= MEDIUM else 1
-
-
-def best_places(walkers: int, samples: int) -> int:
-    """Return how many places a step of the mixture has to choose from, on so many samples.
-
-    As many as cost no more than one on a longer record, which tells more of its parameters.
-    """
-    return max(1, CHEAP // (walkers * samples))
 
 
 def first_chain(

@@ -32,7 +32,8 @@ from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.ensemble import advance
-from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, sample
+from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import draws, first_chain, sample
 from tests.app import small
 from tests.app.test_calibrate import assert_same_end as assert_same_calibration
 from tests.app.test_calibrate import begun as begun_calibration

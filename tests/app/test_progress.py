@@ -11,7 +11,7 @@ from rich.console import Console
 
 from bwbayes.app.running.progress import Progress
 from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.plan import SamplingPlan
 
 PLAN = SamplingPlan(ess=2000, block=50)
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from bwbayes.app.commands import cli, run
 from bwbayes.app.config.config import load
-from bwbayes.app.config.proposal import Proposal, propose
+from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import load_run
@@ -64,7 +64,7 @@ def command(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli.cli, [str(one) for one in arguments], standalone_mode=False)
 
 
-def proposed(path: Path, **units: str) -> Proposal:
+def proposed(path: Path, **units: str) -> ConfigProposal:
     return propose(path, path.parent, Naming(units=units))
 
 

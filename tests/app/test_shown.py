@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import bwbayes as bw
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult, Row
-from bwbayes.control.loop import Noise, Stand
+from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, Wishes, track
 from bwbayes.population.population import population
 from bwbayes.shown import LONGEST, MOST_LINES, brief, head
@@ -89,7 +89,7 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
 def followed(generator: np.random.Generator) -> Tracking:
     """Return what ``fit.track`` does, of three draws: the margins of a thousand take a minute."""
     actuator = cases.actuator("bouc-wen, second-order", "zero")
-    noise = Noise(np.full(3, 0.5), np.full(3, 1.5), np.full(3, 0.5))
+    noise = LoopNoise(np.full(3, 0.5), np.full(3, 1.5), np.full(3, 0.5))
     wishes = Wishes(frequencies=(5.0,))
     return track(actuator, cases.theta(actuator, 3), noise, Stand(cases.SPAN), wishes, generator)
 

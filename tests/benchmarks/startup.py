@@ -24,11 +24,11 @@ COMPILED = """
 import numpy as np
 from bwbayes.inference.compiled import moments
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)
 record = np.sin(np.arange(9.0))
-theta = np.ones((1, len(Table(*parts).names)))
+theta = np.ones((1, len(ParameterTable(*parts).names)))
 moments(theta, record, record, 0 * record, *parts, 1, 0, from_rest=True)
 """
 

@@ -15,7 +15,7 @@ from bwbayes.comparison.future import cut, future, joint_log_score, reweighted
 from bwbayes.data import Record
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.table import JointTable
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.problems import INTERVAL
 from tests.inference.test_solvable import (
     WINDOWS,

@@ -7,14 +7,14 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains, Robustness, design
-from bwbayes.control.loop import Noise, Plan, Stand, follow
+from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, follow
 from bwbayes.control.sampled import SampledModel
 from bwbayes.data.teststand import Amplifier
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from tests.control import cases
 
-QUIET = Noise(np.zeros(2), np.zeros(2), np.ones(2))
+QUIET = LoopNoise(np.zeros(2), np.zeros(2), np.ones(2))
 
 
 def of(name: str, count: int, copies: int) -> tuple[Actuator, FloatArray, SampledModel]:
@@ -29,7 +29,7 @@ def references(samples: int = 121) -> FloatArray:
 
 
 def slowly(
-    actuator: Actuator, theta: FloatArray, plan: Plan, gains: Gains, stand: Stand
+    actuator: Actuator, theta: FloatArray, plan: LoopPlan, gains: Gains, stand: Stand
 ) -> tuple[FloatArray, FloatArray]:
     """Return rms and largest error, simulating the whole past at every sample."""
     controllers, signals, samples = plan.ahead.shape
@@ -71,7 +71,7 @@ def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
     ahead = np.stack([required / 0.6, np.zeros_like(required), required / 0.6])
     # So near that it is met: then the answers are kept to what is still to be had.
     stand = Stand(Span(-55.0, 45.0), delay, Amplifier(current=0.02))
-    plan = Plan(
+    plan = LoopPlan(
         np.clip(ahead, -55, 45),
         np.stack([0 * required, required, required]),
         (False, True, True),
@@ -92,7 +92,7 @@ def test_without_feedback_it_is_the_virtual_stands_amplifier_and_actuator() -> N
     command = np.clip(required / 0.5, -80, 80)
     command[:, 0] = 0.0
     stand = Stand(Span(-100.0, 100.0))
-    plan = Plan(command[np.newaxis], required[np.newaxis], (False,), required, 0)
+    plan = LoopPlan(command[np.newaxis], required[np.newaxis], (False,), required, 0)
     gains = Gains((1.0, 0.0, 0.0), 1e-3)
     got = follow(plan, gains, rows, QUIET, stand, np.random.default_rng(1))
     for s in range(2):
@@ -111,8 +111,8 @@ def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
     """
     _, _, rows = of("bouc-wen", 1, 400)
     required = np.zeros((1, 1001))
-    plan = Plan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), required, 0)
-    noise = Noise(np.full(400, 0.5), np.full(400, 1.5), np.full(400, 0.01))
+    plan = LoopPlan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), required, 0)
+    noise = LoopNoise(np.full(400, 0.5), np.full(400, 1.5), np.full(400, 0.01))
     gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(cases.SPAN)
     got = follow(plan, gains, rows, noise, stand, np.random.default_rng(8))
     spread = 1.5**2 * np.sqrt(2 / 40_000)
@@ -130,7 +130,7 @@ def test_out_of_reach_for_long_it_comes_back_at_once() -> None:
     required = np.concatenate([np.full(1000, 200.0), np.zeros(201)])[np.newaxis]
 
     def error(begins: int) -> float:
-        plan = Plan(np.zeros((1, 1, 1201)), required[np.newaxis], (True,), required, begins)
+        plan = LoopPlan(np.zeros((1, 1, 1201)), required[np.newaxis], (True,), required, begins)
         stand, generator = Stand(limits), np.random.default_rng(1)
         return float(follow(plan, gains, rows, QUIET, stand, generator).largest.max())
 

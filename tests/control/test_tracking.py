@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.loop import Noise, Stand
+from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.references import SHAPES, reference
 from bwbayes.control.tracking import CONTROLLERS, Tracking, Wishes, track
 from bwbayes.errors import InputError
@@ -21,7 +21,7 @@ SDS = {"beta": 0.0012, "gamma": 0.0027, "damping": 350.0}
 NAME = "bouc-wen, second-order"
 
 
-def draws(count: int) -> tuple[Actuator, FloatArray, Noise]:
+def draws(count: int) -> tuple[Actuator, FloatArray, LoopNoise]:
     """Return draws about Table 1 of the paper, as a posterior of the virtual stand has them."""
     actuator, generator = cases.actuator(NAME, "zero"), np.random.default_rng(11)
     theta = np.tile(cases.theta(actuator), (count, 1))
@@ -30,7 +30,7 @@ def draws(count: int) -> tuple[Actuator, FloatArray, Noise]:
     both = generator.standard_normal(count)
     theta[:, actuator.parameters.index("d")] += 0.0048 * both
     theta[:, actuator.parameters.index("alpha")] += 0.0122 * both
-    return actuator, theta, Noise(np.full(count, 0.5), np.full(count, 1.5), np.full(count, 0.5))
+    return actuator, theta, LoopNoise(np.full(count, 0.5), np.full(count, 1.5), np.full(count, 0.5))
 
 
 @pytest.fixture(scope="module")

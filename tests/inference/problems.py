@@ -26,7 +26,7 @@ from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
@@ -138,7 +138,7 @@ def posterior_of(
     fixed = {"initial": 0.0} if fixed is None else fixed
     ranges = ranges_of(voltage, displacement, actuator.interval)
     known = context(ranges, fixed.get("exponent", 1.0), 4.1e5)
-    parameters = parameters_of(Table(actuator, model).declarations, known, fixed, priors)
+    parameters = parameters_of(ParameterTable(actuator, model).declarations, known, fixed, priors)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
     one = Dataset(voltage, displacement, windows, actuator, model, from_rest)

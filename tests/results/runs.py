@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.predictions import Followed
+from bwbayes.app.running.predictions import Swallowed
 from bwbayes.app.running.run import assemble, judged, versions
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
@@ -190,7 +190,7 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     drift = drifted(posterior, draws, source) if again else None
     background = Background.of(posterior, draws)
     verdicts = judged(
-        problem, bands, background, {"record": odd}, {"record": Followed(transient, drift)}
+        problem, bands, background, {"record": odd}, {"record": Swallowed(transient, drift)}
     )
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 

@@ -22,7 +22,7 @@ from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.prediction import Start
 from bwbayes.results.replicates import RANKED, Experiment, replicate, replicates
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.plan import SamplingPlan
 from tests.app import example
 from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
 

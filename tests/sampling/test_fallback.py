@@ -20,11 +20,11 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
 from bwbayes.sampling.sampler import (
     FIRST_CHECK,
     Outcome,
-    SamplingPlan,
     Watcher,
     draws,
     sample,

@@ -27,7 +27,8 @@ import numpy as np
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.sampling.ensemble import Block
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import SamplingPlan, draws, first_chain, log_densities, sample
+from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import draws, first_chain, log_densities, sample
 from tests.inference.problems import gaussian
 
 posterior, point = gaussian(10)

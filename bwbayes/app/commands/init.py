@@ -15,7 +15,7 @@ from bwbayes.errors import ColumnsError, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
-    from bwbayes.app.config.proposal import Proposal
+    from bwbayes.app.config.proposal import ConfigProposal
 
 __all__ = ["config_or_proposal", "init"]
 
@@ -92,7 +92,7 @@ def config_or_proposal(
     return made.config, True
 
 
-def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> Proposal:
+def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
     from bwbayes.app.config.proposal import propose
 
@@ -102,7 +102,7 @@ def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> P
         raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
 
 
-def _show(made: Proposal, console: Console) -> None:
+def _show(made: ConfigProposal, console: Console) -> None:
     """Show what was said of the record, with what to do."""
     from bwbayes.app.screen import show_remarks
 

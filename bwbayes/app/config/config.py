@@ -16,7 +16,7 @@ from typing import Annotated, Self
 import tomlkit
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
-from bwbayes.app.config.keys import Table, described, one_line
+from bwbayes.app.config.keys import ConfigTable, described, one_line
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.app.config.model_settings import ActuatorConfig, ModelConfig, StandConfig
 from bwbayes.app.config.settings import (
@@ -68,7 +68,7 @@ def _one_or_several(given: object) -> str:
     return SEVERAL if tables else ONE
 
 
-class Config(Table):
+class Config(ConfigTable):
     """A whole run."""
 
     name: Annotated[

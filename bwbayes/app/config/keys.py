@@ -22,9 +22,9 @@ from bwbayes.shown import brief
 __all__ = [
     "ANY",
     "MEANINGS",
+    "ConfigTable",
     "Key",
     "Positive",
-    "Table",
     "Texts",
     "described",
     "keys",
@@ -87,7 +87,7 @@ Texts = Annotated[
 KINDS = {str: "text", bool: "true or false", int: "whole number", float: "number", dict: "table"}
 
 
-class Table(BaseModel):
+class ConfigTable(BaseModel):
     """A table of a config: it knows its keys, and takes no others."""
 
     __repr__ = brief

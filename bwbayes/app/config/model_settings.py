@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bwbayes.app.config.keys import Positive, Table, Texts, described
+from bwbayes.app.config.keys import ConfigTable, Positive, Texts, described
 
 __all__ = ["ActuatorConfig", "ModelConfig", "StandConfig", "StandModelConfig"]
 
 
-class ActuatorConfig(Table):
+class ActuatorConfig(ConfigTable):
     """The parts of an actuator, by name or by import path, and their options.
 
     ``passive``, ``thresholds``, ``odd`` and ``terms`` are options of some operators only.
@@ -114,7 +114,7 @@ class StandModelConfig(ActuatorConfig):
     ] = "second-order"
 
 
-class StandConfig(Table):
+class StandConfig(ConfigTable):
     """The virtual test stand that signals are run on."""
 
     discrepancy: Annotated[

@@ -26,12 +26,12 @@ from bwbayes.data.io.checks import checked
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.formats import read_table
 from bwbayes.data.io.grid import decimals_of
-from bwbayes.data.io.table import Table
+from bwbayes.data.io.table import FileTable
 from bwbayes.errors import InputWarning
 from bwbayes.model.drive import rate
 from bwbayes.model.registry import DYNAMICS
 
-__all__ = ["Proposal", "propose"]
+__all__ = ["ConfigProposal", "propose"]
 
 # A quarter is held out: of the whole record, or of each of so many equal parts; where it begins in
 # a part; and the fewest readings that are fitted or held out.
@@ -58,7 +58,7 @@ POINTLESS = ("wrong units", "no relation", "reversed sign", "swapped columns")
 
 
 @dataclass(frozen=True)
-class Proposal:
+class ConfigProposal:
     """A config for a record, and what was seen of the record.
 
     ``text`` is the config in TOML with comments, ``config`` what it says. ``findings`` are what is
@@ -77,7 +77,7 @@ class Proposal:
         return next((one for one in self.findings if one.kind in POINTLESS), None)
 
 
-def propose(path: Path, where: Path, naming: Naming | None = None) -> Proposal:
+def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
     """Propose a config for a record.
 
     Parameters
@@ -102,10 +102,10 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> Proposal:
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
     findings = tuple(_with_sign(one, path, table) for one in inspect(record))
     text = _text(path, where, table.naming, record, findings)
-    return Proposal(text, parse(text, str(path)), record, findings, remarks)
+    return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
 
 
-def _with_sign(finding: Finding, path: Path, table: Table) -> Finding:
+def _with_sign(finding: Finding, path: Path, table: FileTable) -> Finding:
     """Return a finding; of a reversed sign with the command that turns it without a new file."""
     if finding.kind != "reversed sign":
         return finding

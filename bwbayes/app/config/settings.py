@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
-from bwbayes.app.config.keys import Positive, Table, Texts, described
+from bwbayes.app.config.keys import ConfigTable, Positive, Texts, described
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
@@ -36,7 +36,7 @@ def _one_window(given: object) -> object:
     return [given] if alone else given
 
 
-class SignalConfig(Table):
+class SignalConfig(ConfigTable):
     """A voltage for the virtual test stand: V, Hz, s."""
 
     shape: Annotated[
@@ -83,7 +83,7 @@ class SignalConfig(Table):
         return self
 
 
-class _Source(Table):
+class _Source(ConfigTable):
     """Where samples come from: a file, or a signal on the virtual test stand."""
 
     file: Annotated[
@@ -211,7 +211,7 @@ class RecordConfig(_Source):
         return self
 
 
-class ParameterConfig(Table):
+class ParameterConfig(ConfigTable):
     """A parameter's prior or fixed value, bounds, and names for people."""
 
     prior: Annotated[
@@ -251,8 +251,8 @@ class ParameterConfig(Table):
         return self
 
 
-class SamplingConfig(Table):
-    """When to stop and how to sample; see :class:`bwbayes.sampling.sampler.SamplingPlan`."""
+class SamplingConfig(ConfigTable):
+    """When to stop and how to sample; see :class:`bwbayes.sampling.plan.SamplingPlan`."""
 
     engine: Annotated[
         EngineChoice,

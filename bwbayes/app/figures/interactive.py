@@ -41,7 +41,7 @@ from bwbayes.app.figures.style import (
     time_label,
     title,
 )
-from bwbayes.app.report.page import Plots, Script
+from bwbayes.app.report.page import PagePlots, Script
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.results.bands import Bands, Kind
 from bwbayes.results.result import Result
@@ -65,10 +65,10 @@ LOOP_HEIGHT, LOOP_WIDTH = 430, 240  # CSS pixels; the least width
 FONT_SIZE = "13px"
 
 
-def made(result: Result) -> Plots:
+def made(result: Result) -> PagePlots:
     """Return a run's plots and, if there are any, the scripts that draw them."""
     plots = draw(result) if result.outcome.converged else {}
-    return Plots(plots, scripts() if plots else [])
+    return PagePlots(plots, scripts() if plots else [])
 
 
 def scripts() -> list[Script]:

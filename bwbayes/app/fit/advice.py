@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.fit.compared import Compared, Finished, compared, named
+from bwbayes.app.fit.compared import Compared, FinishedFit, compared, named
 from bwbayes.app.fit.options import options_of
 from bwbayes.app.fit.surroundings import warn
 from bwbayes.app.jobs.at_work import RunDraws
@@ -27,7 +27,7 @@ class Advice:
     """Comparison, design and control, for whatever has a problem, a chain and an outcome."""
 
     @options_of(compared)
-    def compare(self: Finished, *others: Finished, **options: Any) -> Compared:
+    def compare(self: FinishedFit, *others: FinishedFit, **options: Any) -> Compared:
         """Compare this fit with others of the same readings, to tell which model to take.
 
         Parameters
@@ -44,7 +44,7 @@ class Advice:
         return compared([named(fit) for fit in (self, *others)], **options)
 
     @options_of(design_draws)
-    def design(self: Finished, target: str | ArrayLike, **options: Any) -> list[Promise]:
+    def design(self: FinishedFit, target: str | ArrayLike, **options: Any) -> list[Promise]:
         """Rank signals by what they would leave of an sd, or of a band's width; the best first.
 
         Parameters
@@ -63,7 +63,7 @@ class Advice:
         return design_draws(_drawn(self), target, **options)
 
     @options_of(compensate_draws)
-    def compensate(self: Finished, reference: Any, **options: Any) -> Compensated:
+    def compensate(self: FinishedFit, reference: Any, **options: Any) -> Compensated:
         """Return the voltage for a displacement, and its predicted error.
 
         ``fit.compensate("triangle", amplitude=30, frequency=1)`` is what
@@ -96,7 +96,7 @@ class Advice:
         return made
 
     @options_of(export_draws)
-    def export(self: Finished, folder: str | Path, **options: Any) -> Exported:
+    def export(self: FinishedFit, folder: str | Path, **options: Any) -> Exported:
         """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
         0 um is where the demagnetized actuator stands at zero volts. What is returned has the
@@ -118,7 +118,7 @@ class Advice:
         return export_draws(_drawn(self), Path(folder), **options)[0]
 
     @options_of(Setup)
-    def track(self: Finished, **options: Any) -> Tracking:
+    def track(self: FinishedFit, **options: Any) -> Tracking:
         """Say how well a closed loop would follow, with and without the model.
 
         Parameters
@@ -135,7 +135,7 @@ class Advice:
         return track_draws(_drawn(self), Setup(**options))
 
 
-def require_converged(fit: Finished) -> None:
+def require_converged(fit: FinishedFit) -> None:
     """Refuse a fit whose sampling has not converged.
 
     Raises
@@ -151,7 +151,7 @@ def require_converged(fit: Finished) -> None:
         )
 
 
-def _drawn(fit: Finished) -> RunDraws:
+def _drawn(fit: FinishedFit) -> RunDraws:
     """Return what a fit that has converged gives; warn if its validation did not pass."""
     require_converged(fit)
     posterior, standing = fit.problem.posterior, fit.result.standing

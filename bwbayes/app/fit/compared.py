@@ -26,10 +26,10 @@ from bwbayes.sampling.sampler import Outcome
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.shown import head
 
-__all__ = ["Compared", "Finished", "compared", "named"]
+__all__ = ["Compared", "FinishedFit", "compared", "named"]
 
 
-class Finished(Protocol):
+class FinishedFit(Protocol):
     """What a comparison needs of a fit."""
 
     @property
@@ -104,7 +104,7 @@ class Compared:
         return f"<pre>{escape(str(self))}</pre>"
 
 
-def named(fit: Finished) -> Fitted:
+def named(fit: FinishedFit) -> Fitted:
     """Return a fit under the name of its config, or of its operator."""
     config = fit.problem.config
     name = config.name or config.model.hysteresis

@@ -39,7 +39,7 @@ from bwbayes.comparison.table import numbers, table
 from bwbayes.data import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.results.bands import Bands
 from bwbayes.results.outputs import write_summary
@@ -170,7 +170,7 @@ def run_models(
 def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
     """Return the config with another model, and of what it says of parameters what that has."""
     actuator = actuator_of(model, records[0], records)
-    names = Table(actuator, noise_model(model.noise, records[0].interval)).names
+    names = ParameterTable(actuator, noise_model(model.noise, records[0].interval)).names
     known = {
         key: {p: given for p, given in getattr(config, key).items() if _plain(p) in names}
         for key in ("parameters", "truth")

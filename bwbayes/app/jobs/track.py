@@ -22,7 +22,7 @@ from bwbayes.app.problem.problem import generator
 from bwbayes.app.report.track_report import render
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Robustness
-from bwbayes.control.loop import Noise, Stand
+from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, Wishes, track
 from bwbayes.errors import InputError
 from bwbayes.results.outputs import write_summary
@@ -116,11 +116,11 @@ def track_draws(run: RunDraws, setup: Setup) -> Tracking:
     return replace(made, standing=standing)
 
 
-def _noise(column: dict[str, FloatArray]) -> Noise:
+def _noise(column: dict[str, FloatArray]) -> LoopNoise:
     """Return what the draws say of sensor and discrepancy; a white noise has none of the latter."""
     sensor = column["sensor_sd"]
     nothing, always = np.zeros_like(sensor), np.ones_like(sensor)
-    return Noise(
+    return LoopNoise(
         sensor, column.get("discrepancy_sd", nothing), column.get("discrepancy_time", always)
     )
 

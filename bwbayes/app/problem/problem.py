@@ -52,7 +52,7 @@ from bwbayes.inference.table import JointTable
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.extrapolation import Extrapolation, beyond_training
 from bwbayes.results.prediction import Start
-from bwbayes.sampling.sampler import SamplingPlan, best_places, best_together
+from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]

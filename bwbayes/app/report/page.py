@@ -21,7 +21,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-__all__ = ["Picture", "Plots", "Script", "Table", "picture", "template"]
+__all__ = ["PagePlots", "Picture", "Script", "Table", "picture", "template"]
 
 # What a cell with a number begins with, or what stands for a number that is not known.
 NUMBER = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
@@ -81,7 +81,7 @@ class Script:
         return "sha256-" + b64encode(sha256(self.text.encode()).digest()).decode("ascii")
 
 
-class Plots(NamedTuple):
+class PagePlots(NamedTuple):
     """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
 
     What makes either is ``bwbayes.app.figures.interactive``.

@@ -13,7 +13,7 @@ from typing import Any
 from bwbayes.app.figures.style import title
 from bwbayes.app.report import tables
 from bwbayes.app.report.captions import OF_THE_CHAIN, caption
-from bwbayes.app.report.page import Picture, Plots, picture, template
+from bwbayes.app.report.page import PagePlots, Picture, picture, template
 from bwbayes.app.report.words import covered, error_text, mark
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
@@ -31,7 +31,7 @@ def render(
     result: Result,
     summary: Mapping[str, Any],
     pictures: Mapping[str, bytes],
-    plots: Plots | None = None,
+    plots: PagePlots | None = None,
 ) -> str:
     """Return the report's page.
 

@@ -10,7 +10,7 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.drawing import Beside
 from bwbayes.app.running.facts import facts_of, stepped
 from bwbayes.app.running.fingerprint import version_remarks, versions
-from bwbayes.app.running.predictions import Followed, judged, predictions, scoring
+from bwbayes.app.running.predictions import Swallowed, judged, predictions, scoring
 from bwbayes.inference import conflict
 from bwbayes.results import agreement, identifiability, innovations
 from bwbayes.results.drift import drifted
@@ -78,7 +78,7 @@ def assemble(
     source = generator(problem.config.seed, "without start")
     some = thinned(flat, source)
     followed = {
-        name: Followed(
+        name: Swallowed(
             swallowed(
                 posterior,
                 some,

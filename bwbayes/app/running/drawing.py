@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bwbayes.app.figures import Drawing, drawings, picture_of, prepare, save_pictures
-from bwbayes.app.report.page import Plots
+from bwbayes.app.report.page import PagePlots
 from bwbayes.app.running.workers import Processes, ended
 from bwbayes.results.result import Result
 
@@ -29,7 +29,7 @@ class Beside:
     def __init__(self, pool: Executor) -> None:
         self.pool = pool
         self.pictured: dict[str, Future[bytes]] = {}
-        self.plotted: Future[Plots] | None = None
+        self.plotted: Future[PagePlots] | None = None
         pool.submit(prepare)
 
     def draw(self, result: Result) -> None:
@@ -47,7 +47,7 @@ class Beside:
         save_pictures(every, folder)
         return every
 
-    def plots(self, result: Result) -> Plots:
+    def plots(self, result: Result) -> PagePlots:
         """Wait until the plots to zoom and hover are made, and return them."""
         try:
             return _plots_of(result) if self.plotted is None else self.plotted.result()
@@ -73,7 +73,7 @@ def beside(workers: int | None, *, asked: bool) -> Iterator[Beside | None]:
         yield Beside(pool)
 
 
-def _plots_of(result: Result) -> Plots:
+def _plots_of(result: Result) -> PagePlots:
     from bwbayes.app.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
 
     return interactive.made(result)

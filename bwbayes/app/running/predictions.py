@@ -47,7 +47,7 @@ from bwbayes.shown import head
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Followed", "Prediction", "judged", "predict_another", "predictions", "scoring"]
+__all__ = ["Prediction", "Swallowed", "judged", "predict_another", "predictions", "scoring"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -256,7 +256,7 @@ def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
     return tuple(bands)
 
 
-class Followed(NamedTuple):
+class Swallowed(NamedTuple):
     """What a fit has followed that the actuator did not do, if anything."""
 
     transient: Transient | None
@@ -268,7 +268,7 @@ def judged(
     bands: Iterable[Bands],
     background: Background,
     series: Mapping[str, Innovations],
-    followed: Mapping[str, Followed],
+    followed: Mapping[str, Swallowed],
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name.
 

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
-from bwbayes.sampling.sampler import SamplingPlan
+from bwbayes.sampling.plan import SamplingPlan
 
 __all__ = ["CampaignProgress", "Progress", "ReplicateProgress"]
 

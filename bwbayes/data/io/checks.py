@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.io.grid import time_grid
-from bwbayes.data.io.table import Table, converted
+from bwbayes.data.io.table import FileTable, converted
 from bwbayes.errors import InputError
 
 __all__ = [
@@ -57,7 +57,7 @@ def require_voltage_is(text: str) -> VoltageIs:
 
 
 def checked(
-    table: Table, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
+    table: FileTable, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
 ) -> Checked:
     """Return what a table's record is made of, after all checks that do not depend on the format.
 
@@ -108,7 +108,7 @@ def checked(
     )
 
 
-def checked_reference(table: Table) -> tuple[FloatArray, float]:
+def checked_reference(table: FileTable) -> tuple[FloatArray, float]:
     """Return a displacement that is asked for, (samples,), um, and its sampling interval, s.
 
     Raises
@@ -125,7 +125,7 @@ def checked_reference(table: Table) -> tuple[FloatArray, float]:
     return values, interval
 
 
-def _check_lengths(table: Table) -> None:
+def _check_lengths(table: FileTable) -> None:
     samples = table.columns["time"].values.size
     for quantity, column in table.columns.items():
         if column.values.size != samples:
@@ -144,7 +144,7 @@ def _filled(values: FloatArray, places: IntArray, quantity: str) -> FloatArray:
     return whole
 
 
-def _check_moving(table: Table, quantity: str, values: FloatArray) -> None:
+def _check_moving(table: FileTable, quantity: str, values: FloatArray) -> None:
     extent = float(np.ptp(values))
     if extent == 0:
         problem = f"constant at {values[0]:g}; give a record in which it moves"
@@ -154,7 +154,7 @@ def _check_moving(table: Table, quantity: str, values: FloatArray) -> None:
         raise table.error(problem, quantity)
 
 
-def _check_readings(table: Table, displacement: FloatArray) -> None:
+def _check_readings(table: FileTable, displacement: FloatArray) -> None:
     read = displacement[~np.isnan(displacement)]
     if read.size < MINIMUM_SAMPLES:
         problem = f"too few readings: {read.size}; give at least {MINIMUM_SAMPLES}"

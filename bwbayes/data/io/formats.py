@@ -23,7 +23,7 @@ from bwbayes.data.io.hdf5 import is_hdf5, read_hdf5, write_hdf5
 from bwbayes.data.io.labview import read_tdms
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.data.io.series import Source
-from bwbayes.data.io.table import Table, table_of
+from bwbayes.data.io.table import FileTable, table_of
 from bwbayes.data.io.text import read_text, write_text
 from bwbayes.data.io.vectors import array_table
 from bwbayes.data.record import Record
@@ -115,7 +115,7 @@ def read_reference(path: str | Path) -> tuple[FloatArray, float]:
     return checked_reference(read_table(Path(path), Naming(), ("time", "displacement")))
 
 
-def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> Table:
+def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> FileTable:
     """Read the columns of a file that count, with the naming that they were recognized by.
 
     Raises

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.io.series import MAXIMUM_SAMPLES
-from bwbayes.data.io.table import Column, Table, converted, scaled
+from bwbayes.data.io.table import FileColumn, FileTable, converted, scaled
 from bwbayes.errors import InputError, InputWarning
 
 __all__ = ["Grid", "decimals_of", "time_grid"]
@@ -42,7 +42,7 @@ class Grid(NamedTuple):
     places: IntArray | None = None
 
 
-def time_grid(table: Table, held: bool) -> Grid:
+def time_grid(table: FileTable, held: bool) -> Grid:
     """Return the grid of the time column after checking that it is uniform.
 
     With `held` samples may be missing; then their places on the whole grid are given.
@@ -96,7 +96,7 @@ def time_grid(table: Table, held: bool) -> Grid:
     return Grid(start - offset, interval, offset, places)
 
 
-def _rounding(column: Column, stamps: FloatArray) -> float:
+def _rounding(column: FileColumn, stamps: FloatArray) -> float:
     """Return by how much a number of the time column may be rounded off in memory, s."""
     if column.values.dtype.kind != "f":
         return 0.0
@@ -120,7 +120,7 @@ def _time_tolerance(stamps: FloatArray, interval: float, rounding: float) -> flo
 
 
 def _uneven(
-    table: Table, time: FloatArray, tolerance: float, deviation: FloatArray, held: bool
+    table: FileTable, time: FloatArray, tolerance: float, deviation: FloatArray, held: bool
 ) -> InputError:
     """Return the error that says where the times leave the grid, and by how much."""
     steps = np.diff(time)
@@ -146,7 +146,7 @@ def _uneven(
 
 
 def _declared_interval(
-    table: Table, measured: float, tolerance: float, rounding: float, steps: int
+    table: FileTable, measured: float, tolerance: float, rounding: float, steps: int
 ) -> float:
     """Return the interval that the file declares, to the last bit, if its times agree with it."""
     text = table.notes.get("interval_s")

@@ -16,7 +16,7 @@ from bwbayes.data.io.columns import COMMON_NAMES, QUANTITIES, Naming, choose, is
 from bwbayes.data.io.series import Source, require_real
 from bwbayes.errors import InputError, InputWarning, one_line
 
-__all__ = ["AT_EVERY_SAMPLE", "Column", "Table", "converted", "scaled", "table_of"]
+__all__ = ["AT_EVERY_SAMPLE", "FileColumn", "FileTable", "converted", "scaled", "table_of"]
 
 AT_EVERY_SAMPLE = "give one at every sample (only a displacement may be missing: nan)"
 
@@ -25,7 +25,7 @@ _LARGEST = 1e9  # V or um: beyond it a unit is wrong, whatever the actuator
 
 
 @dataclass(frozen=True)
-class Column:
+class FileColumn:
     """One column as it stands in a file: its name, values, and unit; a minus turns the sign."""
 
     name: str
@@ -34,7 +34,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class FileTable:
     """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
 
     `notes` holds what the file says in words: `voltage_is`, `origin`, `interval_s`. `first_line`
@@ -42,7 +42,7 @@ class Table:
     """
 
     path: Path
-    columns: Mapping[str, Column]
+    columns: Mapping[str, FileColumn]
     notes: Mapping[str, str] = field(default_factory=dict)
     first_line: int | None = None
     naming: Naming = field(default_factory=Naming)
@@ -61,7 +61,7 @@ class Table:
         return InputError(f"{where}: {problem}")
 
 
-def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> Table:
+def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> FileTable:
     """Return the columns of a file that are time, voltage, displacement and truth.
 
     Raises
@@ -70,7 +70,7 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
         A column or unit that is needed and not known, or values that are not real numbers.
     """
     chosen = choose(source, naming, needed)
-    columns: dict[str, Column] = {}
+    columns: dict[str, FileColumn] = {}
     for quantity, (series, unit) in chosen.items():
         values = np.asarray(series.load())
         try:
@@ -79,13 +79,13 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
             raise InputError(f"{source.path}: {error}") from None
         if values.shape != (series.size,):
             raise InputError(f"{source.path}: {series.name}: damaged or cut off; write it again")
-        columns[quantity] = Column(series.name, values, unit)
+        columns[quantity] = FileColumn(series.name, values, unit)
     if "time" not in columns:
         interval = source.interval if naming.fs is None else 1 / naming.fs
         size = max((column.values.size for column in columns.values()), default=0)
         assert interval is not None
         time = source.start + interval * np.arange(size)
-        columns["time"] = Column(COMMON_NAMES["time"], time, "s")
+        columns["time"] = FileColumn(COMMON_NAMES["time"], time, "s")
     names = {q: column.name for q, column in columns.items()}
     others = [s.name for s in source.series if s.name not in names.values()]
     if others and source.first_line is not None:
@@ -96,10 +96,10 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
     group = next(iter(chosen.values()))[0].group
     notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
     used = Naming({**foreign, **naming.columns}, naming.units, naming.fs)
-    return Table(source.path, columns, notes, source.first_line, used)
+    return FileTable(source.path, columns, notes, source.first_line, used)
 
 
-def converted(table: Table, quantity: str) -> FloatArray:
+def converted(table: FileTable, quantity: str) -> FloatArray:
     """Return a column in the package's unit after refusing what is not finite or absurdly large."""
     column = table.columns[quantity]
     with np.errstate(all="ignore"):

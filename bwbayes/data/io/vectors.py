@@ -9,7 +9,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.io.columns import COMMON_NAMES, Naming
-from bwbayes.data.io.table import Column, Table
+from bwbayes.data.io.table import FileColumn, FileTable
 from bwbayes.errors import InputError
 
 __all__ = ["array_table", "frozen_vector"]
@@ -20,7 +20,7 @@ def array_table(
     arrays: Mapping[str, FloatArray | None],
     units: Mapping[str, str],
     notes: Mapping[str, str],
-) -> Table:
+) -> FileTable:
     """Return arrays (samples,) by quantity as the columns of a file that is called ``where``.
 
     Raises
@@ -33,8 +33,8 @@ def array_table(
     for quantity, values in arrays.items():
         if values is not None:
             unit = units.get(quantity, COMMON_NAMES[quantity].rpartition("_")[2])
-            columns[quantity] = Column(f"{quantity}_{unit.removeprefix('-')}", values, unit)
-    return Table(Path(where), columns, notes)
+            columns[quantity] = FileColumn(f"{quantity}_{unit.removeprefix('-')}", values, unit)
+    return FileTable(Path(where), columns, notes)
 
 
 def frozen_vector(name: str, values: ArrayLike, samples: int) -> FloatArray:

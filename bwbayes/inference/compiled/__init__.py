@@ -14,7 +14,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import kernels, lanes
 from bwbayes.inference.compiled.stages import DRIVES, STAGES, given
 from bwbayes.inference.noise import Noise, SteadyState
-from bwbayes.inference.table import Table
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import MOST_TIMES
 from bwbayes.model.declaration import Values
@@ -54,7 +54,7 @@ def moments(
     from_rest
         The record starts from rest.
     """
-    table = Table(actuator, noise)
+    table = ParameterTable(actuator, noise)
     column = table.columns(theta)
     steady = noise.steady_state(table.noise(theta))
     slow = len(actuator.creep.times) if actuator.creep and free else 0

@@ -23,7 +23,7 @@ from bwbayes.inference.compiled.extrema import (
     SIGN,
     SLOT,
     WHOSE,
-    Plan,
+    ExtremaPlan,
     common_rows,
     of_slots,
     still,
@@ -45,7 +45,7 @@ SLOTS = (ROWS + 6) * LANES
 FARTHEST, NEAREST = 1e-3, 300.0
 
 
-def rows(column: Values, plan: Plan, memory: Memory) -> FloatArray:
+def rows(column: Values, plan: ExtremaPlan, memory: Memory) -> FloatArray:
     """Return what the stage starts from, (models, rows). A slot keeps w_r − d u_r, and T_r."""
     d, rayleigh, saturation = column["d"], column["rayleigh"], column["saturation"]
     volts, displacements = turns(memory)

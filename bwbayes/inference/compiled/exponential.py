@@ -27,7 +27,7 @@ from bwbayes.inference.compiled.extrema import (
     SLOT,
     TURNED,
     WHOSE,
-    Plan,
+    ExtremaPlan,
     common_rows,
     of_slots,
     still,
@@ -44,7 +44,7 @@ STEEP, SHORTFALL, RATE, GONE, STEP = (LANES * row for row in range(ROWS, ROWS + 
 SLOTS = (ROWS + 5) * LANES
 
 
-def rows(column: Values, plan: Plan, memory: Memory) -> FloatArray:
+def rows(column: Values, plan: ExtremaPlan, memory: Memory) -> FloatArray:
     """Return what the stage starts from, (models, rows). A slot keeps w_r − (d + α) u_r."""
     d, alpha, threshold = column["d"], column["alpha"], column["threshold"]
     volts, displacements = turns(memory)

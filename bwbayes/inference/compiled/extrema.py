@@ -34,7 +34,7 @@ __all__ = [
     "SLOT",
     "TURNED",
     "WHOSE",
-    "Plan",
+    "ExtremaPlan",
     "common_rows",
     "of_slots",
     "still",
@@ -56,14 +56,14 @@ ROWS = 3
 REST, LAST, OWN = (LANES * row for row in range(ROWS))
 
 
-class Plan(NamedTuple):
+class ExtremaPlan(NamedTuple):
     """What is known beforehand: ``rows`` (samples, columns), and how many slots it takes."""
 
     rows: FloatArray
     slots: int
 
     @classmethod
-    def of(cls, voltage: FloatArray, memory: Memory) -> Plan:
+    def of(cls, voltage: FloatArray, memory: Memory) -> ExtremaPlan:
         """Look where a voltage (samples,) turns and closes loops."""
         levels = np.array([extremum.voltage for extremum in memory.extrema])
         each = [i for i, extremum in enumerate(memory.extrema) if extremum.own is not None]
@@ -130,7 +130,7 @@ def plan_of(
     return plan, slots
 
 
-def of_slots(plan: Plan, memory: Memory, *kept: FloatArray) -> list[FloatArray]:
+def of_slots(plan: ExtremaPlan, memory: Memory, *kept: FloatArray) -> list[FloatArray]:
     """Return the rows of all slots: of each, ``kept`` (slots known, models) in turn."""
     nothing = np.zeros_like(memory.displacement)
     known = len(memory.extrema)

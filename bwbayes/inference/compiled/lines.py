@@ -23,7 +23,7 @@ from bwbayes.inference.compiled.extrema import (
     SLOT,
     TURNED,
     WHOSE,
-    Plan,
+    ExtremaPlan,
     common_rows,
     of_slots,
     still,
@@ -39,7 +39,7 @@ __all__ = ["lines", "planned", "rows"]
 PLAYS, LINES = (LANES * row for row in range(ROWS, ROWS + 2))
 
 
-def rows(lines: Lines, plan: Plan, memory: Memory) -> FloatArray:
+def rows(lines: Lines, plan: ExtremaPlan, memory: Memory) -> FloatArray:
     """Return what the stage starts from, (models, rows). A slot keeps w_r."""
     nothing = np.zeros_like(memory.displacement)
     every = [
@@ -52,7 +52,7 @@ def rows(lines: Lines, plan: Plan, memory: Memory) -> FloatArray:
     return np.stack(every, axis=1)
 
 
-def planned(lines: Lines, plan: Plan, voltage: FloatArray) -> FloatArray:
+def planned(lines: Lines, plan: ExtremaPlan, voltage: FloatArray) -> FloatArray:
     """Return the plan with the number of thresholds passed."""
     table = plan.rows
     travel = np.abs(voltage - table[:, TURNED])

@@ -17,7 +17,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.jiles_atherton import ABOVE, BELOW, STEPS, TINY
-from bwbayes.model.operators.one_state import Memory
+from bwbayes.model.operators.one_state import StateMemory
 from bwbayes.model.operators.pinned import LONGEST, Pinned
 from bwbayes.model.operators.rosenbrock import (
     BETWEEN,
@@ -46,8 +46,8 @@ __all__ = ["drive"]
 
 
 def drive(
-    operator: Pinned, column: Values, voltage: FloatArray, memory: Memory
-) -> tuple[FloatArray, Memory]:
+    operator: Pinned, column: Values, voltage: FloatArray, memory: StateMemory
+) -> tuple[FloatArray, StateMemory]:
     """Return w (models, samples), um, and the memory after it, as ``operator.advance`` does."""
     joined = np.concatenate([[memory.voltage], voltage])
     stretches = list(monotone_stretches(joined, LONGEST))
@@ -57,7 +57,7 @@ def drive(
     spins = isinstance(operator, DomainWall)
     state = np.array(memory.state)
     w = _follow(spins, walls, joined, ends, directions, state)[:, 1:]
-    return w, Memory(float(joined[-1]), state)
+    return w, StateMemory(float(joined[-1]), state)
 
 
 @njit(nogil=True, cache=True)

@@ -26,7 +26,7 @@ from bwbayes.inference.compiled import (
     lines,
     pinned,
 )
-from bwbayes.inference.compiled.extrema import Plan
+from bwbayes.inference.compiled.extrema import ExtremaPlan
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
@@ -71,7 +71,7 @@ def _bouc_wen(operator: Operator, column: Values, voltage: FloatArray, memory: A
 def _exponential(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
     """Take all models."""
     del operator
-    plan = Plan.of(voltage, memory)
+    plan = ExtremaPlan.of(voltage, memory)
     own = exponential.rows(column, plan, memory)
     able = np.ones(len(own), dtype=bool)
     return Stage(EXPONENTIAL, able, memory.displacement, own, plan.rows)
@@ -80,7 +80,7 @@ def _exponential(operator: Operator, column: Values, voltage: FloatArray, memory
 def _lines(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
     """Take models that share their thresholds."""
     assert isinstance(operator, Plays | MaxwellSlip)
-    plan, of = Plan.of(voltage, memory), operator.lines(column)
+    plan, of = ExtremaPlan.of(voltage, memory), operator.lines(column)
     own = lines.rows(of, plan, memory)
     able = np.full(len(own), len(of.corners) == 1)
     return Stage(LINES, able, memory.displacement, own, lines.planned(of, plan, voltage))
@@ -89,7 +89,7 @@ def _lines(operator: Operator, column: Values, voltage: FloatArray, memory: Any)
 def _bells(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage:
     """Take models whose saturation is not out of all proportion to the voltage."""
     del operator
-    plan = Plan.of(voltage, memory)
+    plan = ExtremaPlan.of(voltage, memory)
     own = bells.rows(column, plan, memory)
     highest = float(np.max(np.abs(voltage)))
     ratio = highest / column["saturation"]

@@ -50,7 +50,7 @@ class Walk:
         curve: FloatArray,
         state: FloatArray,
         voltage: FloatArray,
-        drive: _Drive | None,
+        drive: _GivenDrive | None,
     ) -> None:
         self.stage, self.curve, self.state, self.voltage = stage, curve, state, voltage
         self.drive = drive
@@ -72,7 +72,7 @@ class Walk:
         return displacement
 
 
-class _Drive:
+class _GivenDrive:
     """What an operator without a stage makes of a voltage, piece by piece."""
 
     def __init__(self, operator: Operator, column: Values, memory: Any) -> None:
@@ -107,7 +107,7 @@ def walk(
     actuator.check(column)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
     if type(operator) in DRIVES:
-        drive = _Drive(operator, column, memory)
+        drive = _GivenDrive(operator, column, memory)
         stage = given(drive.along(voltage[:1])[:, 0], np.empty((0, 0)))
     else:
         stage = STAGES[type(operator)](operator, column, voltage, memory)

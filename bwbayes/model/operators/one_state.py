@@ -22,8 +22,8 @@ from bwbayes.model.operator import Operator, Span
 
 __all__ = [
     "HIGHEST_CEILING",
-    "Memory",
     "OneState",
+    "StateMemory",
     "alpha",
     "below_ceiling",
     "below_d",
@@ -40,7 +40,7 @@ HIGHEST_CEILING = 1e9
 Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 
 
-class Memory(NamedTuple):
+class StateMemory(NamedTuple):
     """The last voltage, V, and the state (models,) there, um."""
 
     voltage: float
@@ -59,20 +59,27 @@ class OneState(Operator):
         ``voltage`` (samples,), V; ``state`` (models,), um, is that at its first sample.
         """
 
-    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:  # noqa: ARG002  # the state says all of the past
+    def begin(
+        self,
+        column: Values,
+        voltage: float,
+        span: Span,  # noqa: ARG002  # the state says all of the past
+        *,
+        from_rest: bool,
+    ) -> StateMemory:
         """Return the state at the first voltage: ``initial``, or what it becomes from 0 V on."""
         state = column["initial"]
         if from_rest and voltage != 0:
             state = self.trace(column, np.array([0.0, voltage]), state)[1]
-        return Memory(voltage, state)
+        return StateMemory(voltage, state)
 
     def advance(
-        self, column: Values, voltage: FloatArray, memory: Memory
-    ) -> tuple[FloatArray, Memory]:
+        self, column: Values, voltage: FloatArray, memory: StateMemory
+    ) -> tuple[FloatArray, StateMemory]:
         """Return w (models, samples), um, and the memory after the last sample."""
         joined = np.concatenate([[memory.voltage], voltage])
         w, state = self.trace(column, joined, memory.state)
-        return w[:, 1:], Memory(float(joined[-1]), state)
+        return w[:, 1:], StateMemory(float(joined[-1]), state)
 
     def reachable(
         self, column: Values, voltage: float, span: Span

@@ -21,7 +21,7 @@ from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import Memory, OneState, initial, refuse
+from bwbayes.model.operators.one_state import OneState, StateMemory, initial, refuse
 from bwbayes.model.operators.walls import Solver, Walls
 
 __all__ = ["Pinned"]
@@ -153,12 +153,19 @@ class Pinned(OneState, Solver):
         """Return the displacement (models,) without hysteresis at a voltage, um."""
         return self._fixed(column, voltage, np.zeros_like(column["d"]))
 
-    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:  # noqa: ARG002  # the state says all of the past
+    def begin(
+        self,
+        column: Values,
+        voltage: float,
+        span: Span,  # noqa: ARG002  # the state says all of the past
+        *,
+        from_rest: bool,
+    ) -> StateMemory:
         """Return P_irr at the first voltage: as far behind as ``initial``, or what it becomes."""
         fixed = self._fixed(column, 0.0 if from_rest else voltage, column["initial"])
         if from_rest and voltage != 0:
             fixed = self.trace(column, np.array([0.0, voltage]), fixed)[1]
-        return Memory(voltage, fixed)
+        return StateMemory(voltage, fixed)
 
     def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
         """Return how far behind (2, models) sweeps through the span leave the walls, um."""

@@ -22,7 +22,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.operators.one_state import Memory
+from bwbayes.model.operators.one_state import StateMemory
 from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
 
@@ -76,7 +76,7 @@ def followed(
         )
         for row, d in models
     ]
-    here = State(Memory(0.0, state), (np.zeros_like(state),), (np.empty((state.size, 0)),))
+    here = State(StateMemory(0.0, state), (np.zeros_like(state),), (np.empty((state.size, 0)),))
     made = np.empty_like(drive)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(side, "MANY", 1)
