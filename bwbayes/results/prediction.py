@@ -95,7 +95,7 @@ def predict_windows(
         Draws the state of the dynamics at the record's start, where that is unknown.
     """
     theta = posterior.prior.theta(draws)
-    mixed = _draws(posterior, theta, fitted(posterior, theta, generator), generator)
+    mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(part.start, part.stop) for parts in several.values() for part in parts]
     first = min(start for start, _ in edges)
@@ -150,7 +150,7 @@ def forecast(
     theta = posterior.prior.theta(draws)
     begun = fitted(posterior, theta, generator)
     begun = going_on(begun, posterior.likelihood, theta, generator)
-    return _bands(name, _draws(posterior, theta, begun, generator), longer, after)
+    return _bands(name, _draws(posterior, theta, begun), longer, after)
 
 
 def predict_record(
@@ -190,17 +190,15 @@ def predict_record(
     begun = started(posterior, theta, record, start, generator, part.stop)
     if part.stop <= begun.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, _draws(posterior, theta, begun, generator), record, part)
+    bands = _bands(name, _draws(posterior, theta, begun), record, part)
     scored_from = max(begun.judged_from - part.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=begun.lead_in, separate=True)
 
 
-def _draws(
-    posterior: Posterior, theta: FloatArray, start: Started, generator: np.random.Generator
-) -> _Draws:
+def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
     sds = posterior.only.noise.marginal_sd(posterior.only.table.noise(theta))
-    # From a stream of its own: what else the generator is for does not depend on them.
-    scores = mixture.stratified_scores(len(theta), generator.spawn(1)[0])
+    # The same for all predictions: bands differ by what is predicted, not by chance.
+    scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
     return _Draws(start, *sds, scores)
 
 

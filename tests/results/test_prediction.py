@@ -327,6 +327,20 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
     np.testing.assert_allclose(output.mean, given.mean, rtol=1e-9)
 
 
+def test_bands_of_two_voltages_differ_by_the_voltages_alone(
+    posterior: Posterior, draws: FloatArray, record: Record
+) -> None:
+    """Where the voltages are still the same, so are the bands, whatever the seed."""
+    voltage = record.voltage.copy()
+    voltage[300:] *= 0.5
+    plans = [replace(record, voltage=v, displacement=None) for v in (record.voltage, voltage)]
+    rest = Start(from_rest=True)
+    one, other = (predicted(posterior, draws, plan, rest, seed=s) for s, plan in enumerate(plans))
+    for band in one.upper:
+        np.testing.assert_allclose(one.upper[band][:300], other.upper[band][:300], rtol=1e-12)
+        assert (one.upper[band][300:] != other.upper[band][300:]).any()
+
+
 def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
     planned = replace(made(start=1.2), displacement=None, truth=None)
     bands = predicted(posterior, draws, planned, Start(from_rest=True))
