@@ -136,6 +136,11 @@ def verdicts() -> str:
     )
 
 
+def made_up() -> str:
+    one = measured()["ordinary records"]
+    return f"{one['records']} records: {len(one['refused'])} refused"
+
+
 def ordinary() -> str:
     one = measured()["ordinary answers"]
     right, wrong = (Counter(one[kind]) for kind in ("correct", "other"))
@@ -301,6 +306,7 @@ FINDINGS = [
     hostile,
     steady,
     verdicts,
+    made_up,
     ordinary,
     moving,
     moving_operators,
