@@ -18,8 +18,6 @@ from typing import get_type_hints
 
 import bwbayes
 
-__all__ = ["build", "every_module"]
-
 
 def build(folder: Path) -> None:
     """Write the pages to a folder, ``bwbayes.html`` first."""

@@ -10,8 +10,6 @@ from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
 
-__all__ = ["NAMES", "context", "declared", "default_prior", "joint", "parameter"]
-
 BOUC_WEN = BoucWen()
 DECLARED = {d.name: d for d in every_declaration()} | {d.name: d for d in BOUC_WEN.parameters}
 

@@ -25,23 +25,10 @@ from bwbayes.app.commands import cli
 from bwbayes.data import Record, write_record
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Staircase, Waveform
+from bwbayes.report.figures import picture_of
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens
 from tests.app.specimens import record as specimen
-
-__all__ = [
-    "LEAVES",
-    "QUICK",
-    "README",
-    "ROOT",
-    "blocks",
-    "guides",
-    "lines_of_shell",
-    "records_of",
-    "shorter",
-    "typed",
-    "with_files",
-]
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -65,7 +52,8 @@ SHORTER = {
 # So are what a command does by default, and its options: pictures are blank, models and simulated
 # actuators few.
 DEFAULTS = {
-    "bwbayes.app.figures._draw": lambda *_: Figure(),
+    "bwbayes.report.figures._draw": lambda *_: Figure(),
+    "bwbayes.report.saving.picture_of": lambda _: picture_of(Figure),
     "bwbayes.app.commands.compare.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import multiprocessing
 
-__all__ = ["FORKS"]
-
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
     ["pytest", "bwbayes.app.commands.cli", "bwbayes.app.running.run", "tests.app.small"]

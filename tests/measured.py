@@ -14,8 +14,6 @@ from typing import Any
 
 from filelock import FileLock
 
-__all__ = ["keep", "measured"]
-
 PATH = Path(__file__).with_suffix(".json")
 
 

@@ -1,7 +1,16 @@
-"""The oldest versions that ``pyproject.toml`` allows, as constraints for pip.
+r"""The oldest versions that ``pyproject.toml`` allows, as constraints for pip.
 
-``python -m tests.oldest > oldest.txt`` and ``pip install '.[test]' -c oldest.txt`` make an
-environment of them; CONTRIBUTING.md has the commands.
+They are tried without warnings as errors, because old versions deprecate what newer ones have
+removed; lint, types and browser stay out, since they are the same everywhere::
+
+    python3.12 -m venv .oldest && python3 -m tests.oldest > .oldest/oldest.txt
+    .oldest/bin/pip install . pytest pytest-xdist hypothesis pyyaml -c .oldest/oldest.txt
+    .oldest/bin/pip install nbclient nbformat ipykernel 'distributed==2024.12' -c .oldest/oldest.txt
+    .oldest/bin/python -m pytest -n 2 -W default --ignore tests/test_style.py \
+        --ignore tests/test_packaging.py
+
+A newer Python and the newest versions are tried without the constraints, and with warnings as
+errors.
 """
 
 from __future__ import annotations
@@ -9,8 +18,6 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-
-__all__ = ["constraints"]
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 

@@ -13,8 +13,6 @@ import os
 import shutil
 from dataclasses import dataclass
 
-__all__ = ["PROGRAMS", "VARIABLE", "Program", "missing", "needs"]
-
 VARIABLE = "BWBAYES_PROGRAMS"
 REQUIRED = "required"
 

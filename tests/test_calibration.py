@@ -1,27 +1,24 @@
 """The package's posteriors are calibrated, and a calibration notices when they are not.
 
-50 replicates of ``runs/calibration.toml`` are made once: each draws nine parameters from the prior,
-simulates a record and fits it as a run does. The calibration itself must pass; it raises a false
-alarm once in 100 times. A sharper test looks at all parameters of a replicate together: ranks of
-its whitened coordinates are nearly independent, so that 50 replicates tell as much as 450 of one
-parameter. Its level is 0.01, with errors taken from the spread between replicates; sds a fifth too
-small or a bias of 0.3 sd it finds nearly always.
+``-m slow`` makes 500 replicates of ``runs/calibration.toml``: each draws nine parameters from the
+prior, simulates a record and fits it as a run does. The calibration itself must pass; it raises a
+false alarm once in 100 times. A sharper test looks at all parameters of a replicate together
+(:mod:`tests.together`), at a level of 0.01; 50 replicates, as in the default suite's
+``test_calibration_moving.py``, find sds a fifth too small or a bias of 0.3 sd nearly always, 500
+sds a tenth too small.
 
-Both are planted on the stored draws, as twins. The other defects are planted in the likelihood or
-the prior, with as few replicates as show them, and fewer free parameters, because these defects
-are large: the twins without a defect are the 50 replicates.
+These are planted on the stored draws, as twins. The other defects are planted in the likelihood or
+the prior, in the default suite, with as few replicates as show them, and fewer free parameters,
+because these defects are large: the twins without a defect are the sound replicates.
 
 Bands are held to three standard errors from the spread between the replicates. One of the nine
 comparisons, which depend on each other, is off by chance in one calibration of 28. The
 white noise model, fitted to records of the same kind, fails by far.
-
-``-m slow`` makes 500 replicates, with nearly full power for each parameter by itself; together they
-tell sds a tenth too small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,22 +34,25 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise, SteadyState, WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import LIMIT, Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.measured import keep
-from tests.together import LEVEL, Plant, narrowed, narrowed_a_tenth, shifted, together_test, widened
+from tests.together import (
+    LEVEL,
+    Plant,
+    errors_off,
+    narrowed,
+    narrowed_a_tenth,
+    shifted,
+    together_test,
+    widened,
+)
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
 SEED = 1
 FEW = 10
 
-# Seed and number of replicates.
-QUICK, FULL = (SEED, 50), (SEED + 1, 500)
-
-each_size = pytest.mark.parametrize(
-    "sound", [QUICK, pytest.param(FULL, marks=pytest.mark.slow)], indirect=True
-)
+FULL = 500
 
 EVERY_SAMPLE = slice(None)
 
@@ -81,9 +81,8 @@ def judged(outcome: list[Replicate]) -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def sound(request: pytest.FixtureRequest) -> list[Replicate]:
-    seed, count = request.param
-    return made(experiment(problem()), count, seed)
+def sound() -> list[Replicate]:
+    return made(experiment(problem()), FULL, SEED + 1)
 
 
 @pytest.fixture(scope="module")
@@ -91,19 +90,19 @@ def prior() -> JointPrior:
     return problem().posterior.prior
 
 
-@each_size
+@pytest.mark.slow
 def test_calibration_passes(sound: list[Replicate]) -> None:
     outcome = judged(sound)
     assert () == outcome.shortcomings
     assert () == outcome.unconverged
 
 
-@each_size
+@pytest.mark.slow
 def test_parameters_together_are_calibrated(sound: list[Replicate], prior: JointPrior) -> None:
     assert together_test(sound, prior) > LEVEL
 
 
-@each_size
+@pytest.mark.slow
 @pytest.mark.parametrize("defect", [narrowed, widened, shifted])
 def test_twin_planted_defect_is_found(
     sound: list[Replicate], prior: JointPrior, defect: Plant
@@ -112,7 +111,6 @@ def test_twin_planted_defect_is_found(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sound", [FULL], indirect=True)
 def test_five_hundred_replicates_find_small_defects(
     sound: list[Replicate], prior: JointPrior
 ) -> None:
@@ -132,19 +130,11 @@ def test_five_hundred_replicates_find_small_defects(
     assert together_test(sound, prior, narrowed_a_tenth) < LEVEL
 
 
-@each_size
+@pytest.mark.slow
 def test_bands_cover_held_out_samples_with_parameters_from_the_prior(
     sound: list[Replicate],
 ) -> None:
-    assert {} == {name: off for name, off in errors_off(sound) if not abs(off) < LIMIT}
-
-
-def errors_off(outcome: list[Replicate]) -> Iterator[tuple[str, float]]:
-    """Yield how far each band's mean coverage is off, in standard errors between replicates."""
-    for name in (f"{kind} {level}" for kind in KINDS for level in LEVELS):
-        covered = np.array([one.covered[name] for one in outcome])
-        error = np.std(covered, ddof=1) / np.sqrt(covered.size)
-        yield name, float((np.mean(covered) - int(name.split()[1]) / 100) / error)
+    assert {} == {name: off for name, off in errors_off(sound).items() if not abs(off) < LIMIT}
 
 
 # Defects that are planted in the likelihood or the prior
@@ -162,7 +152,7 @@ def test_white_noise_model_fails_the_bands() -> None:
         joint=None,
     )
     outcome = made(replace(common, posterior=white, source=right), FEW)
-    off = dict(errors_off(outcome))
+    off = errors_off(outcome)
     for kind in ("parameter", "displacement"):
         assert off[f"{kind} 95"] < -LIMIT
     assert not judged(outcome).passed

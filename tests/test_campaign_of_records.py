@@ -17,13 +17,12 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.sampler import draws, first_chain, sample
+from bwbayes.sampling.sampler import draws
 from tests.measured import keep
+from tests.sampled import sampled
 
 RUNS = Path(__file__).parents[1] / "runs"
 SEEDS = int(os.environ.get("BWBAYES_CAMPAIGN_SEEDS", "40"))
@@ -46,12 +45,9 @@ def campaign(seed: int) -> Problem:
 
 def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:
     """Return the 95 % interval of each judged parameter."""
-    seed = problem.config.seed
-    point = pointfit.fit(posterior, generator(seed, "point fit"))
     plan = replace(problem.plan, walkers=max(64, 2 * posterior.prior.dimensions + 6))
-    chain = first_chain(posterior, point, plan, generator(seed, "sampling"))
-    with one_thread(), executor(1, posterior.engine) as pool:
-        assert sample(posterior, plan, chain, pool).converged
+    outcome, chain = sampled(replace(problem, posterior=posterior, plan=plan))
+    assert outcome.converged
     flat = draws(posterior, chain).reshape(-1, posterior.prior.dimensions)
     return {
         name: np.quantile(flat[:, posterior.names.index(name)], [0.025, 0.975]) for name in JUDGED

@@ -19,7 +19,8 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
-from bwbayes.app.jobs.campaign import carry_on, config_text, start
+from bwbayes.app.jobs.campaign import config_text, resume, start
+from bwbayes.app.problem.problem import resolve
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens
 from tests.measured import keep
@@ -103,7 +104,7 @@ def written(folder: Path) -> None:
     for number, (name, values) in enumerate(truths().items()):
         lines = "".join(f"{key} = {value!r}\n" for key, value in values.items())
         text = STAND.format(seed=number + 1) + lines
-        bw.write_record(bw.resolve(parse(text, name), Path()).record, folder / f"{name}.csv")
+        bw.write_record(resolve(parse(text, name), Path()).record, folder / f"{name}.csv")
     for name, content in MALFORMED.items():
         (folder / f"bad_{name}.csv").write_text(content)
 
@@ -122,7 +123,7 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
     (tmp_path / "study.toml").write_text(STUDY)
     config = config_text(tmp_path / "study.toml")
     folder = start(tmp_path / "records", config, tmp_path, tmp_path / "out", pictures=False)
-    ended = carry_on(folder, small.quiet())
+    ended = resume(folder, small.quiet())
     assert 2 == ended.exit_status
     refused = {row.name: row.reason for row in ended.rows if row.status == "refused"}
     assert {f"bad_{name}" for name in MALFORMED} == set(refused)

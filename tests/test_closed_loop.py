@@ -13,7 +13,8 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.problem.problem import generator
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.tracking import Tracking, Wishes, track
+from bwbayes.control.tracked import Tracking
+from bwbayes.control.tracking import track
 from bwbayes.data.teststand import PROCESS_SD, PROCESS_TIME
 from bwbayes.model.operator import Span
 from tests.measured import keep
@@ -58,9 +59,9 @@ def on_the_stand(fit: bw.Fit) -> Tracking:
             np.full(DRAWS, PROCESS_TIME),
         ),
         Stand(Span(*LIMITS)),
-        Wishes(frequencies=FREQUENCIES),
         np.random.default_rng(1),
-        one.table.actuator(every),
+        frequencies=FREQUENCIES,
+        all_theta=one.table.actuator(every),
     )
 
 

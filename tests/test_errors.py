@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pickle
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.errors import InputError, one_line
 
 
-@settings(deadline=None)
 @given(st.text())
 def test_any_text_becomes_one_line_that_prints(text: str) -> None:
     got = str(InputError(text))
@@ -18,7 +17,6 @@ def test_any_text_becomes_one_line_that_prints(text: str) -> None:
     assert [got] == (got.splitlines() or [""])
 
 
-@settings(deadline=None)
 @given(st.text(st.characters(categories=("L", "N", "P")), min_size=1))
 def test_a_text_that_prints_stays_as_it_is(text: str) -> None:
     assert text == one_line(text)

@@ -74,7 +74,7 @@ def test_peak_of_whole_fit_grows_by_less_than_two_gibibytes_a_million_samples() 
     parameters = {name: {"fixed": value} for name, value in fixed.items()}
     short, long = (
         fitted(samples, dynamics="lag", ess=100, parameters=parameters)
-        for samples in (15_000, 60_000)
+        for samples in (10_000, 30_000)
     )
     each = (long.peak - short.peak) / (long.samples - short.samples)
     assert long.peak + each * (MILLION - long.samples) <= 2 * GIB

@@ -16,7 +16,7 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.config.models import models_of
-from bwbayes.app.jobs.compare import compare_models
+from bwbayes.app.jobs.models import compare_models
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import finished
 from bwbayes.arrays import FloatArray
@@ -36,9 +36,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def run(folder: Path, config: Path, statuses: tuple[int, ...] = (0,)) -> Any:
+def run(
+    folder: Path, config: Path, statuses: tuple[int, ...] = (0,), *, improve: bool = False
+) -> Any:
     """Run a config on the measured record and return its summary."""
     argv = ["bwbayes", "run", str(config), "--record", str(RECORD), "--out", str(folder), "--quiet"]
+    argv += ["--improve"] * improve
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", argv)
         with pytest.raises(SystemExit) as ended:
@@ -97,6 +100,19 @@ def test_white_noise_scores_worse_and_its_parameters_look_too_sure(honest: Any, 
         assert white["parameters"][name]["sd"] < 0.6 * honest["parameters"][name]["sd"]
 
 
+@pytest.mark.slow
+def test_plain_bouc_wen_is_improved_to_half_its_error(tmp_path: Path) -> None:
+    """From default priors alone: NRMSE at most 0.45 %, 95 % sensor band at most 0.75 um wide."""
+    config = tmp_path / "plain.toml"
+    text = (ROOT / "runs/measured_stack.toml").read_text(encoding="utf-8")
+    start = text.index("[parameters.discrepancy_time]")
+    config.write_text(text[:start] + text[text.index("[sampling]") :], encoding="utf-8")
+    held_out = run(tmp_path / "out", config, improve=True)["validation"]["held_out"]
+    keep("the measured stack, improved", {key: held_out[key] for key in ("nrmse", "width_95_um")})
+    assert held_out["nrmse"] <= 0.0045
+    assert held_out["width_95_um"] <= 0.75
+
+
 @pytest.fixture(scope="module")
 def parts_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("parts") / "out"
@@ -121,7 +137,7 @@ def test_parts_halve_the_error_and_narrow_the_bands(honest: Any, parts: Any) -> 
 
 
 # Widths of the smoothing that are tried, sd in s: from none to about the time of the stack's lag.
-WIDTHS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
+WIDTHS = (0.0, 0.012, 0.02)
 
 
 def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
@@ -174,7 +190,8 @@ def test_the_voltage_computed_for_the_held_out_displacement_is_the_applied_one(
 def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
-    problem, chain, _ = finished(RunFolder.open(folder))
+    fit = finished(RunFolder.open(folder))
+    problem, chain = fit.problem, fit.chain
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     return problem.posterior, thinned(flat, np.random.default_rng(1))
 
@@ -227,27 +244,13 @@ def on_cuts(posterior: Posterior, drawn: FloatArray) -> tuple[Judged, Judged]:
 
 
 @pytest.mark.slow
-def test_records_cut_out_in_motion_are_predicted(plain_on_cuts: tuple[Judged, Judged]) -> None:
-    """Ten records that start anywhere in the drive; a transient at their start changes little.
-
-    Their bands cover more than promised, 99.9 %: this stack's discrepancy comes back with every
-    period and never reaches the tails of a normal distribution, and its mean over the lead-in's
-    periods is better known than that of a process without memory of the loop.
-    """
-    usual, knocked = plain_on_cuts
-    assert usual[0] >= 0.88
-    assert usual[1] <= 0.0095
-    assert usual[2] <= 1.7
-    np.testing.assert_allclose(usual, knocked, rtol=0.1)
-
-
-@pytest.mark.slow
 def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     parts_folder: Path, parts: Any, plain_on_cuts: tuple[Judged, Judged]
 ) -> None:
     """Their 95 % bands cover 88 to 99 %, and are at least 35 % narrower than plain Bouc-Wen's."""
     assert parts["converged"]
-    problem, chain, _ = finished(RunFolder.open(parts_folder))
+    fit = finished(RunFolder.open(parts_folder))
+    problem, chain = fit.problem, fit.chain
     flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     # So many draws are enough: most of their band is the discrepancy.
     usual, knocked = on_cuts(problem.posterior, thinned(flat, np.random.default_rng(1), 250))
@@ -256,17 +259,6 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     assert usual[1] < plain[1]
     assert usual[2] <= 0.65 * plain[2]
     np.testing.assert_allclose(usual, knocked, rtol=0.1)
-
-
-@pytest.mark.slow
-def test_the_whole_file_is_fitted_in_spite_of_its_start(tmp_path: Path, honest: Any) -> None:
-    """The first readings lie 25 um away; d is that of the fit of 25 to 36 s all the same."""
-    config = tmp_path / "whole.toml"
-    config.write_text(f"[record]\nfile = '{RECORD}'\n")
-    whole = run(tmp_path / "whole", config, (0, 3))
-    assert whole["converged"]
-    d, usual = whole["parameters"]["d"], honest["parameters"]["d"]
-    assert abs(d["mean"] - usual["mean"]) < 2 * usual["sd"]
 
 
 # Six models, from none of the hysteresis to elements that slip.
@@ -286,10 +278,14 @@ def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path
     config = config.model_copy(update={"record": source, "sampling": sampling})
     models = models_of(MODELS, config.model)
     begun = time.monotonic()
-    made = compare_models(config, ROOT, models, tmp_path / "out", Console(quiet=True))
+    quiet = Console(quiet=True)
+    made = compare_models(config, ROOT, models, tmp_path / "out", quiet)
     minutes = (time.monotonic() - begun) / 60
     assert made.recommended is not None
-    chosen, plain = made[made.recommended].mean, made["bouc-wen"].mean
+    chosen = made[made.recommended].mean
+    # Screening may leave it out.
+    alone = {"bouc-wen": models["bouc-wen"]}
+    plain = compare_models(config, ROOT, alone, tmp_path / "plain", quiet)["bouc-wen"].mean
     assert chosen is not None
     assert plain is not None
     narrower = 1 - chosen.width_um / plain.width_um
@@ -297,7 +293,7 @@ def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path
         "models of the measured stack",
         {
             "recommended": made.recommended,
-            "alike": list(made.alike),
+            "tied": list(made.tied),
             "nrmse_percent": round(100 * chosen.nrmse, 3),
             "narrower_percent": round(100 * narrower),
             "minutes": round(minutes, 1),
@@ -306,4 +302,4 @@ def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path
     assert chosen.nrmse <= 0.0042
     assert narrower >= 0.35
     # Plain Bouc-Wen, and a model without hysteresis, are told apart from it.
-    assert not {"bouc-wen", "linear"} & set(made.alike)
+    assert not {"bouc-wen", "linear"} & set(made.tied)

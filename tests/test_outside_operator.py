@@ -19,15 +19,24 @@ from rich.console import Console
 
 import bwbayes
 from bwbayes.app.commands import cli
-from bwbayes.app.running.run import carry_on, start
+from bwbayes.app.config.config import Config, parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.run import resume, start
 from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.elementwise import select
+from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
+from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
+from bwbayes.model.operators.one_state import OneState, beta, initial_anywhere
 from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.step import OneStateStep
+from tests.control.compiled import Compiled
+from tests.programs import needs
 
 HERE = "tests.test_outside_operator"
 
@@ -51,16 +60,15 @@ class TanhLoop(RemembersExtrema):
         slope, held = positive("d", "um/V", "gain", 1.4), positive("alpha", "um/V", "gain", 0.4)
         return slope, held, positive("width", "V", "voltage", 0.5), INITIAL
 
-    def branch(self, column: Values) -> Branch:
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d, α and u_s."""
+        return np.column_stack([column[name] for name in ("d", "alpha", "width")])
+
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
         """Return E = 2 Φ(|u − u_r| / 2)."""
-        d, alpha, width = (column[name][:, np.newaxis] for name in ("d", "alpha", "width"))
-
-        def everett(begin: float | FloatArray, voltage: FloatArray) -> FloatArray:
-            half = np.abs(voltage - begin) / 2
-            moved: FloatArray = 2 * (d * half - alpha * width * np.tanh(half / width))
-            return moved
-
-        return everett
+        half = np.abs(voltage - start) / 2
+        return 2 * (numbers[0] * half - numbers[1] * numbers[2] * np.tanh(half / numbers[2]))
 
 
 @dataclass(frozen=True)
@@ -100,6 +108,74 @@ class SinglePlay(Operator):
         """Return d."""
         del span
         return column["d"]
+
+
+@dataclass(frozen=True)
+class BentStep(OneStateStep):
+    """w = d u − h − k tanh(u / u_s), dh = α du − β |du| h: as an operator's own step."""
+
+    numbers: FloatArray
+
+    @property
+    def parameters(self) -> FloatArray:
+        """d, α, β, k and u_s, (models, 5)."""
+        return self.numbers
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return w and its slope."""
+        d, beta, bend, width = parameters[0], parameters[2], parameters[3], parameters[4]
+        s = select(voltage < memory[0], -1.0, 1.0)
+        top = s * parameters[1] / beta
+        h = top + (memory[1] - top) * np.exp(-beta * np.abs(voltage - memory[0]))
+        after[0], after[1] = voltage, h
+        level, slope = saturated(voltage / width)
+        w = d * voltage - h - bend * level
+        return w, d - parameters[1] + s * beta * h - bend / width * slope
+
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
+        """Return d − 2 α − k / u_s and d."""
+        del limits
+        d, alpha, _, bend, width = self.parameters.T
+        return d - 2 * alpha - bend / width, d
+
+    def coefficients(self) -> dict[str, tuple[Any, str]]:
+        """Return d."""
+        return {"d": (float(self.parameters[0, 0]), "um/V")}
+
+
+def saturated(x: Any) -> tuple[Any, Any]:
+    """Return tanh x and its slope: a function that a step calls."""
+    level = np.tanh(x)
+    return level, 1.0 - level * level
+
+
+@dataclass(frozen=True)
+class Bent(OneState):
+    """The operator of that step, which it takes for its displacement, too."""
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Slopes d and α, um/V, β, 1/V, k, um, u_s, V, and the start."""
+        bend, width = (
+            positive("bend", "um", "displacement", 0.02),
+            positive("width", "V", "voltage", 0.5),
+        )
+        slopes = positive("d", "um/V", "gain", 1.2), positive("alpha", "um/V", "gain", 0.2)
+        return *slopes, beta(), bend, width, initial_anywhere()
+
+    def check(self, column: Values) -> None:
+        """Take any parameters within their bounds."""
+
+    def gain(self, column: Values, span: Span) -> FloatArray:
+        """Return d."""
+        del span
+        return column["d"]
+
+    def step(self, column: Values) -> BentStep:
+        """Return the step."""
+        names = ("d", "alpha", "beta", "bend", "width")
+        return BentStep(np.stack([column[name] for name in names], axis=1))
 
 
 class Incomplete(RemembersExtrema):
@@ -147,6 +223,7 @@ window = [5.0, 6.0]
 TRUTH = {
     "TanhLoop": {"d": 0.9, "alpha": 0.3, "width": 40.0, "initial": 0.0},
     "SinglePlay": {"d": 0.7, "width": 9.0, "initial": 0.0},
+    "Bent": {"d": 0.9, "alpha": 0.2, "beta": 0.03, "bend": 2.0, "width": 40.0, "initial": 0.0},
 }
 
 
@@ -154,7 +231,7 @@ def record_of(kind: str) -> bwbayes.Record:
     """Return a record that an operator of this module has made, with 0.3 um of sensor noise."""
     time = np.arange(300) * 0.02
     voltage = 100 * np.exp(-0.3 * time) * np.sin(2 * np.pi * time)
-    operator = {"TanhLoop": TanhLoop(), "SinglePlay": SinglePlay()}[kind]
+    operator = {"TanhLoop": TanhLoop(), "SinglePlay": SinglePlay(), "Bent": Bent()}[kind]
     actuator = Actuator("none", "first", 0.02, operator, span=Span(-100.0, 100.0))
     theta = np.array([[*TRUTH[kind].values(), 1.0]])
     clean = actuator.displacement(theta, voltage, from_rest=True)[0]
@@ -162,16 +239,16 @@ def record_of(kind: str) -> bwbayes.Record:
     return bwbayes.Record(voltage, clean + noise, 0.02)
 
 
-def config(folder: Path, kind: str, engine: str = "auto") -> bwbayes.Config:
+def config(folder: Path, kind: str, engine: str = "auto") -> Config:
     """Write a record that such an operator has made, and return a config that fits it."""
     bwbayes.write_record(record_of(kind), folder / "record.csv")
     text = CONFIG.replace("HYSTERESIS", f"{HERE}:{kind}").replace("ENGINE", engine)
-    return bwbayes.parse_config(text, "outside.toml")
+    return parse(text, "outside.toml")
 
 
 def test_a_truth_may_be_stated_of_its_own_parameters(tmp_path: Path) -> None:
     stated = config(tmp_path, "SinglePlay").model_copy(update={"truth": {"width": 9.0}})
-    assert bwbayes.resolve(stated, tmp_path).config.truth == {"width": 9.0}
+    assert resolve(stated, tmp_path).config.truth == {"width": 9.0}
 
 
 @pytest.mark.parametrize(
@@ -184,7 +261,7 @@ def test_an_operator_from_outside_goes_all_the_way(kind: str, engine: str, tmp_p
     Of five parameters in all, such a bound is missed by chance in one of 3,000 runs.
     """
     folder = start(config(tmp_path, kind, engine), tmp_path, tmp_path / "run")
-    result = carry_on(folder, Console(quiet=True), workers=1)
+    result = resume(folder, Console(quiet=True), workers=1)
     assert result.outcome.converged
     summary = json.loads(folder.summary.read_text(encoding="utf-8"))
     for name, truth in TRUTH[kind].items():
@@ -199,12 +276,28 @@ def test_an_operator_from_outside_goes_all_the_way(kind: str, engine: str, tmp_p
 
 @pytest.mark.parametrize("kind", list(TRUTH))
 def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
-    problem = bwbayes.resolve(config(tmp_path, kind), tmp_path)
+    problem = resolve(config(tmp_path, kind), tmp_path)
     posterior = problem.posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)
     assert np.max(np.abs(one - other) / (posterior.only.voltage.size + np.abs(one))) < 1e-10
+
+
+def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) -> None:
+    """Many models there and back to 1e-8 V, and the C file to 1e-12 of the range."""
+    actuator = Actuator("none", "first", 0.02, Bent(), span=Span(-100.0, 100.0))
+    spread = 1 + 0.02 * np.random.default_rng(2).uniform(-1, 1, (60, 1))
+    theta = spread * np.array([*TRUTH["Bent"].values(), 0.0])
+    voltage = record_of("Bent").voltage
+    displacement = actuator.displacement(theta, voltage, from_rest=True)
+    back = inverse(actuator, theta, displacement, from_rest=True)
+    np.testing.assert_allclose(back, np.broadcast_to(voltage, back.shape), atol=1e-8)
+    made_for = exported("bent", actuator, theta[0], Span(-100.0, 100.0))
+    assert f"{HERE}:Bent" == made_for.numbers()["parts"]["hysteresis"]
+    compiled = Compiled(made_for, tmp_path, needs("cc"))
+    got = compiled.run("forward", voltage[0], voltage)
+    np.testing.assert_allclose(got, displacement[0], atol=1e-12 * np.ptp(displacement[0]))
 
 
 @pytest.mark.parametrize(

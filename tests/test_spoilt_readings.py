@@ -38,7 +38,7 @@ def measured(seed: int, seconds: float = 16.0) -> Record:
     return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)
 
 
-@pytest.mark.parametrize("what", ["a tenth", "a second"])
+@pytest.mark.parametrize("what", ["a second", pytest.param("a tenth", marks=pytest.mark.slow)])
 def test_missing_readings_leave_the_posterior_of_the_dense_gaussian(
     tmp_path: Path, what: str
 ) -> None:

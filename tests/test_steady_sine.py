@@ -14,15 +14,13 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from bwbayes.inference import pointfit
 from bwbayes.model.actuator import Actuator
-from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
+from bwbayes.sampling.sampler import draws
 from tests.measured import keep
+from tests.sampled import sampled
 
 RATE = 250.0
 TRUTH = {
@@ -69,19 +67,10 @@ def steady_sine(seed: int, folder: Path, periods: int = 3) -> Problem:
     return resolve(config, folder)
 
 
-def sampled(problem: Problem) -> tuple[Outcome, Chain]:
-    """Fit and sample as a run does."""
-    posterior, seed = problem.posterior, problem.config.seed
-    with one_thread(), executor(2, posterior.engine) as pool:
-        point = pointfit.fit(posterior, generator(seed, "point fit"))
-        chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
-        return sample(posterior, problem.plan, chain, pool), chain
-
-
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_steady_sine_converges_within_hundreds_of_steps(seed: int, tmp_path: Path) -> None:
     """Pilot and all. Two of four ensembles in the hopeless mode took 3,000 for the pilot alone."""
-    outcome, chain = sampled(steady_sine(seed, tmp_path))
+    outcome, chain = sampled(steady_sine(seed, tmp_path), workers=2)
     assert outcome.converged, outcome.stop_reason
     assert chain.steps("pilot") + chain.steps("sampling") <= 1200
 
@@ -98,7 +87,7 @@ def test_forty_steady_sines_converge_and_their_intervals_cover(tmp_path: Path) -
     for seed in range(RECORDS):
         problem = steady_sine(seed, tmp_path)
         begun = time.monotonic()
-        outcome, chain = sampled(problem)
+        outcome, chain = sampled(problem, workers=2)
         seconds.append(time.monotonic() - begun)
         steps.append(chain.steps("pilot") + chain.steps("sampling"))
         assert outcome.converged, (seed, outcome.stop_reason)

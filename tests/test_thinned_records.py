@@ -255,21 +255,6 @@ def test_the_variances_to_compare_with_are_those_of_dense_covariances() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_thinned_readings_lead_to_the_truth_as_all_of_them_do(tmp_path: Path, seed: int) -> None:
-    """``decimate = 8`` at 100 Hz: what the voltage did between the readings is not forgotten."""
-    record = measured(0.02, seed, 100.0, 10.0)
-    whole, _ = answer(record, tmp_path, seed, stop=8.0)
-    part, _ = answer(record, tmp_path, seed, "decimate = 8", stop=8.0)
-    for one in (whole, part):
-        assert max(off(one).values()) < 4
-    assert apart(whole, part)["d"] < 2
-    # The twin thins the voltage too, and with it the turning points.
-    twin, _ = answer(thinned(record, 8), tmp_path, seed, stop=8.0)
-    assert max(off(twin).values()) > 4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("lag", LAGS)
 def test_every_kth_sample_of_a_record_at_5_khz_gives_its_answer(tmp_path: Path, lag: float) -> None:
     """Over 20 seeds; and the bands of the rest of the record cover at each rate."""

@@ -1,4 +1,4 @@
-"""A test of all parameters of a calibration together.
+"""A test of all parameters of a calibration together, and one of its bands.
 
 Ranks of a replicate's whitened coordinates are nearly independent, so that replicates tell as much
 as many more of a single parameter would. Its errors come from the spread between replicates.
@@ -14,8 +14,6 @@ from scipy import linalg, stats
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.replicates import Replicate
-
-__all__ = ["LEVEL", "Plant", "narrowed", "narrowed_a_tenth", "shifted", "together_test", "widened"]
 
 # Level at which the test is used.
 LEVEL = 0.01
@@ -82,3 +80,14 @@ def together_test(result: list[Replicate], prior: JointPrior, plant: Plant = not
     mean = np.mean(each, axis=0)
     squared = count * mean @ linalg.solve(np.cov(each.T), mean)
     return float(stats.f.sf(squared * (count - 2) / (2 * (count - 1)), 2, count - 2))
+
+
+def errors_off(results: list[Replicate]) -> dict[str, float]:
+    """How far each band's mean coverage is off, in standard errors between replicates."""
+    ranked = [replicate for replicate in results if replicate.covered]
+    off = {}
+    for name in ranked[0].covered:
+        covered = np.array([replicate.covered[name] for replicate in ranked])
+        error = np.std(covered, ddof=1) / np.sqrt(covered.size)
+        off[name] = float((np.mean(covered) - int(name.split()[-1]) / 100) / error)
+    return off

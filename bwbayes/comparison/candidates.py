@@ -1,20 +1,20 @@
 """One model of a comparison: what it cost to fit, and what it was worth, in numbers.
 
-Everything is about the same readings for all models: the held-out ones for scores and bands, the
-later half of the training readings for what it foretold of its own future, all of the training
-readings for evidence and information criteria.
+Everything is about the same readings for all models: the held-out ones for scores and bands, these
+and the later half of the training readings for what decides, all of the training readings for
+evidence and information criteria.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.comparison.evidence import Evidence
-from bwbayes.comparison.future import Future
+from bwbayes.comparison.leave_future_out import Part
 from bwbayes.results.bands import Bands
 from bwbayes.results.scores import Scores
 from bwbayes.results.standing import Standing
@@ -63,16 +63,14 @@ class Candidate:
     held_out, scores
         Bands of what was held out and measured, and their scores by the bands' name.
     standing
-        Whether its run's bands hold.
-    joint
-        Log density of the held-out readings of the training records together, nats, and Pareto k̂
-        of the ratios that it is a mean of; None if there are none.
-    future
-        What it foretold of its training readings; None if that was left out.
+        Whether its run's bands hold; None if that was not worked out.
+    parts
+        Its log scores of later readings, by the part's name.
     evidence
         Its log evidence.
-    log_likelihood
-        The largest among the draws, nats.
+    screened
+        Whether it was only screened: its evidence, by Laplace's approximation at the MAP estimate,
+        and its likelihood are too far behind for sampling it to be worth while.
     """
 
     __repr__ = brief
@@ -86,30 +84,46 @@ class Candidate:
     hysteresis: bool = True
     held_out: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
-    standing: Standing = field(default_factory=Standing)
-    joint: tuple[float, float] | None = None
-    future: Future | None = None
+    standing: Standing | None = None
+    parts: Mapping[str, Part] = field(default_factory=dict)
     evidence: Evidence | None = None
-    log_likelihood: float | None = None
+    screened: bool = False
+
+    @property
+    def log_evidence(self) -> float:
+        """Its log evidence, nats; −∞ if it is not known."""
+        known = self.evidence is not None and np.isfinite(self.evidence.log_evidence)
+        return self.evidence.log_evidence if known and self.evidence is not None else -np.inf
+
+    @property
+    def log_likelihood(self) -> float | None:
+        """The largest among the draws, or at the MAP estimate, nats."""
+        return None if self.evidence is None else self.evidence.max_log_likelihood
 
     @property
     def aic(self) -> float | None:
-        """Akaike's criterion 2 k − 2 log L, with the largest likelihood among the draws."""
+        """Akaike's criterion 2 k − 2 log L, with :attr:`log_likelihood`."""
         if self.log_likelihood is None:
             return None
         return 2 * self.free - 2 * self.log_likelihood
 
     @property
     def bic(self) -> float | None:
-        """Schwarz's criterion k log n − 2 log L, with the largest likelihood among the draws."""
+        """Schwarz's criterion k log n − 2 log L, with :attr:`log_likelihood`."""
         if self.log_likelihood is None:
             return None
         return self.free * float(np.log(self.readings)) - 2 * self.log_likelihood
 
+    def log_score(self, parts: Iterable[str]) -> float:
+        """Return the sum of its log scores of parts by their names, nats."""
+        return sum(float(np.sum(self.parts[name].log_scores)) for name in parts)
+
     @property
     def log_scores(self) -> FloatArray | None:
         """Log scores (readings,) of all held-out readings, nats; None without any."""
-        scores = [one.log_score[judged(one)] for one in self.held_out if one.log_score is not None]
+        scores = [
+            bands.log_score[judged(bands)] for bands in self.held_out if bands.log_score is not None
+        ]
         return np.concatenate(scores) if scores else None
 
     @property
@@ -117,24 +131,24 @@ class Candidate:
         """Return what the held-out readings say together; None without any."""
         if self.log_scores is None:
             return None
-        every: Sequence[Scores] = [self.scores[one.name] for one in self.held_out]
-        counts = np.array([np.sum(judged(one)) for one in self.held_out], dtype=np.float64)
+        scores: Sequence[Scores] = [self.scores[bands.name] for bands in self.held_out]
+        counts = np.array([np.sum(judged(bands)) for bands in self.held_out], dtype=np.float64)
         parts = counts / counts.sum()
-        sensor = [one.coverage["sensor"] or {} for one in every]
-        errors = [one.coverage_error["sensor"] or {} for one in every]
+        sensor = [score.coverage["sensor"] or {} for score in scores]
+        errors = [score.coverage_error["sensor"] or {} for score in scores]
         return Mean(
             log_score=float(np.mean(self.log_scores)),
-            crps_um=float(parts @ [one.crps_um for one in every]),
-            nrmse=float(np.sqrt(parts @ np.square([one.nrmse for one in every]))),
-            coverage=float(parts @ [one[LEVEL] for one in sensor]),
-            coverage_error=float(np.sqrt(parts**2 @ np.square([one[LEVEL] for one in errors]))),
-            width_um=float(parts @ [one.width_um[LEVEL] for one in every]),
+            crps_um=float(parts @ [score.crps_um for score in scores]),
+            nrmse=float(np.sqrt(parts @ np.square([score.nrmse for score in scores]))),
+            coverage=float(parts @ [coverage[LEVEL] for coverage in sensor]),
+            coverage_error=float(np.sqrt(parts**2 @ np.square([error[LEVEL] for error in errors]))),
+            width_um=float(parts @ [score.width_um[LEVEL] for score in scores]),
         )
 
 
 def judged(bands: Bands) -> BoolArray:
     """Tell which samples of bands have a reading that is judged."""
     assert bands.measured is not None
-    known: BoolArray = np.isfinite(bands.measured)
-    known[: bands.scored_from] = False
-    return known
+    inside: BoolArray = np.isfinite(bands.measured)
+    inside[: bands.scored_from] = False
+    return inside

@@ -13,98 +13,26 @@ hundred. A fit, which trusts the noise model, may look surer than was promised o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
+from bwbayes.comparison.designed import Promise
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.identifiability import stretches_once
-from bwbayes.results.standing import Standing
-from bwbayes.shown import brief
 
-__all__ = ["Asked", "Promise", "promises", "ranked"]
+__all__ = ["promises"]
 
 # Draws that the promise is averaged over, and those that say what is known already.
 DRAWS, KNOWN = 40, 4000
 
 # Step of the derivatives, in posterior sds of a coordinate.
 STEP = 0.01
-
-
-@dataclass(frozen=True)
-class Promise:
-    """What a candidate promises.
-
-    Attributes
-    ----------
-    name
-        The candidate's name.
-    left
-        The part of the standard deviation that would be left: of the parameter, or of the
-        parameter band's mean width along the chosen drive; nan if it is refused.
-    error
-        Its Monte Carlo error.
-    refused
-        Why the amplifier cannot make it; empty if it can.
-    """
-
-    __repr__ = brief
-
-    name: str
-    left: float
-    error: float
-    refused: str = ""
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What was asked of a design.
-
-    Attributes
-    ----------
-    run
-        The name of the run that is started from.
-    parameter, drive
-        What is to be known better: a parameter, or the band along a drive of that name.
-    amplifier
-        What can be driven.
-    signals
-        The candidates' voltages (samples,) by name, V.
-    interval
-        Their sampling interval, s.
-    standing
-        How the validation of the run came out.
-    """
-
-    run: str
-    parameter: str | None
-    drive: str | None
-    amplifier: Limits
-    signals: Mapping[str, FloatArray]
-    interval: float
-    standing: Standing
-
-    @property
-    def target(self) -> str:
-        """The name of what is to be known better."""
-        return self.parameter or self.drive or ""
-
-    @property
-    def left(self) -> str:
-        """What the promises are parts of, in words."""
-        if self.parameter is not None:
-            return f"sd left of {self.parameter}"
-        return f"width left of the band along {self.drive}"
-
-
-def ranked(every: Sequence[Promise]) -> list[Promise]:
-    """Return promises, the best first, what is refused last."""
-    return sorted(every, key=lambda one: (bool(one.refused), one.left, one.name))
 
 
 def promises(
@@ -115,7 +43,7 @@ def promises(
     amplifier: Limits,
     generator: np.random.Generator,
 ) -> list[Promise]:
-    """Work out what candidates would teach.
+    """Rank candidates by what they would teach, the best first.
 
     With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
     sampling, J the derivatives of the candidate's displacements there and C the noise's covariance,
@@ -158,23 +86,27 @@ def promises(
         hint = suggestion(target, asker.names)
         raise InputError(f"design: {target!r} is not a free parameter of the actuator; {hint}")
     before, gradients = asker.known(target)
-    made = []
+    scores: list[Promise] = []
     for name, voltage in candidates.items():
         why = amplifier.refuses(voltage, posterior.only.actuator.interval)
         if why:
-            made.append(Promise(name, np.nan, np.nan, why))
+            scores.append(Promise(name, np.nan, np.nan, why))
             continue
-        left = np.array(
+        remaining = np.array(
             [
-                _spread(gradient, asker.after(information)) / known
-                for gradient, information, known in zip(
+                _spread(gradient, asker.after(information)) / sd
+                for gradient, information, sd in zip(
                     gradients, asker.information(voltage), before, strict=True
                 )
             ]
         )
-        error = float(np.std(left, ddof=1) / np.sqrt(left.size)) if left.size > 1 else np.inf
-        made.append(Promise(name, float(np.mean(left)), error))
-    return made
+        error = (
+            float(np.std(remaining, ddof=1) / np.sqrt(remaining.size))
+            if remaining.size > 1
+            else np.inf
+        )
+        scores.append(Promise(name, float(np.mean(remaining)), error))
+    return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
 
 
 def _spread(gradient: FloatArray, covariance: FloatArray) -> float:
@@ -203,27 +135,29 @@ class _Asker:
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray, generator: np.random.Generator) -> _Asker:
         """Choose the draws, and see what is known."""
-        one, prior = posterior.only, posterior.prior
-        own = [
+        dataset, prior = posterior.only, posterior.prior
+        names = [
             d.name
-            for d in one.actuator.declarations
+            for d in dataset.actuator.declarations
             if d.scope == "actuator" and d.name in prior.free_names
         ]
-        columns = tuple(prior.free_names.index(name) for name in own)
-        known = prior.unconstrain(draws[:: max(len(draws) // KNOWN, 1)])
-        covariance = np.atleast_2d(np.cov(known[:, columns], rowvar=False))
-        chosen = generator.choice(len(known), min(DRAWS, len(known)), replace=False)
+        columns = tuple(prior.free_names.index(name) for name in names)
+        coordinates = prior.unconstrain(draws[:: max(len(draws) // KNOWN, 1)])
+        covariance = np.atleast_2d(np.cov(coordinates[:, columns], rowvar=False))
+        chosen = generator.choice(len(coordinates), min(DRAWS, len(coordinates)), replace=False)
         offset_sd = 0.0
         for parameter in prior.free:
             if parameter.name == "offset" and parameter.prior is not None:
                 offset_sd = float(parameter.prior.frozen.std())
         steps = STEP * np.sqrt(np.diag(covariance))
-        return cls(posterior, known[chosen], columns, tuple(own), covariance, steps, offset_sd)
+        return cls(
+            posterior, coordinates[chosen], columns, tuple(names), covariance, steps, offset_sd
+        )
 
-    def _theta(self, place: FloatArray) -> FloatArray:
+    def _theta(self, position: FloatArray) -> FloatArray:
         """Return θ (2 coordinates, parameters), steps to either side of a place (free,)."""
         count = len(self.columns)
-        moved = np.repeat(place[np.newaxis], 2 * count, axis=0)
+        moved = np.repeat(position[np.newaxis], 2 * count, axis=0)
         rows = np.arange(count)
         moved[rows, self.columns] += self.steps
         moved[count + rows, self.columns] -= self.steps
@@ -237,10 +171,10 @@ class _Asker:
         slopes: FloatArray = ((plus - minus).T / (2 * self.steps)).T
         return slopes
 
-    def _displacement(self, place: FloatArray, voltage: FloatArray) -> FloatArray:
+    def _displacement(self, position: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return derivatives (coordinates, samples) of the displacement along a voltage."""
-        one = self.posterior.only
-        model = one.table.actuator(self._theta(place))
+        dataset = self.posterior.only
+        model = dataset.table.actuator(self._theta(position))
         actuator = self.posterior.likelihood.actuator
         return self._slopes(actuator.displacement(model, voltage, from_rest=True))
 
@@ -248,33 +182,35 @@ class _Asker:
         """Return the spread before, and the target's gradients, at each draw."""
         if isinstance(target, str):
             column = self.posterior.only.table.names.index(target)
-            gradients = [self._slopes(self._theta(place)[:, [column]]) for place in self.places]
+            gradients = [
+                self._slopes(self._theta(position)[:, [column]]) for position in self.places
+            ]
         else:
-            gradients = [self._displacement(place, target) for place in self.places]
+            gradients = [self._displacement(position, target) for position in self.places]
         return [_spread(gradient, self.covariance) for gradient in gradients], gradients
 
     def information(self, voltage: FloatArray) -> list[FloatArray]:
         """Return the Fisher information (coordinates, coordinates) of a candidate, at each draw."""
-        one, prior = self.posterior.only, self.posterior.prior
-        noise = one.table.noise(prior.theta(prior.constrain(self.places)[0]))
+        dataset, prior = self.posterior.only, self.posterior.prior
+        noise = dataset.table.noise(prior.theta(prior.constrain(self.places)[0]))
         once, _ = stretches_once(voltage, np.arange(voltage.size))
-        every = []
-        for place, own in zip(self.places, noise, strict=True):
-            slopes = self._displacement(place, voltage)
+        matrices = []
+        for position, sd in zip(self.places, noise, strict=True):
+            slopes = self._displacement(position, voltage)
             series = np.concatenate([slopes, np.ones((1, voltage.size))])
-            (white,), _ = one.noise.whiten(own[np.newaxis], series[np.newaxis])
+            (white,), _ = dataset.noise.whiten(sd[np.newaxis], series[np.newaxis])
             products = (white * once) @ white.T
             if self.offset_sd:
-                told, level = products[:-1, -1], products[-1, -1] + self.offset_sd**-2
-                every.append(products[:-1, :-1] - np.outer(told, told) / level)
+                offset_row, level = products[:-1, -1], products[-1, -1] + self.offset_sd**-2
+                matrices.append(products[:-1, :-1] - np.outer(offset_row, offset_row) / level)
             else:
-                every.append(products[:-1, :-1])
-        return every
+                matrices.append(products[:-1, :-1])
+        return matrices
 
     def after(self, information: FloatArray) -> FloatArray:
         """Return the covariance that would be left."""
         # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
         factor = np.linalg.cholesky(self.covariance)
         inner = np.eye(len(factor)) + factor.T @ information @ factor
-        left: FloatArray = factor @ linalg.solve(inner, factor.T, assume_a="pos")
-        return left
+        covariance: FloatArray = factor @ linalg.solve(inner, factor.T, assume_a="pos")
+        return covariance

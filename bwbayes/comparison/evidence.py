@@ -15,11 +15,12 @@ from scipy.special import gammaln, logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = ["Bridge", "Evidence", "bridge", "evidence", "log_prior_mass"]
+__all__ = ["Bridge", "Evidence", "bridge", "evidence", "log_prior_mass", "screening_evidence"]
 
 # Places that are proposed, draws that the mixture is fitted to, and draws at the other end.
 PROPOSED = 10_000
@@ -58,12 +59,19 @@ class Evidence:
         product is divided.
     effective
         Effective draws at the bridge's posterior end.
+    prior_share
+        What the evidence pays for the priors' width, nats: the mean log likelihood of the draws
+        less the log evidence, which is how far the posterior is from the prior (Kullback-Leibler).
+    max_log_likelihood
+        The largest among the draws, nats.
     """
 
     log_evidence: float
     error: float
     log_prior_mass: float
     effective: float
+    prior_share: float = np.nan
+    max_log_likelihood: float = np.nan
 
 
 def evidence(
@@ -92,7 +100,9 @@ def evidence(
         Draws from mixture and prior.
     """
     free = draws.shape[-1]
-    coordinates = posterior.prior.unconstrain(draws.reshape(-1, free)).reshape(draws.shape)
+    coordinates = posterior.prior.unconstrain(draws.reshape(-1, free))
+    log_likelihood = log_density.ravel() - posterior.prior.constrain(coordinates)[1]
+    coordinates = coordinates.reshape(draws.shape)
     half = draws.shape[1] // 2
     fitted = coordinates[:, :half].reshape(-1, free)
     fitted = fitted[:: max(len(fitted) // FITTED, 1)]
@@ -100,9 +110,10 @@ def evidence(
     try:
         proposal = StudentMixture.fitted(fitted)
     except np.linalg.LinAlgError:  # too few draws
-        return Evidence(np.nan, np.inf, mass, 0.0)
-    rest = log_density[:, half:].size
-    thin = max(rest // BRIDGED, 1)
+        highest = float(np.max(log_likelihood))
+        return Evidence(np.nan, np.inf, mass, 0.0, max_log_likelihood=highest)
+    size = log_density[:, half:].size
+    thin = max(size // BRIDGED, 1)
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - _normalised(proposal, sampled)
     random = np.random.RandomState(generator.integers(2**32))
@@ -111,12 +122,31 @@ def evidence(
     bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
+    log_evidence = bridged.log_integral + constant - mass
     return Evidence(
-        bridged.log_integral + constant - mass,
+        log_evidence,
         float(np.hypot(bridged.error, mass_error)),
         mass,
         effective,
+        float(np.mean(log_likelihood)) - log_evidence,
+        float(np.max(log_likelihood)),
     )
+
+
+def screening_evidence(
+    posterior: Posterior, point: PointFit, generator: np.random.Generator
+) -> Evidence:
+    """Return Laplace's approximation at a point fit, whose error nobody knows.
+
+    log Z = log p(readings | z) − ½ |z|² + ½ log det C − log prior mass, with the covariance C at
+    the mode z; the constants of the two normal densities cancel.
+    """
+    mass, _ = log_prior_mass(posterior.prior, generator)
+    log_volume = 0.5 * float(np.linalg.slogdet(point.covariance)[1])
+    log_likelihood = point.log_density - posterior.prior.constrain(point.mode[np.newaxis])[1][0]
+    log_evidence = point.log_density + log_volume - mass
+    share = float(log_likelihood) - log_evidence
+    return Evidence(log_evidence, np.inf, mass, 0.0, share, float(log_likelihood))
 
 
 def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
@@ -171,10 +201,10 @@ def _fixed_point(
 ) -> tuple[float, tuple[FloatArray, FloatArray]]:
     """Iterate to log r; return it and the logs of what is averaged at draws and at places."""
     with np.errstate(divide="ignore"):
-        ours, theirs = np.log(share), np.log1p(-share)
+        from_posterior, from_reference = np.log(share), np.log1p(-share)
     for _ in range(ROUNDS):
-        at_draws = -np.logaddexp(ours + draws, theirs + log_r)
-        at_places = places - np.logaddexp(ours + places, theirs + log_r)
+        at_draws = -np.logaddexp(from_posterior + draws, from_reference + log_r)
+        at_places = places - np.logaddexp(from_posterior + places, from_reference + log_r)
         top = logsumexp(at_places) - np.log(places.size)
         before, log_r = log_r, float(top - (logsumexp(at_draws) - np.log(draws.size)))
         if not abs(log_r - before) > ACCURACY:  # nan too
@@ -186,14 +216,14 @@ def _effective(values: FloatArray) -> float:
     """Return what draws (steps, ensembles, walkers) of a bounded quantity are worth."""
     if np.ptp(values) == 0:
         return float(values.size)
-    bulk, _ = effective_draws(values[..., np.newaxis])
-    return float(bulk[0]) if np.isfinite(bulk[0]) else 1.0
+    bulk, _ = effective_draws(values)
+    return bulk if np.isfinite(bulk) else 1.0
 
 
 def _normalised(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
     """Log density of a proposal with its constant, shaped as the coordinates less the last axis."""
     first = proposal.components[0]
-    free, freedom = first.centre.size, first.freedom
+    free, freedom = first.center.size, first.freedom
     constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)
     constant -= 0.5 * free * np.log(freedom * np.pi)
     density = proposal.log_density(coordinates.reshape(-1, free)) + constant

@@ -80,18 +80,18 @@ class _Task:
 
     def simulated(self, voltage: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
         """Yield some draws at a time, and their displacement (draws, samples), um."""
-        begun = self.begun(voltage)
+        states = self.begun(voltage)
         size = max(BLOCK // voltage.size, 1)
-        for first in range(0, len(begun.model), size):
-            some = slice(first, first + size)
-            part = replace(
-                begun,
-                which=begun.which[some],
-                model=begun.model[some],
-                unrest=begun.unrest[some],
-                offset_sd=begun.offset_sd[some],
+        for first in range(0, len(states.model), size):
+            rows = slice(first, first + size)
+            subset = replace(
+                states,
+                which=states.which[rows],
+                model=states.model[rows],
+                unrest=states.unrest[rows],
+                offset_sd=states.offset_sd[rows],
             )
-            yield some, part.advance(voltage)[0]
+            yield rows, subset.advance(voltage)[0]
 
     def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the expected rms errors, um, and the weighted mean displacement (samples,).
@@ -99,15 +99,15 @@ class _Task:
         Errors to the reference as requested and as smoothed, (2,).
         """
         squares, mean = np.zeros(2), np.zeros(voltage.size)
-        for some, simulated in self.simulated(voltage):
-            mean += weights[some] @ simulated
+        for rows, simulated in self.simulated(voltage):
+            mean += weights[rows] @ simulated
             squares += self.squares(simulated)
         return np.sqrt(squares / len(self.draws)), mean
 
     def squares(self, simulated: FloatArray) -> FloatArray:
         """Return the squared errors of some displacements, summed over draws, um², (2,)."""
         return np.array(
-            [np.sum(np.mean((simulated - one) ** 2, axis=1)) for one in self.references]
+            [np.sum(np.mean((simulated - reference) ** 2, axis=1)) for reference in self.references]
         )
 
     def played(self, voltage: FloatArray) -> Played:
@@ -120,16 +120,18 @@ class _Task:
         noise, generator = record.noise.at(self.reference.interval), self.generator()
         rms, largest = np.empty((2, 2, len(theta)))
         squares = np.zeros(2)
-        for some, simulated in self.simulated(voltage):
+        for rows, simulated in self.simulated(voltage):
             squares += self.squares(simulated)
-            for row, one in enumerate(simulated, some.start):
-                moved = one + noise.draw(theta[row : row + 1], one.size, generator)[0]
+            for row, displacement in enumerate(simulated, rows.start):
+                moved = (
+                    displacement + noise.draw(theta[row : row + 1], displacement.size, generator)[0]
+                )
                 errors = moved - self.references
                 rms[:, row] = np.sqrt(np.mean(errors**2, axis=1))
                 largest[:, row] = np.max(np.abs(errors), axis=1)
         expected = np.sqrt(squares / len(theta)).tolist()
-        requested, smoothed = (Errors(*of) for of in zip(rms, largest, expected, strict=True))
-        return Played(**vars(requested), voltage=voltage, bands=bands, smoothed=smoothed)
+        smoothed = Errors(rms[1], largest[1], expected[1])
+        return Played(rms[0], largest[0], expected[0], voltage, bands, smoothed)
 
 
 def compensate(
@@ -201,36 +203,38 @@ def compensate(
     task = _Task(posterior, draws, reference, Start(from_rest, False, settled=True), hold, seed)
     requested, target = task.references
     linear = _linear(posterior, requested, limits)
-    begun = task.begun(linear)
-    actuator, model = begun.actuators[-1], begun.model.mean(axis=0)
+    states = task.begun(linear)
+    actuator, model = states.actuators[-1], states.model.mean(axis=0)
     # The mean model's own place at zero volts, where all begin, is not the mean of the places.
-    place = actuator.displacement(model, [0.0], from_rest=from_rest)[0, 0]
-    model[actuator.parameters.index("offset")] -= place
-    column = actuator.columns(begun.model)
+    at_zero = actuator.displacement(model, [0.0], from_rest=from_rest)[0, 0]
+    model[actuator.parameters.index("offset")] -= at_zero
+    column = actuator.columns(states.model)
     span = actuator.span
     assert span is not None
     slopes = np.broadcast_to(actuator.hysteresis.gain(column, span), len(draws))
     weights = slopes / np.sum(slopes)
 
-    def inverted(asked: FloatArray) -> FloatArray:
-        made = inverse(actuator, model, asked, from_rest=from_rest, limits=limits, nearest=nearest)
-        return np.asarray(made[0])
+    def inverted(displacement: FloatArray) -> FloatArray:
+        voltage = inverse(
+            actuator, model, displacement, from_rest=from_rest, limits=limits, nearest=nearest
+        )
+        return np.asarray(voltage[0])
 
     by_mean = inverted(target)
     error, mean = task.expected(by_mean, weights)
-    best, least, asked = by_mean, error, target
+    best, smallest, aim = by_mean, error, target
     for _ in range(ROUNDS):
-        asked = asked + (target - mean)
-        tried = inverted(asked)
-        left, mean = task.expected(tried, weights)
-        if not left[1] < least[1]:
+        aim = aim + (target - mean)
+        tried = inverted(aim)
+        remaining, mean = task.expected(tried, weights)
+        if not remaining[1] < smallest[1]:
             break
-        best, least = tried, left
-    taken, other = (by_mean, least) if command == "mean" else (best, error)
-    played, between = task.played(taken), _between(actuator, model, taken, from_rest)
-    said = _said(reference, taken, actuator, limits, nearest)
+        best, smallest = tried, remaining
+    chosen, other = (by_mean, smallest) if command == "mean" else (best, error)
+    played, between = task.played(chosen), _between(actuator, model, chosen, from_rest)
+    notes = _said(reference, chosen, actuator, limits, nearest)
     if between > np.mean(played.rms):
-        said.append(
+        notes.append(
             f"between samples the displacement leaves a straight line by up to {between:.3g} um, "
             "more than the rms error at them; choose a shorter sampling interval"
         )
@@ -245,7 +249,7 @@ def compensate(
         between,
         from_rest,
         limit,
-        (*remarks, *said),
+        (*remarks, *notes),
     )
 
 
@@ -277,15 +281,15 @@ def _said(
     limits: Limits,
     nearest: bool,
 ) -> list[str]:
-    said = []
+    notes = []
     if reference.approach > 0:
         begins = reference.given[round(reference.approach / reference.interval)]
-        said.append(
+        notes.append(
             f"the reference begins at {begins:.4g} um: a way of {reference.approach:g} s is put "
             "before it, from 0 um, where the actuator stands at zero volts"
         )
     if reference.moved > 0:
-        said.append(
+        notes.append(
             f"the reference is smoothed over {reference.smoothed:.3g} s, which moves it by up to "
             f"{reference.moved:.3g} um; errors are those to the reference as requested"
         )
@@ -293,8 +297,8 @@ def _said(
         at = np.mean((voltage <= limits.low) | (voltage >= limits.high))
         fast = np.abs(np.diff(voltage)) >= (1 - 1e-9) * limits.rate * actuator.interval
         if at > 0 or fast.any():
-            said.append(
+            notes.append(
                 f"the amplifier is at its voltage limit for {at:.1%} of the samples, and at its "
                 f"speed limit for {np.mean(fast):.1%}: the command is the nearest one"
             )
-    return said
+    return notes

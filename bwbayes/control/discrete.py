@@ -58,7 +58,7 @@ def linear_part(actuator: Actuator, theta: ArrayLike) -> Any:
         )
     column = actuator.columns(row)
     actuator.filter.check(column)
-    numerator, denominator, gains, crept = (part[0] for part in sections_of(actuator, column))
+    numerator, denominator, gains, crept = (values[0] for values in sections_of(actuator, column))
     growing = actuator.creep is not None and actuator.creep.growing
     a, b, c = [], [], []
     d = np.zeros((1, 1 + growing))
@@ -81,6 +81,6 @@ def frequency_response(sections: SampledSections, turns: FloatArray) -> FloatArr
     ``turns`` (frequencies,) are angles per sample, rad.
     """
     powers = np.exp(-1j * np.outer(np.arange(3), turns))
-    each = (sections.numerator @ powers) / (sections.denominator @ powers)
-    total: Any = np.einsum("ms,msf->mf", sections.gains, each)
+    responses = (sections.numerator @ powers) / (sections.denominator @ powers)
+    total: Any = np.einsum("ms,msf->mf", sections.gains, responses)
     return np.asarray(total)

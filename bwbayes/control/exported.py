@@ -19,6 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.discrete import linear_part
+from bwbayes.control.printed import ascii_of, c_functions, number_in_c
 from bwbayes.control.sampled import (
     BISECTION_ROUNDS,
     NEWTON_ROUNDS,
@@ -36,25 +37,6 @@ from bwbayes.shown import brief
 __all__ = ["Exported", "exported"]
 
 BETWEEN = {"first": "voltage's drive goes straight", "zero": "voltage is held"}
-
-
-# Of a step's coefficients that the JSON file has; the others serve the C file alone.
-UNITS = {
-    "d": "um/V",
-    "d2": "um/V^2",
-    "d3": "um/V^3",
-    "alpha": "um/V",
-    "alpha1": "um/V^2",
-    "alpha2": "um/V^3",
-    "beta": "1/V",
-    "against": "1/V",
-    "ahead": "1/V",
-    "below": "um^-n",
-    "above": "um^-n",
-    "exponent": "-",
-    "weights": "um/V",
-    "thresholds": "V",
-}
 
 
 @dataclass(frozen=True)
@@ -89,16 +71,13 @@ class Exported:
     @property
     def linear(self) -> Any:
         """The linear part, a discrete ``scipy.signal.StateSpace``."""
-        return linear_part(self.model.actuator, self._theta)
-
-    @property
-    def _theta(self) -> FloatArray:
-        return np.array([self.model.column[one][0] for one in self.model.actuator.parameters])
+        actuator, column = self.model.actuator, self.model.column
+        return linear_part(actuator, np.array([column[name][0] for name in actuator.parameters]))
 
     def numbers(self) -> dict[str, Any]:
         """Return what ``model.json`` says: parts, parameters and coefficients, with their units."""
         actuator = self.model.actuator
-        known = {name: float(values[0]) for name, values in self.model.column.items()}
+        means = {name: float(values[0]) for name, values in self.model.column.items()}
         linear = self.linear
         return {
             "name": self.name,
@@ -116,15 +95,18 @@ class Exported:
                 "creep_times_s": list(actuator.creep.times) if actuator.creep else [],
             },
             "parameters": {
-                one.name: {
-                    "mean": known[one.name],
-                    "sd": self.sds.get(one.name),
-                    "unit": one.unit_in(known),
-                    "description": one.description,
+                declaration.name: {
+                    "mean": means[declaration.name],
+                    "sd": self.sds.get(declaration.name),
+                    "unit": declaration.unit_in(means),
+                    "description": declaration.description,
                 }
-                for one in actuator.declarations
+                for declaration in actuator.declarations
             },
-            "hysteresis": self._hysteresis,
+            "hysteresis": {
+                name: {"value": value, "unit": unit}
+                for name, (value, unit) in self.model.step.coefficients().items()
+            },
             "gain": self._gain,
             "creep_growth_per_V": self._growth,
             "zero": {
@@ -155,22 +137,30 @@ class Exported:
             keep_trailing_newline=True,
             finalize=_in_c,
         )
-        actuator, hysteresis = self.model.actuator, self.model.step.coefficients()
+        actuator, step = self.model.actuator, self.model.step
+        remembered = step.demagnetised()[0]
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] if actuator.gain else []
         parts += ["creep"] if actuator.creep else []
         return environment.get_template("actuator.c.j2").render(
             title=f"Model of {_plain(self.name)}",
             parts=f"Parts: {_plain(', '.join(parts))}.",
-            warnings=[_plain(line) for said in self.standing.said for line in wrap(said, 92)],
+            warnings=[_plain(line) for text in self.standing.said for line in wrap(text, 92)],
             version=_plain(version("bwbayes")),
             interval=actuator.interval,
             between=BETWEEN[actuator.hold],
             held=actuator.hold == "zero",
             low=self.limits.low,
             high=self.limits.high,
-            hysteresis=hysteresis,
-            plays=hysteresis.get("weights", ()),
+            hysteresis=ascii_of(type(step).__doc__ or "").split("\n\n")[0],
+            parameters_are=ascii_of(type(step).parameters.__doc__ or ""),
+            parameters=[*map(number_in_c, step.parameters[0].tolist())],
+            remembered=remembered.tolist(),
+            functions=c_functions(
+                type(step).move,
+                {"parameters": step.parameters.shape[1], "memory": remembered.size},
+                "actuator_",
+            ),
             sections=self._sections,
             gain=self._gain,
             growth=self._growth,
@@ -186,11 +176,12 @@ class Exported:
     def _called(self) -> str:
         """What a config calls the hysteresis."""
         kind = type(self.model.actuator.hysteresis)
-        return next(name for name, made in HYSTERESIS.items() if made is kind)
+        path = f"{kind.__module__}:{kind.__qualname__}"
+        return next((name for name, operator in HYSTERESIS.items() if operator is kind), path)
 
     @property
     def _sections(self) -> list[dict[str, Any]]:
-        numerator, denominator, gains, crept = (part[0] for part in self.model.sections)
+        numerator, denominator, gains, crept = (values[0] for values in self.model.sections)
         return [
             {
                 "what": "creep" if is_creep else "dynamics",
@@ -202,13 +193,6 @@ class Exported:
                 numerator, denominator, gains, crept, strict=True
             )
         ]
-
-    @property
-    def _hysteresis(self) -> dict[str, Any]:
-        known = self.model.step.coefficients()
-        return {
-            name: {"value": v, "unit": UNITS[name]} for name, v in known.items() if name in UNITS
-        }
 
     @property
     def _gain(self) -> dict[str, float] | None:
@@ -271,7 +255,7 @@ def exported(
 
 def _in_c(value: Any) -> Any:
     """Return a number as C has it, to the last bit."""
-    return repr(float(value)) if isinstance(value, float) else value
+    return number_in_c(value) if isinstance(value, float) else value
 
 
 def _plain(text: str) -> str:

@@ -131,10 +131,10 @@ def design(
     InputError
         No controller of this kind has them.
     """
-    least = draws.slopes(limits)[0]
-    if not least.min() > 0:
+    lowest = draws.slopes(limits)[0]
+    if not lowest.min() > 0:
         raise InputError(
-            f"track: some draws have slopes as low as {least.min():.3g} um/V, at which no "
+            f"track: some draws have slopes as low as {lowest.min():.3g} um/V, at which no "
             "controller is stable; narrow the limits"
         )
     poles = mean.sections.denominator[0, 0]
@@ -147,17 +147,17 @@ def design(
     # An integrator of this speed is at its limit on the steepest slope, whatever the dynamics.
     high = 2.0 / float(draws.slopes(limits)[1].max())
     low = 1e-6 * high
-    kept = _keeps(margins(gains_of(low), draws, limits, delay, poles=False), required)
-    if not kept:
+    robust = _keeps(margins(gains_of(low), draws, limits, delay, poles=False), required)
+    if not robust:
         raise InputError(
             f"track: no controller of this kind keeps a gain margin of {required.gain:g} and a "
             f"phase margin of {required.phase:g} degrees with all draws; ask for less, or sample "
             "faster"
         )
     while high / low > 1 + PRECISION:
-        middle = math.sqrt(low * high)
-        kept = _keeps(margins(gains_of(middle), draws, limits, delay, poles=False), required)
-        low, high = (middle, high) if kept else (low, middle)
+        trial = math.sqrt(low * high)
+        robust = _keeps(margins(gains_of(trial), draws, limits, delay, poles=False), required)
+        low, high = (trial, high) if robust else (low, trial)
     gains = gains_of(low)
     result = margins(gains, draws, limits, delay)
     if not result.stable:
@@ -168,8 +168,10 @@ def design(
 
 
 def _keeps(result: Margins, required: Robustness) -> bool:
-    kept = (result.gain >= required.gain) & (result.phase >= required.phase) & (result.circle > 0)
-    return bool(np.all(kept))
+    satisfied = (
+        (result.gain >= required.gain) & (result.phase >= required.phase) & (result.circle > 0)
+    )
+    return bool(np.all(satisfied))
 
 
 def margins(
@@ -184,7 +186,7 @@ def margins(
     back = np.exp(-1j * turns)
     controller = np.polyval(gains.steps[::-1], back) / (1 - back) * back**delay
     loop = controller * frequency_response(draws.sections, turns)
-    least, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
+    smallest, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
     size = np.abs(loop)
     with np.errstate(divide="ignore"):
         log_size = np.log(size)
@@ -193,26 +195,26 @@ def margins(
     # Where the loop is real and negative; at the end it is real but for rounding.
     real = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        part = np.clip(np.nan_to_num(-angle[:, :-1] / turned), 0.0, 1.0)
-        log_real = log_size[:, :-1] + part * np.diff(log_size, axis=1)
+        fraction = np.clip(np.nan_to_num(-angle[:, :-1] / turned), 0.0, 1.0)
+        log_real = log_size[:, :-1] + fraction * np.diff(log_size, axis=1)
     worst = np.max(np.where(real, np.exp(log_real), 0.0), axis=1)
     worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, size[:, -1], 0.0))
     with np.errstate(divide="ignore"):
         gain = 1 / (largest[:, 0] * worst)
     # Where it has the size one at some slope: the lag is least at one of these frequencies, which
     # are those in between and, on straight lines from angle to angle, the two ends.
-    between = (size * largest >= 1) & (size * least <= 1)
+    between = (size * largest >= 1) & (size * smallest <= 1)
     lag = np.min(np.where(between, np.abs(angle), np.pi), axis=1)
-    for slope in (least, largest):
+    for slope in (smallest, largest):
         level = log_size + np.log(slope)
         crossed = (level[:, :-1] >= 0) != (level[:, 1:] >= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            part = level[:, :-1] / (level[:, :-1] - level[:, 1:])
-        at_one = np.abs(angle[:, :-1] + part * turned)
+            fraction = level[:, :-1] / (level[:, :-1] - level[:, 1:])
+        at_one = np.abs(angle[:, :-1] + fraction * turned)
         lag = np.minimum(lag, np.min(np.where(crossed, at_one, np.pi), axis=1))
     phase = np.degrees(lag)
     phase = np.where(gain < 1, -phase, phase)
-    circle = np.min(((1 + largest * loop) * np.conj(1 + least * loop)).real, axis=1)
+    circle = np.min(((1 + largest * loop) * np.conj(1 + smallest * loop)).real, axis=1)
     above = size * largest >= 1
     last = turns[np.maximum(ANGLES - 1 - np.argmax(above[:, ::-1], axis=1), 0)]
     crossover = np.where(above.any(axis=1), last, 0.0) / (2 * np.pi * gains.interval)
@@ -237,7 +239,7 @@ def _largest_pole(gains: Gains, draws: SampledModel, row: int, slope: float, del
     return float(np.max(np.abs(roots), initial=0.0))
 
 
-def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
+def _sum(first: FloatArray, second: FloatArray) -> FloatArray:
     """Add polynomials in 1/z."""
-    longest = max(one.size, other.size)
-    return np.pad(one, (0, longest - one.size)) + np.pad(other, (0, longest - other.size))
+    longest = max(first.size, second.size)
+    return np.pad(first, (0, longest - first.size)) + np.pad(second, (0, longest - second.size))

@@ -115,7 +115,7 @@ def follow(
     low, high = stand.limits
     step, reach = stand.amplifier.step, stand.amplifier.slew * gains.interval
     looks = np.array(plan.looks)[:, np.newaxis, np.newaxis]
-    kept = np.exp(-gains.interval / noise.time)
+    decay = np.exp(-gains.interval / noise.time)
     shock = noise.discrepancy * np.sqrt(-np.expm1(-2 * gains.interval / noise.time))
 
     state = draws.begin(np.zeros(draws.models))
@@ -134,7 +134,7 @@ def follow(
         np.round(reading / stand.sensor.step, out=reading)
         reading *= stand.sensor.step
         errors = [plan.targets[:, :, t, np.newaxis] - reading, *errors[:2]]
-        change = sum(gain * one for gain, one in zip(gains.steps, errors, strict=True))
+        change = sum(gain * error for gain, error in zip(gains.steps, errors, strict=True))
         # Kept to what the amplifier can still give: that is all there is of anti-windup.
         late = min(t + stand.delay, samples)
         ahead = plan.ahead[:, :, late, np.newaxis]
@@ -146,6 +146,6 @@ def follow(
         if t >= plan.begins:
             limited += (command <= low) | (command >= high)
         state = draws.forward(state, held.ravel())[1]
-        drift = kept * drift + shock * generator.standard_normal(count)
+        drift = decay * drift + shock * generator.standard_normal(count)
     judged = samples - plan.begins
     return TrackingErrors(np.sqrt(squares / judged), largest, limited / judged)

@@ -1,4 +1,4 @@
-"""A command that compensates, in numbers: its voltage, the displacement that it gives, its errors.
+"""A command that compensates: its voltage, the displacement that it gives, its errors, its report.
 
 What :func:`~bwbayes.control.compensation.compensate` returns. Errors are those at the samples, to
 the reference as requested and as it was smoothed.
@@ -6,16 +6,31 @@ the reference as requested and as it was smoothed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.wished import Reference
+from bwbayes.data.io.formats import write_record
 from bwbayes.data.record import Record
 from bwbayes.model.linear import HOLD_NAMES, Hold
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Figure,
+    Picture,
+    Report,
+    Section,
+    Table,
+    kind_of,
+    remarks_banner,
+    standing_banner,
+)
 from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
@@ -23,6 +38,14 @@ from bwbayes.shown import brief
 __all__ = ["Choice", "Compensation", "Errors", "Played", "planned"]
 
 Choice = Literal["mean", "expected"]
+
+FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.html")
+
+COMMANDS = {"mean": "inverse of the mean model", "expected": "least expected squared error"}
+HOLDS = {
+    "zero": "held until the next sample, as a DAC does (zero-order hold)",
+    "first": "straight lines (first-order hold)",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +108,17 @@ def _interval(values: FloatArray, level: int) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """A command that makes a displacement, and what is promised of it.
+    """A command that makes a displacement, and its predicted errors.
 
-    ``reference`` is what was asked for; ``command`` says which of the two voltages was taken;
-    ``compensated`` is that command, ``linear`` the one without compensation; ``difference`` the
-    largest difference of the two voltages that could have been taken, V, and ``other`` what the
-    other one leaves, as ``Played.smoothed.expected``, um. ``limit`` is that of the error, um, if
-    there is one; ``hold`` what the command does between samples, and ``between`` how far the
-    displacement leaves straight lines there, um. ``standing`` is how the validation of the run came
-    out that all of this builds on.
+    ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
+    ``smoothed``; ``reference`` is what was asked for; ``command`` says which of the two voltages
+    was taken; ``compensated`` is that command, ``linear`` the one without compensation;
+    ``difference`` the largest difference of the two voltages that could have been taken, V, and
+    ``other`` what the other one leaves, as ``Played.smoothed.expected``, um. ``limit`` is that of
+    the error, um, if there is one; ``hold`` what the command does between samples, and ``between``
+    how far the displacement leaves straight lines there, um. ``standing`` is how the validation of
+    the run came out that all of this builds on.
     """
-
-    __repr__ = brief
 
     reference: Reference
     command: Choice
@@ -136,14 +158,14 @@ class Compensation:
     @property
     def summary(self) -> dict[str, Any]:
         """What is promised, in numbers."""
-        asked = self.asked
+        target = self.asked
         return {
             "validation": self.standing.numbers,
             "reference": self.reference.name,
-            "samples": asked.size,
+            "samples": target.size,
             "interval_s": self.reference.interval,
-            "from_um": float(np.min(asked)),
-            "to_um": float(np.max(asked)),
+            "from_um": float(np.min(target)),
+            "to_um": float(np.max(target)),
             "smoothed_s": self.reference.smoothed,
             "smoothing_moves_um": self.reference.moved,
             "approach_s": self.reference.approach,
@@ -186,6 +208,165 @@ class Compensation:
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
         return pd.DataFrame(dict(self.columns()))
+
+    def plot(self) -> Figure:
+        """Draw reference, prediction and error along time."""
+        from bwbayes.report.figures import compensation, drawn  # noqa: PLC0415  # slow to load
+
+        return drawn(
+            compensation.draw_tracking, self.reference.name, self.asked, self._commands, self.limit
+        )
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
+        """Write all files to a folder, and return them.
+
+        Raises
+        ------
+        InputError
+            A file that exists, unless it may be replaced, or that cannot be written.
+        """
+        from bwbayes.report.saving import refuse_existing, save  # noqa: PLC0415  # slow to load
+
+        folder = Path(folder)
+        refuse_existing([folder / name for name in FILES], overwrite=overwrite)
+        files = save(self.report(), folder, "compensation")
+        write_record(self.record, folder / "command.csv")
+        return [folder / "command.csv", *files]
+
+    def report(self) -> Report:
+        """Return the predicted error beside that of a linear command, with pictures."""
+        from bwbayes.report.figures import compensation as figures  # noqa: PLC0415  # slow to load
+
+        name, target, limit = self.reference.name, self.asked, self.limit
+        commands = self._commands
+        validation = "" if self.standing.holds else f", validation {self.standing.status}"
+        headline = f"Predicted error{validation}"
+        return Report(
+            title=f"{name}, compensation",
+            heading=f"Compensation: {name}",
+            banners=[
+                *standing_banner(self.standing),
+                Banner(kind_of(self.standing), headline, [self._promise()]),
+                *remarks_banner(self.remarks),
+            ],
+            blocks=[
+                self._table(),
+                Picture(
+                    "tracking",
+                    "Reference and prediction",
+                    "The command, the displacement that it will give with its 95 % bands, and the "
+                    "error; beside it what a linear command would do.",
+                    partial(figures.draw_tracking, name, target, commands, limit),
+                ),
+                Picture(
+                    "error",
+                    "Error",
+                    "Left: the tracking error, to the reference as requested, with its 95 % bands; "
+                    "dotted, the limit. Right: what its rms may be, with the discrepancy, over the "
+                    "draws.",
+                    partial(figures.draw_error, target, commands, limit),
+                ),
+                Picture(
+                    "loops",
+                    "Before and after",
+                    "What is predicted against the reference: without compensation the loop is "
+                    "open.",
+                    partial(figures.draw_loops, target, commands),
+                ),
+                Section("Request", [Facts(self._facts())], folded=False),
+            ],
+            numbers=self.summary,
+            csv=self.to_pandas().to_csv(index=False, float_format="%.9g"),
+        )
+
+    @property
+    def _commands(self) -> dict[str, Played]:
+        return {"uncompensated": self.linear, "compensated": self.compensated}
+
+    def _promise(self) -> str:
+        after, before = self.compensated, self.linear
+        low, high = _interval(after.rms, 95)
+        text = (
+            f"rms error {np.mean(after.rms):.3g} µm (95 %: {low:.3g} to {high:.3g}), without "
+            f"compensation {np.mean(before.rms):.3g} µm"
+        )
+        if self.limit is not None:
+            within = after.probability(self.limit)
+            text += f"; stays below {self.limit:g} µm with a probability of {within:.2f}"
+        return text
+
+    def _table(self) -> Table:
+        summary = self.summary
+        played = [summary["compensated"], summary["uncompensated"]]
+        rows = [("Voltage", *(_span(command["voltage_V"]) for command in played), "V")]
+        rows += _error_rows("", played)
+        if self.limit is not None:
+            texts = [f"{command['probability_below_limit']:.3f}" for command in played]
+            rows.append((f"Probability that the error stays below {self.limit:g} µm", *texts, ""))
+        if self.reference.moved > 0:
+            smoothed = [command["to_smoothed_reference"] for command in played]
+            rows += _error_rows(" to the smoothed reference", smoothed)
+        return Table(
+            "error",
+            "Error",
+            ("Quantity", "Compensated", "Uncompensated", "Unit"),
+            rows,
+            note="The displacement less the reference as requested, with the model's discrepancy "
+            "and without the sensor's noise, over the posterior's draws. Uncompensated: the "
+            "reference over the slope of a straight line through the record that was fitted.",
+        )
+
+    def _facts(self) -> list[tuple[str, str]]:
+        alternative: Choice = "expected" if self.command == "mean" else "mean"
+        target, interval = self.asked, self.reference.interval
+        return [
+            (
+                "Reference",
+                f"{np.min(target):.4g} to {np.max(target):.4g} µm, "
+                f"{target.size} samples every {interval:g} s",
+            ),
+            ("Command", COMMANDS[self.command]),
+            (
+                "The other command",
+                f"{COMMANDS[alternative]}: differs by up to {self.difference:.3g} V, and leaves "
+                f"{self.other:.4g} µm (rms expected over the draws, without the discrepancy, to "
+                "the reference as smoothed) where this one leaves "
+                f"{self.compensated.smoothed.expected:.4g} µm",
+            ),
+            ("Voltage between samples", HOLDS[self.hold]),
+            (
+                "Displacement between samples",
+                f"up to {self.between:.3g} µm from a straight line; errors are those at the "
+                "samples, just before the voltage changes",
+            ),
+            (
+                "Start",
+                "demagnetized at zero volts"
+                if self.from_rest
+                else "waited at zero volts, after any drive",
+            ),
+            ("0 µm", "where the actuator stands at zero volts as the command begins"),
+        ]
+
+    def __repr__(self) -> str:
+        promise = f"compensation for {self.reference.name}: {self._promise()}"
+        return "\n".join([*self.standing.said, promise.replace("µ", "u")])
+
+
+def _error_rows(reference: str, errors: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return means and intervals of errors, each with a column of its own."""
+    rows: list[tuple[str, ...]] = []
+    for key, title in (("rms_um", "Rms of the error"), ("largest_um", "Largest error")):
+        means = (f"{error[key]['mean']:.3g}" for error in errors)
+        rows.append((f"{title}{reference}, mean", *means, "µm"))
+        for level in LEVELS:
+            spans = (_span(error[key][str(level)]) for error in errors)
+            rows.append((f"{title}{reference}, {level} % interval", *spans, "µm"))
+    return rows
+
+
+def _span(edges: Sequence[float]) -> str:
+    return f"{edges[0]:.4g} to {edges[1]:.4g}"
 
 
 def planned(voltage: FloatArray, reference: Reference, hold: Hold, origin: str) -> Record:

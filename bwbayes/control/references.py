@@ -26,37 +26,24 @@ LEVELS = 5
 APPROACH = 1.0
 
 
-def _sine(turns: FloatArray) -> FloatArray:
-    return np.sin(2 * np.pi * turns)
-
-
 def _decaying(turns: FloatArray) -> FloatArray:
-    whole = turns[-1] + (turns[-1] - turns[-2])
-    decayed: FloatArray = np.sin(2 * np.pi * turns) * (1 - turns / whole)
+    end = turns[-1] + (turns[-1] - turns[-2])
+    decayed: FloatArray = np.sin(2 * np.pi * turns) * (1 - turns / end)
     return decayed
 
 
-def _steps(turns: FloatArray) -> FloatArray:
-    return np.where((turns + 1e-9) % 1.0 < 0.5, 1.0, -1.0)
-
-
-def _staircase(turns: FloatArray) -> FloatArray:
-    levels: FloatArray = np.round(LEVELS * Triangle(1.0, 1.0)(turns)) / LEVELS
-    return levels
-
-
 SHAPES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
-    "sine": _sine,
+    "sine": lambda turns: np.sin(2 * np.pi * turns),
     "decaying sine": _decaying,
-    "steps": _steps,
-    "staircase": _staircase,
+    "steps": lambda turns: np.where((turns + 1e-9) % 1.0 < 0.5, 1.0, -1.0),
+    "staircase": lambda turns: np.round(LEVELS * Triangle(1.0, 1.0)(turns)) / LEVELS,
 }
 
 JUMPING = ("steps", "staircase")
 
 
 def reference(
-    frequency: float, interval: float, middle: float, amplitude: float, rise: int = 1
+    frequency: float, interval: float, center: float, amplitude: float, rise: int = 1
 ) -> tuple[FloatArray, int]:
     """Return all signals of a frequency, (signals, samples), um, and where they begin.
 
@@ -86,9 +73,9 @@ def reference(
             for name, shape in SHAPES.items()
         ]
     )
-    swung = middle + amplitude * swung
-    if middle == 0:
+    swung = center + amplitude * swung
+    if center == 0:
         return swung, 0
     lead = np.arange(round(APPROACH / interval)) * interval / APPROACH
-    risen = middle * (1 - np.cos(np.pi * lead)) / 2
+    risen = center * (1 - np.cos(np.pi * lead)) / 2
     return np.hstack([np.tile(risen, (len(swung), 1)), swung]), risen.size

@@ -17,9 +17,9 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inverse.stepped import DriveStep, step_of
-from bwbayes.model.inverse.steps import Gone, HysteresisStep
+from bwbayes.model.gain import DriveStep
 from bwbayes.model.operator import Span
+from bwbayes.model.step import Gone, HysteresisStep
 from bwbayes.shown import brief
 
 __all__ = [
@@ -106,7 +106,7 @@ class SampledModel:
         """
         column = {name: values.copy() for name, values in actuator.columns(theta).items()}
         return cls(
-            actuator, column, step_of(actuator.hysteresis, column), sections_of(actuator, column)
+            actuator, column, actuator.hysteresis.step(column), sections_of(actuator, column)
         )
 
     @property
@@ -116,9 +116,11 @@ class SampledModel:
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        rest, _, memory = self.drive(self.step.demagnetised(), voltage)
+        equilibrium, _, memory = self.drive(self.step.demagnetised(), voltage)
         filters = np.zeros((*self.sections.gains.shape, 2))
-        return SteppedState(memory, voltage, rest, rest * self._growth(voltage), filters)
+        return SteppedState(
+            memory, voltage, equilibrium, equilibrium * self._growth(voltage), filters
+        )
 
     @cached_property
     def zero(self) -> FloatArray:
@@ -177,12 +179,12 @@ class SampledModel:
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
-        least, largest = self.step.slopes(limits)
+        smallest, largest = self.step.slopes(limits)
         if self.actuator.gain is None:
-            return least, largest
+            return smallest, largest
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
         added = self._shaped.added_slope(np.linspace(*limits, 1001)[:, np.newaxis])
-        return least + added.min(axis=0), largest + added.max(axis=0)
+        return smallest + added.min(axis=0), largest + added.max(axis=0)
 
     def _instant(
         self, state: SteppedState, displacement: FloatArray
@@ -278,10 +280,10 @@ def require_inverse(model: SampledModel, limits: Span) -> None:
         The displacement may turn back while the voltage goes on, or the dynamics between samples
         are such that the voltage would swing ever wider from sample to sample.
     """
-    least = float(model.slopes(limits)[0].min())
-    if not least > 0:
+    lowest = float(model.slopes(limits)[0].min())
+    if not lowest > 0:
         raise InputError(
-            f"inverse: the model's slope may be as low as {least:.3g} um/V within {limits.low:g} "
+            f"inverse: the model's slope may be as low as {lowest:.3g} um/V within {limits.low:g} "
             f"to {limits.high:g} V, so that a displacement has more than one voltage"
         )
     zeros = model.actuator.sections(model.column).zeros

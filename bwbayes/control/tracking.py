@@ -11,26 +11,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.discrete import frequency_response
-from bwbayes.control.gains import Gains, Margins, Robustness, design
+from bwbayes.control.gains import Robustness, design
 from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, TrackingErrors, follow
 from bwbayes.control.references import SHAPES, reference
 from bwbayes.control.sampled import SampledModel, require_inverse
+from bwbayes.control.tracked import CONTROLLERS, Tracking
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
-from bwbayes.results.standing import Standing
-from bwbayes.shown import brief
 
-__all__ = ["CONTROLLERS", "Tracking", "Wishes", "track"]
+__all__ = ["track"]
 
-CONTROLLERS = ("no compensation", "feed-forward", "PID", "PID with feed-forward")
 LOOKS = (False, False, True, True)
 
 # Of the reach of the mean model, what a reference swings by unless told otherwise.
@@ -55,139 +51,17 @@ MOST_SAMPLES = 1_000_000
 CLOSE = 1e-4
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """What a loop is to follow, and how safely.
-
-    Parameters
-    ----------
-    robustness
-        The margins that all draws must keep.
-    frequencies
-        Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
-        leave 71 % of a sine, or to a tenth of the samples.
-    amplitude
-        Of the references, um; by default 80 % of what the mean model reaches.
-    """
-
-    robustness: Robustness = field(default_factory=Robustness)
-    frequencies: tuple[float, ...] | None = None
-    amplitude: float | None = None
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """How well four controllers follow, for every draw.
-
-    ``rms`` and ``largest`` error, um, and the share of samples ``limited`` by the amplifier are
-    (controllers, frequencies, signals, draws), in the order of ``CONTROLLERS``, ``frequencies``,
-    Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
-    take the time ``rise``, s. ``standing`` is how the validation of the run came out that gave the
-    draws.
-    """
-
-    __repr__ = brief
-
-    gains: Gains
-    margins: Margins
-    robustness: Robustness
-    stand: Stand
-    frequencies: tuple[float, ...]
-    signals: tuple[str, ...]
-    middle: float
-    amplitude: float
-    rise: float
-    rms: FloatArray
-    largest: FloatArray
-    limited: FloatArray
-    standing: Standing = field(default_factory=Standing)
-
-    @property
-    def best(self) -> FloatArray:
-        """Share of the draws in which PID with feed-forward has less rms error than either alone.
-
-        (frequencies, signals).
-        """
-        alone = np.minimum(self.rms[1], self.rms[2])
-        share: FloatArray = np.mean(self.rms[3] < alone, axis=-1)
-        return share
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return the table: a row for each signal, frequency and controller."""
-        return [
-            {
-                "signal": signal,
-                "frequency_Hz": frequency,
-                "controller": controller,
-                **_of("rms_um", self.rms[c, f, s]),
-                **_of("largest_um", self.largest[c, f, s]),
-                "limited": float(np.mean(self.limited[c, f, s])),
-            }
-            for s, signal in enumerate(self.signals)
-            for f, frequency in enumerate(self.frequencies)
-            for c, controller in enumerate(CONTROLLERS)
-        ]
-
-    def to_pandas(self) -> Any:
-        """Return the table as a pandas.DataFrame."""
-        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
-
-        return pd.DataFrame(self.rows())
-
-    def numbers(self) -> dict[str, Any]:
-        """Return all of it for a summary, with units in the names."""
-        gains, margins, stand = self.gains, self.margins, self.stand
-        return {
-            "validation": self.standing.numbers,
-            "controller": {
-                "proportional_V_per_um": gains.proportional,
-                "integral_V_per_um_s": gains.integral,
-                "derivative_V_s_per_um": gains.derivative,
-                "steps_V_per_um": list(gains.steps),
-                "interval_s": gains.interval,
-                "delay_samples": stand.delay,
-            },
-            "robustness": {
-                "gain_margin_asked": self.robustness.gain,
-                "phase_margin_asked_deg": self.robustness.phase,
-                "gain_margin_least": float(margins.gain.min()),
-                "phase_margin_least_deg": float(margins.phase.min()),
-                "crossover_Hz": [float(margins.crossover.min()), float(margins.crossover.max())],
-                "circle_criterion_least": float(margins.circle.min()),
-                "largest_pole": float(margins.pole.max()),
-                "stable": margins.stable,
-                "draws": int(margins.gain.size),
-            },
-            "reference": {
-                "middle_um": self.middle,
-                "amplitude_um": self.amplitude,
-                "rise_s": self.rise,
-                "limits_V": list(stand.limits),
-            },
-            "draws": int(self.rms.shape[-1]),
-            "best_share": [
-                {"signal": signal, "frequency_Hz": frequency, "share": float(self.best[f, s])}
-                for s, signal in enumerate(self.signals)
-                for f, frequency in enumerate(self.frequencies)
-            ],
-            "table": self.rows(),
-        }
-
-
-def _of(name: str, values: FloatArray) -> dict[str, float]:
-    """Return mean and 95 % interval over the draws."""
-    low, high = np.quantile(values, [0.025, 0.975])
-    return {name: float(values.mean()), f"{name}_low": float(low), f"{name}_high": float(high)}
-
-
 def track(
     actuator: Actuator,
     theta: FloatArray,
     noise: LoopNoise,
     stand: Stand,
-    wishes: Wishes,
     generator: np.random.Generator,
-    every: FloatArray | None = None,
+    *,
+    robustness: Robustness | None = None,
+    frequencies: Sequence[float] | None = None,
+    amplitude: float | None = None,
+    all_theta: FloatArray | None = None,
 ) -> Tracking:
     """Follow the paper's signals with four controllers.
 
@@ -201,11 +75,16 @@ def track(
         Of those draws.
     stand
         The test stand.
-    wishes
-        What is to be followed, and how safely.
     generator
         Source of discrepancy and sensor noise.
-    every
+    robustness
+        The margins that all draws must keep.
+    frequencies
+        Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
+        leave 71 % of a sine, or to a tenth of the samples.
+    amplitude
+        Of the references, um; by default 80 % of what the mean model reaches.
+    all_theta
         (draws, parameters): all draws that the controller must be stable with, and whose mean is
         the model; by default those that are simulated.
 
@@ -215,42 +94,43 @@ def track(
         A model that has no step or no inverse, margins that cannot be had, frequencies that are too
         fast or too slow, or an amplitude that is out of reach.
     """
-    every = theta if every is None else every
-    mean = SampledModel.of(actuator, every.mean(axis=0)[np.newaxis])
-    draws = SampledModel.of(actuator, every)
+    robustness = robustness or Robustness()
+    all_theta = theta if all_theta is None else all_theta
+    mean = SampledModel.of(actuator, all_theta.mean(axis=0)[np.newaxis])
+    draws = SampledModel.of(actuator, all_theta)
     limits = stand.limits
     require_inverse(mean, limits)
-    frequencies = _frequencies(mean, wishes.frequencies)
+    frequencies = _frequencies(mean, frequencies)
     ends = _reach(mean, limits)
-    amplitude = _amplitude(wishes.amplitude, ends)
+    amplitude = _amplitude(amplitude, ends)
     # A range about zero needs no way to its middle.
-    middle = ends.middle if abs(ends.middle) > ROUND * amplitude else 0.0
+    center = ends.middle if abs(ends.middle) > ROUND * amplitude else 0.0
     rise = _rise(mean)
-    gains, kept = design(mean, draws, limits, stand.delay, wishes.robustness)
+    gains, satisfied = design(mean, draws, limits, stand.delay, robustness)
 
     names = tuple(SHAPES)
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(names), 1)))
     references = [
-        reference(frequency, actuator.interval, middle, amplitude, rise)
+        reference(frequency, actuator.interval, center, amplitude, rise)
         for frequency in frequencies
     ]
     models = SampledModel.of(
-        actuator, np.tile(every.mean(axis=0), (len(frequencies) * len(names), 1))
+        actuator, np.tile(all_theta.mean(axis=0), (len(frequencies) * len(names), 1))
     )
     fed = _fed(models, [desired for desired, _ in references], stand)
     followed: list[TrackingErrors] = []
     for (desired, begins), (command, reached) in zip(references, fed, strict=True):
         plan = _plan(desired, begins, command, reached, ends, limits)
         followed.append(follow(plan, gains, rows, noise, stand, generator))
-    rms, largest, limited = (np.stack(part, axis=1) for part in zip(*followed, strict=True))
+    rms, largest, limited = (np.stack(results, axis=1) for results in zip(*followed, strict=True))
     return Tracking(
         gains,
-        kept,
-        wishes.robustness,
+        satisfied,
+        robustness,
         stand,
         frequencies,
         names,
-        middle,
+        center,
         amplitude,
         rise * actuator.interval,
         rms,
@@ -267,9 +147,12 @@ def _fed(
     All at once, in the time that the longest takes: it is a step's own cost that counts, not how
     many models do it. Of that length the others rest where they end.
     """
-    longest = max(one.shape[1] for one in references)
+    longest = max(reference.shape[1] for reference in references)
     desired = np.vstack(
-        [np.pad(one, ((0, 0), (0, longest - one.shape[1])), mode="edge") for one in references]
+        [
+            np.pad(reference, ((0, 0), (0, longest - reference.shape[1])), mode="edge")
+            for reference in references
+        ]
     )
     command, reached = np.zeros_like(desired), np.zeros_like(desired)
     state = model.begin(np.zeros(model.models))
@@ -280,9 +163,12 @@ def _fed(
         last = state.voltage
         command[:, t], state = model.inverse(state, desired[:, t + 1], stand.limits, guess, close)
     reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
-    ends = np.cumsum([one.shape[0] for one in references])[:-1]
+    ends = np.cumsum([reference.shape[0] for reference in references])[:-1]
     parts = zip(references, np.split(command, ends), np.split(reached, ends), strict=True)
-    return [(fed[:, : one.shape[1]], gone[:, : one.shape[1]]) for one, fed, gone in parts]
+    return [
+        (fed[:, : reference.shape[1]], delivered[:, : reference.shape[1]])
+        for reference, fed, delivered in parts
+    ]
 
 
 def _plan(
@@ -316,16 +202,16 @@ def _reach(mean: SampledModel, limits: Span) -> Span:
     return Span(ends[4] - ends[0], ends[3] - ends[0])
 
 
-def _amplitude(given: float | None, ends: Span) -> float:
+def _amplitude(amplitude: float | None, ends: Span) -> float:
     """Return the references' amplitude, um."""
-    if given is None:
+    if amplitude is None:
         return PART * ends.half
-    if not 0 < given <= ends.half:
+    if not 0 < amplitude <= ends.half:
         raise InputError(
-            f"amplitude: {given:g} um; give one above 0 and within the mean model's reach, which "
-            f"is {ends.half:.3g} um about {ends.middle:.3g} um"
+            f"amplitude: {amplitude:g} um; give one above 0 and within the mean model's reach, "
+            f"which is {ends.half:.3g} um about {ends.middle:.3g} um"
         )
-    return given
+    return amplitude
 
 
 def _rise(mean: SampledModel) -> int:
@@ -335,34 +221,36 @@ def _rise(mean: SampledModel) -> int:
     is a Hann window, stays within the reach that the amplitude is 80 % of.
     """
     turns = np.geomspace(1e-4, np.pi, 400)
-    left = np.abs(frequency_response(mean.sections, turns))[0]
-    slow = turns[left < LEFT]
+    response = np.abs(frequency_response(mean.sections, turns))[0]
+    slow = turns[response < LEFT]
     return max(round(4 / float(slow[0])), 1) if slow.size else 1
 
 
-def _frequencies(mean: SampledModel, given: Sequence[float] | None) -> tuple[float, ...]:
+def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tuple[float, ...]:
     """Return the frequencies, Hz."""
     interval = mean.actuator.interval
     fastest = 1 / (PER_PERIOD * interval)
-    if given is not None:
-        for one in given:
+    if frequencies is not None:
+        for frequency in frequencies:
             slowest = 3 / (MOST_SAMPLES * interval)
-            if not slowest <= one <= fastest:
+            if not slowest <= frequency <= fastest:
                 raise InputError(
-                    f"frequencies: {one:g} Hz; at this rate give some from {slowest:.3g} to "
+                    f"frequencies: {frequency:g} Hz; at this rate give some from {slowest:.3g} to "
                     f"{fastest:.3g} Hz"
                 )
-        if not given:
+        if not frequencies:
             raise InputError("frequencies: none is given; give some in Hz")
-        return tuple(given)
+        return tuple(frequencies)
     chosen: list[float] = []
     for decade in range(math.floor(math.log10(SLOWEST)), math.ceil(math.log10(fastest)) + 1):
         for digit in DECADE:
-            one = round(digit * 10.0**decade, 12)
-            if one > fastest:
+            frequency = round(digit * 10.0**decade, 12)
+            if frequency > fastest:
                 return tuple(chosen)
-            chosen.append(one)
-            left = np.abs(frequency_response(mean.sections, np.array([2 * np.pi * one * interval])))
-            if left[0, 0] < LEFT:
+            chosen.append(frequency)
+            response = np.abs(
+                frequency_response(mean.sections, np.array([2 * np.pi * frequency * interval]))
+            )
+            if response[0, 0] < LEFT:
                 return tuple(chosen)
     return tuple(chosen)

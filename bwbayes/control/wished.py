@@ -42,14 +42,12 @@ WRITTEN = 0.9
 MOST_SAMPLES = 10**7
 
 
-def _staircase(turns: FloatArray, levels: int) -> FloatArray:
-    return np.round(levels * sawtooth(2 * np.pi * (turns + 0.25), 0.5)) / levels
-
-
 SHAPES: Mapping[str, Callable[[FloatArray, int], FloatArray]] = {
     "sine": lambda turns, _: np.sin(2 * np.pi * turns),
     "triangle": lambda turns, _: sawtooth(2 * np.pi * (turns + 0.25), 0.5),
-    "staircase": _staircase,
+    "staircase": lambda turns, levels: (
+        np.round(levels * sawtooth(2 * np.pi * (turns + 0.25), 0.5)) / levels
+    ),
     "raster": lambda turns, _: sawtooth(2 * np.pi * (turns + WRITTEN / 2), WRITTEN),
 }
 
@@ -119,13 +117,13 @@ class Reference:
         first = float(self.given[0])
         if abs(first) <= CLOSE * np.ptp(self.given):
             return self
-        way = _way(first, max(round(APPROACH / self.interval), SHORTEST))
+        approach = _way(first, max(round(APPROACH / self.interval), SHORTEST))
         return Reference(
-            np.concatenate([way, self.given]),
+            np.concatenate([approach, self.given]),
             self.interval,
             self.name,
             self.smoothed,
-            way.size * self.interval,
+            approach.size * self.interval,
         )
 
     @property
@@ -195,9 +193,9 @@ def shaped(
     swung: FloatArray = amplitude * SHAPES[shape](
         frequency * interval * np.arange(samples, dtype=np.float64), levels
     )
-    rest = np.zeros(max(round(REST / (frequency * interval)), 1))
+    still = np.zeros(max(round(REST / (frequency * interval)), 1))
     if middle:
-        way = _way(middle, round(1 / (frequency * interval)))
-        rest = np.concatenate([rest, way, np.full(rest.size, middle)])
+        approach = _way(middle, round(1 / (frequency * interval)))
+        still = np.concatenate([still, approach, np.full(still.size, middle)])
     sd = ROUNDED / frequency if smoothed is None else smoothed
-    return Reference(np.concatenate([rest, middle + swung]), interval, shape, sd)
+    return Reference(np.concatenate([still, middle + swung]), interval, shape, sd)

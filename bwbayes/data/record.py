@@ -1,7 +1,7 @@
 """One measurement of an actuator: voltage in, displacement out, sampled at a steady rate.
 
 A :class:`Record` is what every file is read into and what every later step starts from. Its units
-are volts, micrometres and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
+are volts, micrometers and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
 names the data exactly. Parts of a record are addressed by time: a window is the pair (start, stop).
 The voltage is known at every sample, since it drives the simulation; a displacement may be missing
 (nan), and what is missing is not judged.
@@ -20,10 +20,9 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.data.io.checks import VoltageIs, checked, require_voltage_is
 from bwbayes.data.io.columns import QUANTITIES, Naming
-from bwbayes.data.io.frames import frame_source, in_seconds
-from bwbayes.data.io.grid import decimals_of
+from bwbayes.data.io.grid import clock
+from bwbayes.data.io.memory import array_source, frame_source, frozen_vector, in_seconds
 from bwbayes.data.io.table import table_of
-from bwbayes.data.io.vectors import array_table, frozen_vector
 from bwbayes.errors import InputError, one_line
 from bwbayes.shown import brief
 
@@ -167,23 +166,24 @@ class Record:
         if time is None and "time" in units:
             raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
         # The record makes arrays of what it gets, or says that it cannot.
-        given: Any = {"voltage": voltage, "displacement": displacement}
-        given |= {"interval": 1.0 if interval is None else interval, "start": start or 0.0}
-        made = cls(**given, voltage_is=voltage_is, origin=origin)
+        arguments: Any = {"voltage": voltage, "displacement": displacement}
+        arguments |= {"interval": 1.0 if interval is None else interval, "start": start or 0.0}
+        record = cls(**arguments, voltage_is=voltage_is, origin=origin)
         times = None
         if time is not None:
-            times = frozen_vector("time", in_seconds(np.asarray(time)), made.samples)
+            times = frozen_vector("time", in_seconds(np.asarray(time)), record.samples)
         arrays = {
-            "time": made.time if times is None else times,
-            "voltage": made.voltage,
-            "displacement": made.displacement,
+            "time": record.time if times is None else times,
+            "voltage": record.voltage,
+            "displacement": record.displacement,
         }
-        notes = {"origin": made.origin}
+        notes = {"origin": record.origin}
         if times is None:
-            notes["interval_s"] = repr(made.interval)
-        table = array_table(origin, arrays, units, notes)
+            notes["interval_s"] = repr(record.interval)
         need = displacement is not None
-        return cls(**checked(table, voltage_is=made.voltage_is, need_displacement=need))
+        needed = QUANTITIES if need else ("time", "voltage")
+        table = table_of(array_source(origin, arrays, units, notes), Naming(units=units), needed)
+        return cls(**checked(table, voltage_is=record.voltage_is, need_displacement=need))
 
     @classmethod
     def from_pandas(
@@ -227,8 +227,8 @@ class Record:
             If a column is recognized by nothing but its unit, or samples are missing in which a
             commanded voltage was held.
         """
-        given = {"time": time, "voltage": voltage, "displacement": displacement}
-        columns = {quantity: name for quantity, name in given.items() if name is not None}
+        names = {"time": time, "voltage": voltage, "displacement": displacement}
+        columns = {quantity: name for quantity, name in names.items() if name is not None}
         naming = Naming(columns, units or {}, fs)
         # Without a displacement it is a planned voltage; which it is, only what is said can tell.
         needed = QUANTITIES if displacement is not None else ("time", "voltage")
@@ -306,7 +306,7 @@ class Record:
 
     def clock(self, time: float) -> str:
         """Return a time in s with the decimals that tell neighboring samples apart."""
-        return f"{round(time, decimals_of(self.interval)):.15g}"
+        return clock(time, self.interval)
 
     def window(self, start: float, stop: float) -> Record:
         """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
@@ -319,8 +319,8 @@ class Record:
         the history that the hysteresis remembers.
         """
         end = self.window_slice(self.start if first_reading is None else first_reading, stop)
-        part = self._part(slice(0, end.stop))
-        return part if first_reading is None else part.without(slice(0, end.start))
+        record = self._part(slice(0, end.stop))
+        return record if first_reading is None else record.without(slice(0, end.start))
 
     def without(self, left_out: slice | BoolArray | IntArray) -> Record:
         """Return the record without the readings at the samples `left_out`, a slice or index."""
@@ -351,9 +351,9 @@ class Record:
         """
         if factor != int(factor) or factor < 1:
             raise InputError(f"decimate: {factor} is not a whole number of samples; give 1 or more")
-        kept = np.flatnonzero(self.has_reading)[:: int(factor)]
+        readings = np.flatnonzero(self.has_reading)[:: int(factor)]
         left_out = np.ones(self.samples, dtype=np.bool_)
-        left_out[kept] = False
+        left_out[readings] = False
         return self.without(left_out)
 
     def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
@@ -371,24 +371,24 @@ class Record:
         """
         trained = [(window, self.window_slice(*window)) for window in sorted(training)]
         held = [(window, self.window_slice(*window)) for window in held_out]
-        for index, (one, one_slice) in enumerate(trained):
+        for index, (window, samples) in enumerate(trained):
             for kind, others in (("training", trained[:index]), ("held-out", held)):
                 for other, other_slice in others:
-                    if one_slice.start < other_slice.stop and other_slice.start < one_slice.stop:
+                    if samples.start < other_slice.stop and other_slice.start < samples.stop:
                         raise InputError(
-                            f"training window {self.clock(one[0])} to {self.clock(one[1])} s: "
-                            f"overlaps the {kind} window {self.clock(other[0])} to "
+                            f"training window {self.clock(window[0])} to {self.clock(window[1])} "
+                            f"s: overlaps the {kind} window {self.clock(other[0])} to "
                             f"{self.clock(other[1])} s; move one (record.train)"
                         )
-        return Split(tuple(part for _, part in trained), tuple(part for _, part in held))
+        return Split(tuple(cut for _, cut in trained), tuple(cut for _, cut in held))
 
-    def _part(self, part: slice) -> Record:
+    def _part(self, samples: slice) -> Record:
         return replace(
             self,
-            voltage=self.voltage[part],
-            displacement=None if self.displacement is None else self.displacement[part],
-            truth=None if self.truth is None else self.truth[part],
-            start=self.start + self.interval * part.start,
+            voltage=self.voltage[samples],
+            displacement=None if self.displacement is None else self.displacement[samples],
+            truth=None if self.truth is None else self.truth[samples],
+            start=self.start + self.interval * samples.start,
         )
 
 

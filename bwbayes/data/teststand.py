@@ -103,7 +103,7 @@ class Amplifier:
     def output(self, command: FloatArray, interval: float) -> FloatArray:
         """Voltage at the electrode, held from each sample to the next.
 
-        The level follows the quantised and limited command by at most slew x interval per sample;
+        The level follows the quantized and limited command by at most slew x interval per sample;
         the ramp inside a sample is not resolved. It starts settled at the first command.
 
         Parameters
@@ -118,7 +118,7 @@ class Amplifier:
         (samples,) array
             V.
         """
-        levels = np.clip(_quantise(command, self.step, self.dac_bits), -self.limit, self.limit)
+        levels = np.clip(_quantize(command, self.step, self.dac_bits), -self.limit, self.limit)
         reach = self.slew * interval
         followed = itertools.accumulate(
             levels.tolist(), lambda held, level: min(max(level, held - reach), held + reach)
@@ -152,14 +152,14 @@ class LaserSensor:
     def read(self, displacement: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the readings (samples,) of a displacement (samples,), both in um."""
         noise = self.sd * generator.standard_normal(displacement.size)
-        return _quantise(displacement + noise, self.step, self.adc_bits)
+        return _quantize(displacement + noise, self.step, self.adc_bits)
 
 
 @dataclass(frozen=True)
 class VirtualTestStand:
     """The whole stand: command in, :class:`bwbayes.Record` with its truth out.
 
-    The actuator follows the amplifier's held output, starting at rest and demagnetised at the
+    The actuator follows the amplifier's held output, starting at rest and demagnetized at the
     first sample; an operator that remembers extrema came there straight from zero volts. On top of
     its displacement comes one of three discrepancies:
 
@@ -179,8 +179,6 @@ class VirtualTestStand:
         Which discrepancy.
     sample_rate : float
         Hz.
-    table : RingBender
-        The actuator's true parameters.
     amplifier : Amplifier
         What drives it.
     sensor : LaserSensor
@@ -189,9 +187,8 @@ class VirtualTestStand:
         The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
         interval is the stand's, its hold that of the amplifier.
     true : mapping of str to float
-        True values of its parameters; of those that are not given the ``table``'s, or typical
-        ones. With an ``initial`` the hysteresis starts in that
-        state.
+        True values of its parameters; of those that are not given the ring bender's, or typical
+        ones. With an ``initial`` the hysteresis starts in that state.
 
     Raises
     ------
@@ -204,7 +201,6 @@ class VirtualTestStand:
 
     discrepancy: Literal["none", "process", "structural"] = "process"
     sample_rate: float = 1000.0
-    table: RingBender = RingBender()
     amplifier: Amplifier = Amplifier()
     sensor: LaserSensor = LaserSensor()
     actuator: Actuator = field(default_factory=lambda: Actuator("second-order", "zero"))
@@ -232,7 +228,7 @@ class VirtualTestStand:
         """Return all true values by name: the actuator's, ``sensor_sd`` and the process's.
 
         ``discrepancy_sd`` (um) and ``discrepancy_time`` (s) exist for ``"process"`` only. There is
-        no ``initial`` where no value of it is the demagnetised state.
+        no ``initial`` where no value of it is the demagnetized state.
         """
         truth = {**self._values, "sensor_sd": self.sensor.sd}
         if self._from_rest:
@@ -302,7 +298,7 @@ class VirtualTestStand:
     @cached_property
     def _values(self) -> dict[str, float]:
         """The true values of the actuator's parameters."""
-        return true_values(self.actuator, asdict(self.table)) | dict(self.true)
+        return true_values(self.actuator, asdict(RingBender())) | dict(self.true)
 
     @property
     def _from_rest(self) -> bool:
@@ -310,18 +306,8 @@ class VirtualTestStand:
         one_state = isinstance(self.actuator.hysteresis, OneState)
         return not one_state and "initial" not in self.true
 
-    @property
-    def _columns(self) -> dict[str, FloatArray]:
-        """The true values, (1,) each."""
-        return {name: np.array([value]) for name, value in self._values.items()}
-
-    @property
-    def _driven(self) -> Actuator:
-        """The actuator behind the amplifier."""
-        return replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
-
     def _displacement(self, output: FloatArray) -> FloatArray:
-        actuator = self._driven
+        actuator = replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
         theta = np.array([[self._values[name] for name in actuator.parameters]])
         try:
             (displacement,) = actuator.displacement(theta, output, from_rest=self._from_rest)
@@ -344,7 +330,8 @@ class VirtualTestStand:
 
     def _even_term(self, output: FloatArray, interval: float) -> FloatArray:
         strain = QUADRATIC_AT_100_V * (output / 100.0) ** 2
-        dynamics = self.actuator.filter.recursion(self._columns, 1, interval, "zero")
+        column = {name: np.array([value]) for name, value in self._values.items()}
+        dynamics = self.actuator.filter.recursion(column, 1, interval, "zero")
         moved: FloatArray = strain[0] + _from_rest(dynamics, strain[np.newaxis] - strain[0])[0]
         return moved
 
@@ -385,13 +372,13 @@ def _ornstein_uhlenbeck(
     samples: int, interval: float, generator: np.random.Generator
 ) -> FloatArray:
     """Draw the process (samples,) in um from its stationary distribution, exact at any interval."""
-    kept = math.exp(-interval / PROCESS_TIME)
+    decay = math.exp(-interval / PROCESS_TIME)
     shocks = PROCESS_SD * generator.standard_normal(samples)
     shocks[1:] *= math.sqrt(-math.expm1(-2 * interval / PROCESS_TIME))
-    return np.asarray(lfilter([1.0], [1.0, -kept], shocks), dtype=np.float64)
+    return np.asarray(lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
 
 
-def _quantise(values: FloatArray, step: float, bits: int) -> FloatArray:
+def _quantize(values: FloatArray, step: float, bits: int) -> FloatArray:
     """Round to the levels of a two's complement converter, clipped at its ends."""
     half = 2.0 ** (bits - 1)
     levels: FloatArray = step * np.clip(np.round(values / step), -half, half - 1)

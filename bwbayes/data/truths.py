@@ -68,9 +68,13 @@ def true_values(actuator: Actuator, table: Mapping[str, float]) -> dict[str, flo
     """
     operator = actuator.hysteresis
     stated = table if isinstance(operator, BoucWen) else OPERATORS.get(type(operator), {})
-    own = {declared.name for declared in operator.parameters}
-    known = {n: value for n, value in {**table, **GAIN, **LAG}.items() if n not in own} | {**stated}
-    return {d.name: known[d.name] if d.name in known else _median(d) for d in actuator.declarations}
+    of_operator = {declared.name for declared in operator.parameters}
+    values = {n: value for n, value in {**table, **GAIN, **LAG}.items() if n not in of_operator} | {
+        **stated
+    }
+    return {
+        d.name: values[d.name] if d.name in values else _median(d) for d in actuator.declarations
+    }
 
 
 def _median(declared: Declaration) -> float:

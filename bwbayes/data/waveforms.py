@@ -1,17 +1,18 @@
 """The voltages that drive an actuator: the paper's signals, and parts to build others from.
 
-A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`,
-:class:`Multisine`) times an amplitude :class:`Decay`, switched on at a start time and sampled at a
-rate; a step is a staircase of one level. The paper's own signals are made of these parts by
-:func:`identification_signal`, :func:`verification_signal` and :func:`step_signal`, and
-:func:`signal` finds them by name.
+A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`) times an
+amplitude :class:`Decay`, switched on at a start time and sampled at a rate; a step is a staircase
+of one level. The paper's own signals are made of these, and :func:`signal` finds them by
+name.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal, Protocol
 
 import numpy as np
@@ -22,16 +23,12 @@ from bwbayes.errors import InputError
 __all__ = [
     "Carrier",
     "Decay",
-    "Multisine",
     "Sine",
     "Staircase",
     "Triangle",
     "Waveform",
-    "identification_signal",
     "signal",
     "signal_names",
-    "step_signal",
-    "verification_signal",
 ]
 
 MOST_SAMPLES = 10**7
@@ -139,17 +136,6 @@ class Staircase:
             _require_finite("staircase: levels", level)
         _require_positive("staircase: dwell", self.dwell)
 
-    @classmethod
-    def up_and_down(cls, amplitude: float, steps: int, dwell: float) -> Staircase:
-        """Build a staircase from zero to the amplitude (V) and back, so many equal steps each way.
-
-        Raises :class:`InputError` as the class does, and if there is no step.
-        """
-        if steps < 1:
-            raise InputError(f"staircase: steps: {steps} is too few; give at least one")
-        up = [amplitude * step / steps for step in range(steps + 1)]
-        return cls((*up, *up[-2::-1]), dwell)
-
     @property
     def highest_frequency(self) -> float:
         """Frequency of a square wave of the same dwell, Hz; 0 for a single level."""
@@ -161,50 +147,6 @@ class Staircase:
         passed = np.floor(elapsed / self.dwell + 1e-9)
         index = np.minimum(passed, len(self.levels) - 1).astype(np.int64)
         return np.asarray(self.levels, dtype=np.float64)[index]
-
-
-@dataclass(frozen=True)
-class Multisine:
-    """A sum of sines, ``v = sum_i amplitude_i sin(2 pi frequency_i t + phase_i)``.
-
-    Parameters
-    ----------
-    sines : tuple of Sine
-        The components; at least one.
-
-    Raises :class:`InputError` if there is no component.
-    """
-
-    sines: tuple[Sine, ...]
-
-    def __post_init__(self) -> None:
-        if not self.sines:
-            raise InputError("multisine: sines: there is none; give at least one")
-
-    @classmethod
-    def flat(cls, amplitude: float, frequencies: tuple[float, ...]) -> Multisine:
-        """Build ``count`` equal sines of ``amplitude / count`` (V) each, with a low crest factor.
-
-        The phases are Schroeder's for a flat spectrum, ``-pi i (i - 1) / count``; the frequencies
-        are in Hz. Raises :class:`InputError` if there is none, or one that is not above zero.
-        """
-        count = len(frequencies)
-        phases = (-np.pi * i * (i - 1) / count for i in range(1, count + 1))
-        return cls(
-            tuple(Sine(amplitude / count, f, p) for f, p in zip(frequencies, phases, strict=True))
-        )
-
-    @property
-    def highest_frequency(self) -> float:
-        """The highest component's frequency, Hz."""
-        return max(sine.frequency for sine in self.sines)
-
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
-        total = np.zeros_like(elapsed)
-        for sine in self.sines:
-            total += sine(elapsed)
-        return total
 
 
 @dataclass(frozen=True)
@@ -324,75 +266,49 @@ class Waveform:
         return time, self(time)
 
 
-def identification_signal() -> Waveform:
-    """Return the signal that the paper identifies its model with, equations (1)-(4).
-
-    Rest for 0.5 s, then a sine of 100 V and 1 Hz whose amplitude decays from 4 s on at 0.1 per
-    second; 16 s long, 16,000 samples at 1000 Hz.
-
-    Notes
-    -----
-    Two misprints are read as the text means them. Equation (2) lost its sine: it is
-    ``100 sin(2 pi t)``, whose phase at 0.5 s is pi, so the voltage goes down first. The factor
-    ``1 - 0.1 (t - 4)`` of equations (3) and (4) turns negative after 14 s; the text lets the
-    amplitude decay to zero, so from 14 s on the voltage is zero.
-    """
-    return Waveform(Sine(100.0, 1.0, phase=math.pi), 16.0, start=0.5, decay=Decay(4.0, 0.1))
-
-
-def verification_signal() -> Waveform:
-    """Return the signal that the paper verifies its model with (section 4.2).
-
-    Rest for 5 s, then a sine of 100 V and 0.1 Hz that decays from 25 s on.
-
-    Notes
-    -----
-    The paper gives neither the decay nor the length. ASSUMPTIONS: the amplitude decays linearly,
-    as in equation (3), at 0.05 per second, so it is zero from 45 s on; the signal is 50 s long;
-    the sine counts its phase from the first sample, as equation (2) does: ``100 sin(0.2 pi t)``
-    has the phase pi at 5 s, so the voltage goes down first here too.
-    """
-    return Waveform(Sine(100.0, 0.1, phase=math.pi), 50.0, start=5.0, decay=Decay(25.0, 0.05))
-
-
-def step_signal(amplitude: float) -> Waveform:
-    """Step from zero to the amplitude at 1 s; the paper's are 10, 50 and 100 V (its Fig. 5).
-
-    Parameters
-    ----------
-    amplitude : float
-        Height of the step, V.
-
-    Raises :class:`InputError` if the amplitude is not finite.
-
-    Notes
-    -----
-    The paper does not give the length. ASSUMPTION: 11 s, ten of them after the step.
-    """
-    return Waveform(Staircase((amplitude,), dwell=10.0), duration=11.0, start=1.0)
+# Those of the paper. Two misprints are read as the text means them: equation (2) lost its sine, so
+# it is 100 sin(2 pi t), whose phase at 0.5 s is pi, and the voltage goes down first; the factor 1
+# - 0.1 (t - 4) of equations (3) and (4) turns negative after 14 s, where the text lets the
+# amplitude be zero. ASSUMPTIONS, where the paper says nothing: the verification signal decays
+# linearly, as in equation (3), at 0.05 per second, is 50 s long, and counts its phase from the
+# first sample, as equation (2) does; a step is 11 s long, ten of them after the step.
+SIGNALS: Mapping[str, Waveform] = MappingProxyType(
+    {
+        "identification": Waveform(
+            Sine(100.0, 1.0, phase=math.pi), 16.0, start=0.5, decay=Decay(4.0, 0.1)
+        ),
+        "verification": Waveform(
+            Sine(100.0, 0.1, phase=math.pi), 50.0, start=5.0, decay=Decay(25.0, 0.05)
+        ),
+        **{
+            f"step{height}": Waveform(Staircase((float(height),), dwell=10.0), 11.0, start=1.0)
+            for height in (10, 50, 100)
+        },
+    }
+)
 
 
 def signal_names() -> tuple[str, ...]:
     """Return the names that :func:`signal` knows."""
-    return ("identification", "verification", "step10", "step50", "step100")
+    return tuple(SIGNALS)
 
 
 def signal(name: str) -> Waveform:
     """Return one of the paper's signals by its name; :func:`signal_names` are all of them.
+
+    ``identification``: rest for 0.5 s, then a sine of 100 V and 1 Hz whose amplitude decays from
+    4 s on at 0.1 per second, 16 s long, equations (1)-(4). ``verification``: rest for 5 s, then a
+    sine of 100 V and 0.1 Hz that decays from 25 s on, section 4.2. ``step10``, ``step50`` and
+    ``step100``: a step from zero to so many volts at 1 s, Fig. 5.
 
     Raises :class:`InputError` for any other; the text lists the names and the nearest one.
 
     >>> signal("step50").duration  # s
     11.0
     """
-    match name:
-        case "identification":
-            return identification_signal()
-        case "verification":
-            return verification_signal()
-        case "step10" | "step50" | "step100":
-            return step_signal(float(name.removeprefix("step")))
-    nearest = difflib.get_close_matches(name, signal_names(), n=1, cutoff=0.0)[0]
+    if name in SIGNALS:
+        return SIGNALS[name]
+    nearest = difflib.get_close_matches(name, SIGNALS, n=1, cutoff=0.0)[0]
     raise InputError(
-        f"signal: no {name!r}; did you mean {nearest!r}? (known: {', '.join(signal_names())})"
+        f"signal: no {name!r}; did you mean {nearest!r}? (known: {', '.join(SIGNALS)})"
     )

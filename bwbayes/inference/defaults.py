@@ -50,26 +50,26 @@ def ranges_of(
     )
 
 
-def joined(every: Sequence[Ranges]) -> Ranges:
+def joined(records: Sequence[Ranges]) -> Ranges:
     """Return the ranges of several records of one actuator together.
 
     Displacements are not held against each other, for sensors are set to zero between records: the
     widest counts, and its middle. Voltages are. The time between turns is that of the fastest
     drive: a step never turns.
     """
-    if len(every) == 1:
-        return every[0]
-    widest = max(every, key=lambda one: one.displacement)
-    low = min(one.bias - one.voltage for one in every)
-    high = max(one.bias + one.voltage for one in every)
+    if len(records) == 1:
+        return records[0]
+    widest = max(records, key=lambda record: record.displacement)
+    low = min(record.bias - record.voltage for record in records)
+    high = max(record.bias + record.voltage for record in records)
     return Ranges(
         voltage=(high - low) / 2,
         displacement=widest.displacement,
         middle=widest.middle,
-        time=min(one.time for one in every),
+        time=min(record.time for record in records),
         bias=(high + low) / 2,
-        interval=min(one.interval for one in every),
-        duration=max(one.duration for one in every),
+        interval=min(record.interval for record in records),
+        duration=max(record.duration for record in records),
     )
 
 
@@ -77,5 +77,5 @@ def default_priors(
     declarations: Iterable[Declaration], context: Context
 ) -> dict[str, Distribution]:
     """Return the default priors of those of the parameters that have one, by name."""
-    known = {declaration.name: declaration.default(context) for declaration in declarations}
-    return {name: prior for name, prior in known.items() if isinstance(prior, Distribution)}
+    defaults = {declaration.name: declaration.default(context) for declaration in declarations}
+    return {name: prior for name, prior in defaults.items() if isinstance(prior, Distribution)}

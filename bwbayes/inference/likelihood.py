@@ -77,11 +77,13 @@ class Score(NamedTuple):
     """What shapes in the readings would explain, beside an unknown start.
 
     ``pull`` u (models, shapes) is the log density's slope in their sizes, where these are zero, and
-    ``information`` I (models, shapes, shapes) its bend.
+    ``information`` I (models, shapes, shapes) its bend; ``log_density`` (models,) is that without
+    them, nats.
     """
 
     pull: FloatArray
     information: FloatArray
+    log_density: FloatArray
 
     @property
     def together(self) -> FloatArray:
@@ -191,40 +193,54 @@ class Likelihood:
         covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         return LinearStart(density, squares, sd * mean, covariance)
 
-    def score(self, theta: FloatArray, shapes: FloatArray) -> Score:
+    def score(
+        self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
+    ) -> Score:
         """Say what shapes (shapes, readings) in the readings, um, would explain at θ.
 
         With the whitened shapes S, and as in :meth:`start`:
 
             u = Sᵀ (z₀ − Z μ),   I = Sᵀ S − Sᵀ Z C Zᵀ S.
+
+        ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
+        at θ, if it is given.
         """
-        pulls, informations = [], []
-        for piece in batches(len(theta), self.readings.rows.size, CACHED):
-            series = self._whitened(theta[piece], shapes)
+        scores = []
+        for batch in batches(len(theta), self.readings.rows.size, CACHED):
+            simulated = None if displacement is None else displacement[batch]
+            series, log_determinant = self._whitened(theta[batch], shapes, simulated)
             products = np.einsum("mit,mjt->mij", series, series)
-            sd = self.start_sd(theta[piece])
+            sd = self.start_sd(theta[batch])
             first = 1 + sd.shape[1]
             prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
             precision = np.eye(sd.shape[1]) + prior * products[:, 1:first, 1:first]
-            covariance = _inverse(precision)[0] * prior
-            others, rest = products[:, 1:first], products[:, first:]
-            left = rest - np.einsum("mui,muv,mvj->mij", others[:, :, first:], covariance, others)
-            pulls.append(left[:, :, 0])
-            informations.append(left[:, :, first:])
-        return Score(np.concatenate(pulls), np.concatenate(informations))
+            inverse, log_volume = _inverse(precision)
+            others = products[:, 1:first]
+            # Of all products what the unknowns do not explain.
+            free = products - np.einsum("mui,muv,mvj->mij", others, inverse * prior, others)
+            logs = log_determinant + log_volume + self.readings.rows.size * LOG_TWO_PI
+            density = -0.5 * (free[:, 0, 0] + logs)
+            scores.append(Score(free[:, first:, 0], free[:, first:, first:], density))
+        return Score(*(np.concatenate(values) for values in zip(*scores, strict=True)))
 
-    def _whitened(self, theta: FloatArray, shapes: FloatArray) -> FloatArray:
-        """Whiten residual, unknowns' responses and shapes: (models, series, readings)."""
+    def _whitened(
+        self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Whiten residual, unknowns' responses and shapes: (models, series, readings).
+
+        Beside them the log determinant (models,) of the noise's covariance.
+        """
         readings, spaced = self.readings, self.spaced
         model, noise = self.table.actuator(theta), self.table.noise(theta)
-        simulated = self._simulated(model)
+        if displacement is None:
+            displacement = self._simulated(model)[:, readings.where]
         responses = self._responses(model, spaced.steady_state(noise).log_decay)
-        heard = responses.shape[2]
+        audible = responses.shape[2]
         series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
-        series[:, 0] = readings.values - simulated[:, readings.where]
-        series[:, 1 : 1 + responses.shape[1], :heard] = responses
+        series[:, 0] = readings.values - displacement
+        series[:, 1 : 1 + responses.shape[1], :audible] = responses
         series[:, 1 + responses.shape[1] :] = shapes
-        return spaced.whiten(noise, series, readings.skipped)[0]
+        return spaced.whiten(noise, series, readings.skipped)
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
@@ -244,6 +260,23 @@ class Likelihood:
     def unknown(self) -> bool:
         """Tell whether anything is unknown of the start."""
         return bool(self.offset_sd) or not (self.from_rest or self.actuator.unknowns == 0)
+
+    def simulate(
+        self, model: FloatArray, voltage: FloatArray, unrest: FloatArray | None = None
+    ) -> FloatArray:
+        """Displacement (models, samples), um, along a voltage (samples,), V.
+
+        ``model`` is (models, parameters of the actuator); ``unrest`` (models, unknowns), um, is how
+        far dynamics and creep are from rest at the first sample.
+        """
+        if self.engine == "numba":
+            # Here, because it is slow to load.
+            from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
+
+            state = walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
+            if state is not None:
+                return state.to(voltage.size)
+        return self.actuator.advance(model, voltage, None, unrest, from_rest=self.from_rest)[0]
 
     def _simulated(self, model: FloatArray) -> FloatArray:
         """Displacement (models, samples), um, up to the last reading, the dynamics at rest."""
@@ -270,8 +303,8 @@ class Likelihood:
                 )
             )
         pieces = batches(len(theta), self.readings.samples)
-        parts = [self._moments(theta[piece]) for piece in pieces]
-        return Moments(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        parts = [self._moments(theta[batch]) for batch in pieces]
+        return Moments(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     def _moments(self, theta: FloatArray) -> Moments:
         """Do it with NumPy for one batch of models."""
@@ -281,15 +314,15 @@ class Likelihood:
         residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
         spaced = self.spaced
         responses = self._responses(model, spaced.steady_state(noise).log_decay)
-        skipped, heard = readings.skipped, responses.shape[2]
+        skipped, audible = readings.skipped, responses.shape[2]
         parts = []
         # A few models at a time: what is whitened then stays in the cache.
-        for piece in batches(len(theta), readings.rows.size, CACHED):
-            white, log_determinant = spaced.whiten(noise[piece], residual[piece], skipped)
-            pulls, _ = spaced.whiten(noise[piece], responses[piece], skipped[:heard])
+        for batch in batches(len(theta), readings.rows.size, CACHED):
+            white, log_determinant = spaced.whiten(noise[batch], residual[batch], skipped)
+            pulls, _ = spaced.whiten(noise[batch], responses[batch], skipped[:audible])
             series = [white[:, 0], *np.moveaxis(pulls, 1, 0)]
-            parts.append((_products(series, heard), log_determinant))
-        return Moments(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+            parts.append((_products(series, audible), log_determinant))
+        return Moments(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     def _responses(self, model: FloatArray, log_decay: FloatArray) -> FloatArray:
         """Unknowns' responses (models, unknowns, readings), as long as the noise hears of them.
@@ -301,21 +334,23 @@ class Likelihood:
         sections = self.actuator.sections(self.actuator.columns(model))
         unknowns = 0 if self.from_rest else sections.unknowns
         if self.offset_sd:
-            heard = rows.size
+            audible = rows.size
         elif unknowns:
             with np.errstate(divide="ignore"):
                 slowest = max(float(np.max(np.log(sections.remembered))), -FORGOTTEN)
-            far = FORGOTTEN + rows * slowest < 0
+            forgotten = FORGOTTEN + rows * slowest < 0
             # White noise decays at once: its rate is infinite.
             decay = max(float(np.max(log_decay)), -FORGOTTEN)
-            far &= FORGOTTEN + np.arange(rows.size) * decay < 0
-            heard = int(np.argmax(far)) if far[-1] else rows.size
+            forgotten &= FORGOTTEN + np.arange(rows.size) * decay < 0
+            audible = int(np.argmax(forgotten)) if forgotten[-1] else rows.size
         else:
-            heard = 0
-        free = sections.free_responses(int(rows[heard - 1]) + 1 if heard and unknowns else 0)
-        parts = [free[:, :unknowns, rows[:heard]] if unknowns else np.empty((len(model), 0, heard))]
+            audible = 0
+        free = sections.free_responses(int(rows[audible - 1]) + 1 if audible and unknowns else 0)
+        parts = [
+            free[:, :unknowns, rows[:audible]] if unknowns else np.empty((len(model), 0, audible))
+        ]
         if self.offset_sd:
-            parts.insert(0, np.ones((len(model), 1, heard)))
+            parts.insert(0, np.ones((len(model), 1, audible)))
         return np.concatenate(parts, axis=1)
 
 
@@ -331,19 +366,19 @@ def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     inverse, log_determinant = np.empty_like(matrices), np.empty(len(matrices))
     inverse[~lost], log_determinant[~lost] = _inverse(matrices[~lost])
     values, vectors = np.linalg.eigh(matrices[lost])
-    least = 4 * matrices.shape[1] * np.finfo(float).eps * values[:, -1:]
-    values = np.where(values < np.maximum(least, 1.0), 1.0, values)
+    smallest = 4 * matrices.shape[1] * np.finfo(float).eps * values[:, -1:]
+    values = np.where(values < np.maximum(smallest, 1.0), 1.0, values)
     inverse[lost] = (vectors / values[:, np.newaxis]) @ np.swapaxes(vectors, 1, 2)
     log_determinant[lost] = np.sum(np.log(values), axis=1)
     return inverse, log_determinant
 
 
-def _products(series: list[FloatArray], heard: int) -> FloatArray:
+def _products(series: list[FloatArray], audible: int) -> FloatArray:
     """Σ zᵢ zⱼ (models, series, series); all series but the first (models, readings) are shorter."""
     products = np.empty((len(series[0]), len(series), len(series)))
-    for i, one in enumerate(series):
-        for j, other in enumerate(series[: i + 1]):
+    for i, first in enumerate(series):
+        for j, second in enumerate(series[: i + 1]):
             # Sums, not dot products: a linear algebra library may split those over threads.
-            product = np.sum(one**2 if i == j else one * other[:, :heard], axis=1)
+            product = np.sum(first**2 if i == j else first * second[:, :audible], axis=1)
             products[:, i, j] = products[:, j, i] = product
     return products

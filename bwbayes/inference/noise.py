@@ -109,7 +109,7 @@ SENSOR_SD = Declaration(
     "um",
     r"s",
     "sd of the sensor noise",
-    lambda known: lognormal(0.006 * known.ranges.displacement, 2.0),
+    lambda context: lognormal(0.006 * context.ranges.displacement, 2.0),
     floor=0.0,
     aliases=("noise",),
 )
@@ -120,7 +120,7 @@ DISCREPANCY_SD = Declaration(
     "sd of the model discrepancy",
     # Not even its order of magnitude is known. A prior that is level down to zero would claim
     # some discrepancy where there is none, and make a right model's bands too wide.
-    lambda known: lognormal(1e-5 * known.ranges.displacement, 4.0),
+    lambda context: lognormal(1e-5 * context.ranges.displacement, 4.0),
     floor=0.0,
     aliases=("sigma",),
 )
@@ -129,7 +129,7 @@ DISCREPANCY_TIME = Declaration(
     "s",
     r"\tau",
     "correlation time of the model discrepancy",
-    lambda known: lognormal(0.5 * known.ranges.time, 0.8),
+    lambda context: lognormal(0.5 * context.ranges.time, 0.8),
     floor=0.0,
 )
 
@@ -286,8 +286,8 @@ class DiscrepancyNoise:
         fresh = -np.expm1(-2 * rate)
         half = fresh * (process - sensor) / 2
         root = np.sqrt(half**2 + fresh * process * sensor)
-        apart = np.where(half > 0, 1, root - half)
-        predicted = np.where(half > 0, half + root, fresh * process * sensor / apart)
+        divisor = np.where(half > 0, 1, root - half)
+        predicted = np.where(half > 0, half + root, fresh * process * sensor / divisor)
         with np.errstate(divide="ignore", over="ignore"):
             log_a = np.minimum(-rate - np.log1p(predicted / sensor), -1e-300)
         surplus = np.maximum(process - predicted, 0.0)
@@ -314,9 +314,9 @@ class _Filter:
 
     def skip(self, readings: float) -> None:
         """Pass over that many missing readings."""
-        kept = np.exp(-readings * self.steady.rate)
-        self.mean *= kept[:, np.newaxis]
-        self.unsure = kept**2 * self.unsure - np.expm1(-2 * readings * self.steady.rate) * (
+        decay = np.exp(-readings * self.steady.rate)
+        self.mean *= decay[:, np.newaxis]
+        self.unsure = decay**2 * self.unsure - np.expm1(-2 * readings * self.steady.rate) * (
             self.steady.surplus
         )
 

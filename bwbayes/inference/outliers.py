@@ -65,41 +65,44 @@ def outliers(
     InputError
         More than one in twenty of a record's readings would be.
     """
-    every = {one.name: one.readings for one in without({}).datasets}
+    readings_of = {dataset.name: dataset.readings for dataset in without({}).datasets}
     aside: dict[str, BoolArray] = {
         name: np.isin(readings.rows, (suspects or {}).get(name, []))
-        for name, readings in every.items()
+        for name, readings in readings_of.items()
     }
     cleared = {name: np.zeros_like(mask) for name, mask in aside.items()}
     for _ in range(ROUNDS):
-        posterior = without({name: every[name].rows[mask] for name, mask in aside.items()})
+        posterior = without({name: readings_of[name].rows[mask] for name, mask in aside.items()})
         point = pointfit.fit(posterior, generator.spawn(1)[0])
         before = dict(aside)
-        for name, place in _places(posterior, point.mode).items():
-            away, mask = np.abs(surprise(posterior.alone(name), place, every[name])), aside[name]
+        for name, position in _places(posterior, point.mode).items():
+            away, mask = (
+                np.abs(surprise(posterior.alone(name), position, readings_of[name])),
+                aside[name],
+            )
             # Spikes in a fit make its noise larger than that of most readings: theirs counts, but
             # what a later fit clears needs the whole distance from then on.
-            usual = min(1.0, float(np.median(away[~mask])) / MEDIAN)
+            typical = min(1.0, float(np.median(away[~mask])) / MEDIAN)
             cleared[name] = cleared[name] | (mask & (away <= LIMIT))
-            suspect = (away > LIMIT * usual) & ~mask & ~cleared[name]
+            suspect = (away > LIMIT * typical) & ~mask & ~cleared[name]
             aside[name] = (away > LIMIT) | suspect
             _require_few(aside[name], 0.5)  # and a fit to fewer than half says nothing
         if all(np.array_equal(aside[name], before[name]) for name in aside):
             break
     for mask in aside.values():
         _require_few(mask, MOST)
-    return {name: every[name].rows[mask] for name, mask in aside.items()}
+    return {name: readings_of[name].rows[mask] for name, mask in aside.items()}
 
 
-def _places(posterior: Posterior, place: FloatArray) -> dict[str, FloatArray]:
+def _places(posterior: Posterior, position: FloatArray) -> dict[str, FloatArray]:
     """Return the coordinates (its free,) of each record alone at joint ones (free,)."""
-    free = posterior.prior.constrain(place[np.newaxis])[0]
-    return {name: one.prior.unconstrain(draws)[0] for name, one, draws in posterior.each(free)}
+    free = posterior.prior.constrain(position[np.newaxis])[0]
+    return {name: alone.prior.unconstrain(draws)[0] for name, alone, draws in posterior.each(free)}
 
 
-def _require_few(aside: BoolArray, most: float) -> None:
+def _require_few(aside: BoolArray, limit: float) -> None:
     """Refuse to set aside more than a part of the readings (readings,)."""
-    if np.mean(aside) > most:
+    if np.mean(aside) > limit:
         raise InputError(
             f"model.outliers: {np.sum(aside)} of {aside.size} readings would be set aside, too "
             "many for isolated outliers; leave outliers out, and look at the residuals"
@@ -107,51 +110,51 @@ def _require_few(aside: BoolArray, most: float) -> None:
 
 
 def surprise(
-    posterior: Posterior, place: FloatArray, readings: Readings | None = None
+    posterior: Posterior, position: FloatArray, readings: Readings | None = None
 ) -> FloatArray:
     """Return how far each reading of a record is from what all others predict, in sds, (readings,).
 
-    At the coordinates ``place`` (free,). ``readings`` may have some that the posterior has not;
+    At the coordinates ``position`` (free,). ``readings`` may have some that the posterior has not;
     these predict no other. With the discrepancy's mean and variance (m, P) from the readings
     before, and from those after, both joined over its own variance σ²:
 
         1/Q = 1/P₁ + 1/P₂ − 1/σ²,   x̂ = Q (m₁/P₁ + m₂/P₂),   (r − x̂) / √(Q + s²).
     """
-    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
-    one, readings = posterior.only, readings or posterior.only.readings
+    theta = posterior.prior.theta(posterior.prior.constrain(position[np.newaxis])[0])
+    dataset, readings = posterior.only, readings or posterior.only.readings
     simulated = posterior.simulate(theta, readings.rows)[0]
     residual = readings.values - simulated
-    noise = one.noise.at(one.actuator.interval * readings.stride)
-    steady = noise.steady_state(one.table.noise(theta))
-    own = float(steady.predicted[0] + steady.surplus[0])
+    noise = dataset.noise.at(dataset.actuator.interval * readings.stride)
+    steady = noise.steady_state(dataset.table.noise(theta))
+    prior_variance = float(steady.predicted[0] + steady.surplus[0])
     sensor = float(steady.variance[0] - steady.predicted[0])
-    if own <= 0:
+    if prior_variance <= 0:
         return np.asarray(residual / np.sqrt(sensor))
-    known = np.isin(readings.rows, one.readings.rows)
-    before = _predicted(residual, readings.skipped, known, steady)
+    fitted = np.isin(readings.rows, dataset.readings.rows)
+    before = _predicted(residual, readings.skipped, fitted, steady)
     backward = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    after = (part[::-1] for part in _predicted(residual[::-1], backward, known[::-1], steady))
+    after = (series[::-1] for series in _predicted(residual[::-1], backward, fitted[::-1], steady))
     (m_1, p_1), (m_2, p_2) = before, after
-    joined = 1 / (1 / p_1 + 1 / p_2 - 1 / own)
+    joined = 1 / (1 / p_1 + 1 / p_2 - 1 / prior_variance)
     expected = joined * (m_1 / p_1 + m_2 / p_2)
     distance: FloatArray = (residual - expected) / np.sqrt(joined + sensor)
     return distance
 
 
 def _predicted(
-    residual: FloatArray, skipped: FloatArray, known: BoolArray, steady: SteadyState
+    residual: FloatArray, skipped: FloatArray, fitted: BoolArray, steady: SteadyState
 ) -> tuple[FloatArray, FloatArray]:
     """Predict the discrepancy at each reading from known ones before: mean, variance (each)."""
     predicted, variance = float(steady.predicted[0]), float(steady.variance[0])
-    own = predicted + float(steady.surplus[0])
+    prior_variance = predicted + float(steady.surplus[0])
     rate, sensor = float(steady.rate[0]), variance - predicted
     means, variances = np.empty_like(residual), np.empty_like(residual)
-    mean, unsure = 0.0, own
-    series = zip(residual.tolist(), skipped.tolist(), known.tolist(), strict=True)
+    mean, unsure = 0.0, prior_variance
+    series = zip(residual.tolist(), skipped.tolist(), fitted.tolist(), strict=True)
     for t, (reading, missing, is_known) in enumerate(series):
         if t:
-            kept = math.exp(-(1 + missing) * rate)
-            mean, unsure = kept * mean, kept**2 * unsure + (1 - kept**2) * own
+            decay = math.exp(-(1 + missing) * rate)
+            mean, unsure = decay * mean, decay**2 * unsure + (1 - decay**2) * prior_variance
         means[t], variances[t] = mean, unsure
         if is_known:
             gain = unsure / (unsure + sensor)

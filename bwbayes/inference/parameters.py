@@ -65,12 +65,12 @@ class Parameter:
     record: str = ""
 
     @classmethod
-    def of(cls, declared: Declaration, known: Distribution | float) -> Parameter:
+    def of(cls, declared: Declaration, value: Distribution | float) -> Parameter:
         """Return a declared parameter with a prior or a fixed value."""
         names = declared.name, declared.unit, declared.label, declared.description
-        if isinstance(known, Distribution):
-            return cls(*names, prior=known, declared=declared)
-        return cls(*names, fixed=known, declared=declared)
+        if isinstance(value, Distribution):
+            return cls(*names, prior=value, declared=declared)
+        return cls(*names, fixed=value, declared=declared)
 
     def __post_init__(self) -> None:
         if (self.prior is None) == (self.fixed is None):
@@ -84,8 +84,8 @@ class Parameter:
         if not np.isfinite(value) or not self.lower <= value <= self.upper:
             raise InputError(f"{self.name}: fixed at {value}; give a finite value in its bounds")
         if not self.above_floor(np.array(value)):
-            least = "above" if self.positive else "at least"
-            raise InputError(f"{self.name}: fixed at {value:g}; must be {least} {self.floor:g}")
+            relation = "above" if self.positive else "at least"
+            raise InputError(f"{self.name}: fixed at {value:g}; must be {relation} {self.floor:g}")
 
     @property
     def plain(self) -> str:
@@ -129,8 +129,8 @@ class Parameter:
         """The formula that maps normal scores to values, if there is one and nothing cuts it."""
         assert self.prior is not None
         bounded = self.declared is not None and self.declared.bounds is not None
-        form, whole = self.prior.form, self.support == self.prior.support
-        return form if isinstance(form, Scored) and whole and not bounded else None
+        form, uncut = self.prior.form, self.support == self.prior.support
+        return form if isinstance(form, Scored) and uncut and not bounded else None
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
@@ -228,15 +228,15 @@ class JointPrior:
         InputError
             Fewer than one in ten thousand draws of the single priors meets the constraints.
         """
-        kept = np.empty((0, self.dimensions))
+        accepted = np.empty((0, self.dimensions))
         tried = 0
-        while kept.shape[0] < size:
+        while accepted.shape[0] < size:
             batch = np.stack([_draw_single(p, generator, size) for p in self.free], axis=1)
-            kept = np.concatenate([kept, batch[np.isfinite(self.log_density(batch))]])
+            accepted = np.concatenate([accepted, batch[np.isfinite(self.log_density(batch))]])
             tried += size
-            if kept.shape[0] < 1e-4 * tried - 10:
+            if accepted.shape[0] < 1e-4 * tried - 10:
                 raise InputError(f"priors: hardly any draw has {self._stated()}")
-        return kept[:size]
+        return accepted[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
         """Map free parameters (models, free), inside their bounds, to coordinates."""
@@ -260,9 +260,9 @@ class JointPrior:
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
         # A parameter is a row here, so that what is done with one is done with neighbours.
-        given = np.ascontiguousarray(coordinates.T)
-        safe = np.clip(given, -FARTHEST, FARTHEST)
-        free, possible = np.empty_like(safe), np.equal(safe, given).all(axis=0)
+        unclipped = np.ascontiguousarray(coordinates.T)
+        safe = np.clip(unclipped, -FARTHEST, FARTHEST)
+        free, possible = np.empty_like(safe), np.equal(safe, unclipped).all(axis=0)
         self._plain.fill(free, safe)
         values = self._values(None, rows=coordinates.shape[0])
         values.update(zip(self.free_names, free, strict=True))
@@ -298,13 +298,13 @@ class JointPrior:
         floors = np.array([parameter.floor for parameter in self.free])
         reached = [p.declared is None or p.declared.reaches_floor for p in self.free]
         nothing = np.full(len(self.free), -np.inf)
-        above, least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
-        return above[:, np.newaxis], least[:, np.newaxis]
+        above, at_least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
+        return above[:, np.newaxis], at_least[:, np.newaxis]
 
     def _above_floors(self, free: FloatArray) -> BoolArray:
         """Tell which models (models,) of free parameters (free, models) are on or above floors."""
-        above, least = self._floors
-        inside: BoolArray = ((free > above) & (free >= least)).all(axis=0)
+        above, at_least = self._floors
+        inside: BoolArray = ((free > above) & (free >= at_least)).all(axis=0)
         return inside
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
@@ -319,12 +319,12 @@ class JointPrior:
         low, high = parameter.support
         if parameter.declared is None or parameter.declared.bounds is None:
             return np.asarray(low), np.asarray(high)
-        known = {name: values[name] for name in self._known[parameter.name]}
-        least, most = self._between(parameter, known)
+        earlier = {name: values[name] for name in self._known[parameter.name]}
+        lower, upper = self._between(parameter, earlier)
         # Bounds that cut nothing stay numbers: the map is then the prior's own.
         return (
-            np.asarray(low) if least.ndim == 0 and least <= low else np.maximum(low, least),
-            np.asarray(high) if most.ndim == 0 and most >= high else np.minimum(high, most),
+            np.asarray(low) if lower.ndim == 0 and lower <= low else np.maximum(low, lower),
+            np.asarray(high) if upper.ndim == 0 and upper >= high else np.minimum(high, upper),
         )
 
     def seen(self, values: Values, record: str) -> Values:
@@ -335,8 +335,8 @@ class JointPrior:
         """
         if not record:
             return values
-        mine = {plain: values[name] for plain, name in self._own[record] if name in values}
-        return {**values, **mine}
+        specific = {plain: values[name] for plain, name in self._own[record] if name in values}
+        return {**values, **specific}
 
     def _views(self, parameter: Parameter) -> tuple[str, ...]:
         """Return the records whose values a parameter's bounds depend on; empty for any."""
@@ -348,10 +348,10 @@ class JointPrior:
         """Return the bounds (models,) that other values set; of several records, the tightest."""
         if parameter.declared is None or parameter.declared.bounds is None:
             return np.asarray(-np.inf), np.asarray(np.inf)
-        every = [parameter.limits(self.seen(values, one)) for one in self._views(parameter)]
-        low, high = every[0]
-        for least, most in every[1:]:
-            low, high = np.maximum(low, least), np.minimum(high, most)
+        limits = [parameter.limits(self.seen(values, record)) for record in self._views(parameter)]
+        low, high = limits[0]
+        for lower, upper in limits[1:]:
+            low, high = np.maximum(low, lower), np.minimum(high, upper)
         return low, high
 
     def _possible(self, values: Values) -> BoolArray:

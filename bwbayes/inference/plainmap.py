@@ -34,12 +34,16 @@ class PlainMap:
     @classmethod
     def of(cls, formulas: Mapping[int, Scored | None]) -> PlainMap:
         """Take the parameters, by their places, that have a formula."""
-        known = {row: one for row, one in formulas.items() if one is not None}
+        forms = {row: form for row, form in formulas.items() if form is not None}
         kinds = (
-            [(row, one.centre, one.scale) for row, one in known.items() if one.logarithmic == kind]
+            [
+                (row, form.centre, form.scale)
+                for row, form in forms.items()
+                if form.logarithmic == kind
+            ]
             for kind in (False, True)
         )
-        return cls(frozenset(known), *(_columns(kind) for kind in kinds))
+        return cls(frozenset(forms), *(_columns(kind) for kind in kinds))
 
     def fill(self, free: FloatArray, scores: FloatArray) -> None:
         """Write the values of their scores, both (free, models)."""

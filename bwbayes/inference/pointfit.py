@@ -83,17 +83,17 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     # A place that least squares allows may still have no density: the noise is another one there.
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
-    climbed = [place for place, is_so in zip(places, possible, strict=True) if is_so]
+    climbed = [position for position, is_so in zip(places, possible, strict=True) if is_so]
     modes: list[_Mode] = []
-    for place in climbed or [likeliest]:
-        mode = _mode(posterior, place, spread, modes)
+    for position in climbed or [likeliest]:
+        mode = _mode(posterior, position, spread, modes)
         if mode is not None:
             modes.append(mode)
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
-    worth = [m.place for m in modes if m.log_density > best.log_density - HOPELESS]
+    worth = [m.position for m in modes if m.log_density > best.log_density - HOPELESS]
     optima = _distinct(worth, best.covariance)
-    return PointFit(best.place, best.covariance, best.log_density, optima, spread)
+    return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 
 
 def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +104,7 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     if len(point.optima) == 1:
         return point.covariance[np.newaxis], np.ones(1)
     # Climbed to once more: a chain's file keeps the covariance of the best alone.
-    climbs = (_mode(posterior, place, point.prior_covariance) for place in point.optima)
+    climbs = (_mode(posterior, position, point.prior_covariance) for position in point.optima)
     modes = [mode for mode in climbs if mode is not None]
     covariances = np.stack([mode.covariance for mode in modes])
     log_evidence = np.array([mode.log_density for mode in modes])
@@ -120,18 +120,18 @@ def approximated(
     Returns (modes count, free), as many at every optimum, and (count, free), by their shares.
     """
     covariances, shares = peaks(posterior, point)
-    each = np.stack(
+    candidates = np.stack(
         [
-            generator.multivariate_normal(place, covariance, size=count)
-            for place, covariance in zip(point.optima, covariances, strict=True)
+            generator.multivariate_normal(position, covariance, size=count)
+            for position, covariance in zip(point.optima, covariances, strict=True)
         ]
     )
     which = generator.choice(len(shares), size=count, p=shares)
-    return np.concatenate(each), each[which, np.arange(count)]
+    return np.concatenate(candidates), candidates[which, np.arange(count)]
 
 
 def _with_noise(
-    posterior: Posterior, place: FloatArray, noise: FloatArray, generator: np.random.Generator
+    posterior: Posterior, position: FloatArray, noise: FloatArray, generator: np.random.Generator
 ) -> FloatArray:
     """Give a place (free,) the most probable noise parameters, from prior draws (draws, noise).
 
@@ -139,8 +139,8 @@ def _with_noise(
     noise: so draws around the best few are tried, closer and closer.
     """
     size = noise.shape[1]
-    physical = np.tile(place[: place.size - size], (len(noise), 1))
-    best = np.empty((0, place.size))
+    physical = np.tile(position[: position.size - size], (len(noise), 1))
+    best = np.empty((0, position.size))
     density = np.empty(0)
     for _ in range(ROUNDS):
         best = np.concatenate([best, np.hstack([physical, noise])])
@@ -149,26 +149,26 @@ def _with_noise(
         best, density = best[order], density[order]
         if not size:
             break
-        few = best[:, -size:]
-        chosen = few[generator.integers(BEST, size=len(noise))]
-        noise = chosen + np.std(few, axis=0) * generator.standard_normal(noise.shape)
-    most: FloatArray = best[0]
-    return most
+        top = best[:, -size:]
+        chosen = top[generator.integers(BEST, size=len(noise))]
+        noise = chosen + np.std(top, axis=0) * generator.standard_normal(noise.shape)
+    winner: FloatArray = best[0]
+    return winner
 
 
 def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:
     """Keep one place for each distinct optimum of least squares, the best first."""
     costs = least_squares.costs(np.stack(places))
-    kept: list[int] = []
+    distinct: list[int] = []
     for i in np.argsort(costs, kind="stable").tolist():
-        apart = [
+        separate = [
             np.max(np.abs(places[i] - places[j]) / least_squares.spread) > SAME
             or costs[i] > (1 + SAME) * costs[j]
-            for j in kept
+            for j in distinct
         ]
-        if all(apart):
-            kept.append(i)
-    return [places[i] for i in kept]
+        if all(separate):
+            distinct.append(i)
+    return [places[i] for i in distinct]
 
 
 class _LeastSquares:
@@ -185,14 +185,14 @@ class _LeastSquares:
     ) -> None:
         self.posterior, self.centre, self.spread, self.steps = posterior, centre, spread, steps
         self.physical = np.array([n in posterior.table.physical for n in posterior.names])
-        most = RESIDUALS // len(posterior.datasets)
-        every = [one.readings.rows for one in posterior.datasets]
-        self.rows = [rows[:: max(rows.size // most, 1)] for rows in every]
+        stride = RESIDUALS // len(posterior.datasets)
+        training = [dataset.readings.rows for dataset in posterior.datasets]
+        self.rows = [rows[:: max(rows.size // stride, 1)] for rows in training]
         total = sum(rows.size for rows in self.rows)
         self.size = total + np.count_nonzero(self.physical)
         self.targets, self.scales = [], []
-        for one, rows in zip(posterior.datasets, self.rows, strict=True):
-            self.targets.append(one.displacement[rows])
+        for dataset, rows in zip(posterior.datasets, self.rows, strict=True):
+            self.targets.append(dataset.displacement[rows])
             # A hundredth of the range is about what a Bouc-Wen model misses.
             self.scales.append(0.01 * float(np.ptp(self.targets[-1])) * np.sqrt(total))
 
@@ -208,8 +208,8 @@ class _LeastSquares:
         theta = self.posterior.prior.theta(free)
         pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
         missed = [
-            (self.posterior.simulate(theta, rows, one.name) - target) / scale
-            for one, rows, target, scale in zip(
+            (self.posterior.simulate(theta, rows, dataset.name) - target) / scale
+            for dataset, rows, target, scale in zip(
                 self.posterior.datasets, self.rows, self.targets, self.scales, strict=True
             )
         ]
@@ -226,7 +226,7 @@ class _LeastSquares:
         if not self.physical.any():
             return self.centre
 
-        def place(values: FloatArray) -> FloatArray:
+        def full(values: FloatArray) -> FloatArray:
             everywhere = np.tile(self.centre, (np.atleast_2d(values).shape[0], 1))
             everywhere[:, self.physical] = values
             return everywhere
@@ -237,7 +237,7 @@ class _LeastSquares:
 
         def residuals(values: FloatArray) -> FloatArray:
             # With what the slopes need, in one call: they are asked for at most of these places.
-            here, plus, minus = np.split(self.residuals(place(values + star)), [1, 1 + steps.size])
+            here, plus, minus = np.split(self.residuals(full(values + star)), [1, 1 + steps.size])
             last[:] = here[0], values.copy(), _slopes(here, plus, minus, steps[:, np.newaxis]).T
             return last[0]
 
@@ -253,77 +253,76 @@ class _LeastSquares:
             x_scale=self.spread[self.physical],
             max_nfev=60,
         )
-        optimum: FloatArray = place(solution.x)[0]
-        return optimum
+        return np.asarray(full(solution.x)[0])
 
 
 def _slopes(here: FloatArray, plus: FloatArray, minus: FloatArray, steps: FloatArray) -> FloatArray:
     """Slopes (parameters, residuals) from a step either way, or from one if the other has none."""
     sides = np.stack([plus - minus, plus - here, here - minus])
     sides /= np.stack([2 * steps, steps, steps])
-    known = np.isfinite(sides[:, :, :1])
-    first = np.argmax(known, axis=0)[np.newaxis]
+    finite = np.isfinite(sides[:, :, :1])
+    first = np.argmax(finite, axis=0)[np.newaxis]
     slopes: FloatArray = np.take_along_axis(sides, first, axis=0)[0]
-    return np.where(known.any(axis=0), slopes, 0.0)
+    return np.where(finite.any(axis=0), slopes, 0.0)
 
 
 @dataclass(frozen=True)
 class _Mode:
-    place: FloatArray
+    position: FloatArray
     covariance: FloatArray
     log_density: float
 
 
 def _mode(
-    posterior: Posterior, start: FloatArray, spread: FloatArray, known: Sequence[_Mode] = ()
+    posterior: Posterior, start: FloatArray, spread: FloatArray, modes: Sequence[_Mode] = ()
 ) -> _Mode | None:
     """Climb from a start (free,) to the mode it leads to, by Newton steps within a trust region.
 
     None as soon as it is seen to lead to one that is known.
     """
     surface = _Surface(posterior, start, _units(posterior, start, np.sqrt(np.diag(spread))))
-    place, curvature = start, None
+    position, curvature = start, None
     for _ in range(4):
-        if any(_leads_to(posterior, place, mode) for mode in known):
+        if any(_leads_to(posterior, position, mode) for mode in modes):
             return None
         # Each round measures in the units of the last curvature: finite differences need them.
         solution = optimize.minimize(
             surface.value,
-            surface.inwards(place),
+            surface.inwards(position),
             jac=surface.gradient,
             hess=surface.hessian,
             method="trust-exact",
             options={"gtol": 1e-2, "maxiter": 60},
         )
-        place = surface.outwards(solution.x)
+        position = surface.outwards(solution.x)
         curvature = surface.hessian(solution.x)
         settled = solution.success and np.allclose(np.diag(curvature), 1, atol=0.2)
-        surface = surface.rescaled(place, curvature)
+        surface = surface.rescaled(position, curvature)
         if settled:
             break
     return _Mode(
-        place, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(place)))
+        position, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(position)))
     )
 
 
-def _leads_to(posterior: Posterior, place: FloatArray, mode: _Mode) -> bool:
+def _leads_to(posterior: Posterior, position: FloatArray, mode: _Mode) -> bool:
     """Tell whether the density rises, but for a dip, all the way from a place (free,) to a mode."""
-    way = np.linspace(0.0, 1.0, WAY)[:, np.newaxis]
-    density = posterior.log_density(place + way * (mode.place - place))
+    path = np.linspace(0.0, 1.0, WAY)[:, np.newaxis]
+    density = posterior.log_density(position + path * (mode.position - position))
     return bool(np.all(density > np.maximum.accumulate(density) - DIP))
 
 
-def _units(posterior: Posterior, place: FloatArray, spread: FloatArray) -> FloatArray:
+def _units(posterior: Posterior, position: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the step (free,) of each coordinate that costs about a nat, ``spread`` at most.
 
     The mean cost of a step either way: a slope at the place does not count.
     """
     parts = 10.0 ** np.arange(0, -5, -0.5)
     steps = parts[:, np.newaxis, np.newaxis] * np.diag(spread)
-    both = np.concatenate([place + steps, place - steps]).reshape(-1, place.size)
-    forth, back = posterior.log_density(both).reshape(2, parts.size, place.size)
+    sides = np.concatenate([position + steps, position - steps]).reshape(-1, position.size)
+    forth, back = posterior.log_density(sides).reshape(2, parts.size, position.size)
     with np.errstate(invalid="ignore"):  # a density of zero here and there has no cost
-        cost = posterior.log_density(place[np.newaxis]) - (forth + back) / 2
+        cost = posterior.log_density(position[np.newaxis]) - (forth + back) / 2
     cheap = cost < 1
     cheap[-1] = True
     units: FloatArray = spread * parts[np.argmax(cheap, axis=0)]
@@ -339,22 +338,22 @@ class _Surface:
         self.posterior, self.centre = posterior, centre
         self.axes = np.diag(axes) if axes.ndim == 1 else axes
         size = centre.size
-        one = self.STEP * np.eye(size)
+        steps = self.STEP * np.eye(size)
         pairs = [(i, j) for i in range(size) for j in range(i)]
         self._pairs = tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
-        two = one[self._pairs[0]], one[self._pairs[1]]
-        self._star = np.concatenate([np.zeros((1, size)), one, -one])
-        self._cross = np.concatenate([two[0] + two[1], -two[0] - two[1]])
+        sides = steps[self._pairs[0]], steps[self._pairs[1]]
+        self._star = np.concatenate([np.zeros((1, size)), steps, -steps])
+        self._cross = np.concatenate([sides[0] + sides[1], -sides[0] - sides[1]])
 
     def outwards(self, w: FloatArray) -> FloatArray:
-        place: FloatArray = self.centre + w @ self.axes.T
-        return place
+        position: FloatArray = self.centre + w @ self.axes.T
+        return position
 
-    def inwards(self, place: FloatArray) -> FloatArray:
+    def inwards(self, position: FloatArray) -> FloatArray:
         with warnings.catch_warnings():
             # Axes of very different lengths are as they should be.
             warnings.simplefilter("ignore", linalg.LinAlgWarning)
-            w: FloatArray = linalg.solve(self.axes, place - self.centre)
+            w: FloatArray = linalg.solve(self.axes, position - self.centre)
         return w
 
     def values(self, w: FloatArray) -> FloatArray:
@@ -392,9 +391,9 @@ def _distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
         # A discrepancy of which a record shows nothing is far less sure than a gain.
         warnings.simplefilter("ignore", linalg.LinAlgWarning)
         inverse = linalg.inv(covariance)
-    kept: list[FloatArray] = []
-    for place in places:
-        apart = [(place - other) @ inverse @ (place - other) for other in kept]
-        if all(distance > place.size for distance in apart):
-            kept.append(place)
-    return np.stack(kept)
+    distinct: list[FloatArray] = []
+    for position in places:
+        distances = [(position - other) @ inverse @ (position - other) for other in distinct]
+        if all(distance > position.size for distance in distances):
+            distinct.append(position)
+    return np.stack(distinct)

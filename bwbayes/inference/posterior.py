@@ -155,7 +155,7 @@ class Posterior:
     @cached_property
     def table(self) -> JointTable:
         """The parameters in the order of θ's columns."""
-        names = tuple(one.name for one in self.datasets)
+        names = tuple(dataset.name for dataset in self.datasets)
         return self.joint or JointTable(self.datasets[0].table, names)
 
     @property
@@ -168,7 +168,7 @@ class Posterior:
             There are several.
         """
         if len(self.datasets) > 1:
-            names = ", ".join(one.name for one in self.datasets)
+            names = ", ".join(dataset.name for dataset in self.datasets)
             raise InputError(f"record: several were fitted ({names}), and this is for a fit of one")
         return self.datasets[0]
 
@@ -192,14 +192,14 @@ class Posterior:
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters): the sum over the records."""
         total = np.zeros(len(theta))
-        for one, likelihood in zip(self.datasets, self.likelihoods, strict=True):
-            total += likelihood.log_density(self.table.of(theta, one.name))
+        for dataset, likelihood in zip(self.datasets, self.likelihoods, strict=True):
+            total += likelihood.log_density(self.table.of(theta, dataset.name))
         return total
 
     @cached_property
     def likelihoods(self) -> tuple[Likelihood, ...]:
         """The likelihood of each record."""
-        return tuple(one.likelihood(self.engine) for one in self.datasets)
+        return tuple(dataset.likelihood(self.engine) for dataset in self.datasets)
 
     @property
     def likelihood(self) -> Likelihood:
@@ -225,26 +225,15 @@ class Posterior:
         Each is (some models, rows), in the order of θ.
         """
         number = 0 if record is None else self.table.records.index(record)
-        one = self.only if record is None else self.datasets[number]
-        likelihood, theta = self.likelihoods[number], self.table.of(theta, one.name)
-        model = one.table.actuator(theta)
+        dataset = self.only if record is None else self.datasets[number]
+        likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
+        model = dataset.table.actuator(theta)
         unrest = likelihood.start(theta).mean if likelihood.unknown else None
-        voltage = one.voltage[: one.training[-1].stop]
+        voltage = dataset.voltage[: dataset.training[-1].stop]
 
-        def simulated(part: slice) -> FloatArray:
-            actuator, rest = likelihood.actuator, one.from_rest
-            moving = None if unrest is None else unrest[part]
-            if self.engine == "numba":
-                # Here, because it is slow to load.
-                from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
-
-                begun = walk(actuator, model[part], voltage, moving, from_rest=rest)
-                if begun is not None:
-                    return begun.to(voltage.size)
-            return actuator.advance(model[part], voltage, None, moving, from_rest=rest)[0]
-
-        for part in batches(len(theta), voltage.size):
-            yield simulated(part)[:, rows]
+        for batch in batches(len(theta), voltage.size):
+            moving = None if unrest is None else unrest[batch]
+            yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""
@@ -252,17 +241,19 @@ class Posterior:
 
     def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
         """Return the posterior of other training windows of the same records, by name."""
-        datasets = (replace(one, training=windows[one.name]) for one in self.datasets)
+        datasets = (replace(dataset, training=windows[dataset.name]) for dataset in self.datasets)
         return replace(self, datasets=tuple(datasets))
 
     def with_readings(self, displacements: Mapping[str, FloatArray]) -> Posterior:
         """Return the posterior of other readings (samples,) of the same records, by name."""
-        datasets = (replace(one, displacement=displacements[one.name]) for one in self.datasets)
+        datasets = (
+            replace(dataset, displacement=displacements[dataset.name]) for dataset in self.datasets
+        )
         return replace(self, datasets=tuple(datasets))
 
     def without(self, rows: Mapping[str, IntArray]) -> Posterior:
         """Return the posterior without the readings of some samples of its records, by name."""
-        displacements = {one.name: one.displacement.copy() for one in self.datasets}
+        displacements = {dataset.name: dataset.displacement.copy() for dataset in self.datasets}
         for name, left_out in rows.items():
             displacements[name][left_out] = np.nan
         return self.with_readings(displacements)
@@ -272,15 +263,15 @@ class Posterior:
         """The posterior of each record alone."""
         if len(self.datasets) == 1:
             return {self.only.name: self}
-        every = {}
-        for one in self.datasets:
-            places = self.table.places(one.name)
-            parameters = (self.prior.parameters[place] for place in places.tolist())
+        posteriors = {}
+        for dataset in self.datasets:
+            places = self.table.places(dataset.name)
+            parameters = (self.prior.parameters[column] for column in places.tolist())
             prior = JointPrior(
                 (replace(p, name=p.plain, record="") for p in parameters), self.prior.constraint
             )
-            every[one.name] = Posterior((one,), prior, self.engine)
-        return every
+            posteriors[dataset.name] = Posterior((dataset,), prior, self.engine)
+        return posteriors
 
     def alone(self, record: str) -> Posterior:
         """Return the posterior of one record alone, its parameters by their plain names."""
@@ -290,10 +281,10 @@ class Posterior:
         """Return the columns of draws (draws, free) that are free parameters of a record alone."""
         names = (self.table.name_of(name, record) for name in self.alone(record).names)
         columns = [self.names.index(name) for name in names]
-        part: FloatArray = draws[..., columns]
-        return part
+        columns_of: FloatArray = draws[..., columns]
+        return columns_of
 
     def each(self, draws: FloatArray) -> Iterator[Alone]:
         """Yield the records one by one, with their parameters of draws (draws, free)."""
-        for one in self.datasets:
-            yield Alone(one.name, self.alone(one.name), self.its(draws, one.name))
+        for dataset in self.datasets:
+            yield Alone(dataset.name, self.alone(dataset.name), self.its(draws, dataset.name))

@@ -110,15 +110,16 @@ class JointTable:
     shared: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for key, given in (("per_record", self.per_record), ("shared", self.shared)):
-            for name in given:
+        for key, names in (("per_record", self.per_record), ("shared", self.shared)):
+            for name in names:
                 if name not in self.table.names:
                     hint = suggestion(name, self.table.names)
                     raise InputError(f"model.{key}: no part here has {name!r}; {hint}")
-        both = [name for name in self.per_record if name in self.shared]
-        if both:
+        repeated = [name for name in self.per_record if name in self.shared]
+        if repeated:
             raise InputError(
-                f"model.per_record: {both[0]!r} is in model.shared too; remove it from one of them"
+                f"model.per_record: {repeated[0]!r} is in model.shared too; "
+                "remove it from one of them"
             )
 
     @cached_property
@@ -152,8 +153,8 @@ class JointTable:
     @property
     def physical(self) -> tuple[str, ...]:
         """Names of the parameters that are the actuator's parts', not the noise's."""
-        mine = self.table.actuator_part.parameters
-        return tuple(column.name for column in self.layout if column.declaration.name in mine)
+        names = self.table.actuator_part.parameters
+        return tuple(column.name for column in self.layout if column.declaration.name in names)
 
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return the columns (models,) of θ (models, parameters) by name."""
@@ -164,12 +165,12 @@ class JointTable:
         """Of each record, where its own θ's columns are in the joint one."""
         places = {}
         for record in self.records:
-            mine = {
-                column.declaration.name: place
-                for place, column in enumerate(self.layout)
+            columns = {
+                column.declaration.name: index
+                for index, column in enumerate(self.layout)
                 if column.record in ("", record)
             }
-            places[record] = np.array([mine[name] for name in self.table.names])
+            places[record] = np.array([columns[name] for name in self.table.names])
         return places
 
     def places(self, record: str) -> IntArray:
@@ -178,8 +179,8 @@ class JointTable:
 
     def of(self, theta: FloatArray, record: str) -> FloatArray:
         """Return θ of one record (models, its parameters) from the joint one."""
-        mine: FloatArray = theta[:, self._places[record]]
-        return mine
+        columns: FloatArray = theta[:, self._places[record]]
+        return columns
 
     def name_of(self, name: str, record: str) -> str:
         """Return the name of the column that is a record's parameter ``name``."""

@@ -22,8 +22,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.creep import Creep
-from bwbayes.model.declaration import Context, Declaration, Values, normal
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.filters import Filter
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold, Sections
@@ -35,12 +34,14 @@ from bwbayes.shown import brief
 __all__ = ["Actuator", "State"]
 
 
-def _offset(known: Context) -> Distribution:
-    return normal(known.ranges.middle, known.ranges.reach)
-
-
 OFFSET = Declaration(
-    "offset", "um", r"y_0", "sensor offset", _offset, scope="record", aliases=("y0",)
+    "offset",
+    "um",
+    r"y_0",
+    "sensor offset",
+    lambda context: normal(context.ranges.middle, context.ranges.reach),
+    scope="record",
+    aliases=("y0",),
 )
 
 
@@ -103,8 +104,8 @@ class Actuator:
     def __post_init__(self) -> None:
         made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
         if self.hold not in get_args(Hold):
-            known = ", ".join(get_args(Hold))
-            raise InputError(f"hold: {self.hold!r} is unknown; write one of {known}")
+            choices = ", ".join(get_args(Hold))
+            raise InputError(f"hold: {self.hold!r} is unknown; write one of {choices}")
         if not 0 < self.interval < math.inf:
             raise InputError(f"interval: {self.interval:.6g}; must be positive and finite, in s")
 
@@ -187,18 +188,21 @@ class Actuator:
         if state is None:
             memory = self.begin(column, path, from_rest=from_rest)
             drives, hysteresis = self._drives(column, path, memory)
-            rest = tuple(drive[:, 0].copy() for drive in drives)
+            equilibrium = tuple(drive[:, 0].copy() for drive in drives)
             filtered = sections.begin(unrest)
         else:
             drives, hysteresis = self._drives(column, path, state.hysteresis)
-            rest, filtered = state.rest, tuple(one.copy() for one in state.filter)
+            equilibrium, filtered = (
+                state.rest,
+                tuple(filter_state.copy() for filter_state in state.filter),
+            )
         # The recursions see the drives' distance from rest, so that they start at zero exactly.
-        for drive, before in zip(drives, rest, strict=True):
+        for drive, before in zip(drives, equilibrium, strict=True):
             np.subtract(drive, before[:, np.newaxis], out=drive)
         result = sections.run(drives, filtered)
-        level = sum(gain * before for gain, before in zip(sections.gains, rest, strict=True))
+        level = sum(gain * before for gain, before in zip(sections.gains, equilibrium, strict=True))
         result += (level + column["offset"])[:, np.newaxis]
-        return result, State(hysteresis, rest, filtered)
+        return result, State(hysteresis, equilibrium, filtered)
 
     def hysteretic(self, theta: FloatArray, voltage: FloatArray, *, from_rest: bool) -> FloatArray:
         """Return what the operator makes of a record's voltage, (models, samples), um."""

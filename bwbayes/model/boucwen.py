@@ -18,20 +18,11 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.exponent import ExponentFlow
+from bwbayes.model.relaxing import RelaxingStep
 
 __all__ = ["ceiling", "hysteresis"]
-
-# Elements (models x samples) that one array expression handles: small enough for the cache.
-PIECE = 65_536
-
-# Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
-TINY = 1e-100
-
-# With γ > β, h = α / (β − γ) is a state of unstable rest, and for β = 0 it is the ceiling itself.
-# A start that rounding puts on it or beyond is taken to lie this fraction of the way there.
-INSIDE = 1 - 1e-14
 
 # A state carried over from an earlier piece may exceed the ceiling by its rounding.
 CEILING_SLACK = 1 + 1e-9
@@ -122,9 +113,9 @@ def hysteresis(
     linear = models["exponent"] == 1.0
     for rows, flow_of in ((linear, _LinearFlow), (~linear, ExponentFlow)):
         if rows.any():
-            part = {name: values[rows] for name, values in models.items()}
-            start = part.pop("initial")
-            result[rows] = _follow(path, flow_of(**part), start)
+            columns = {name: values[rows] for name, values in models.items()}
+            start = columns.pop("initial")
+            result[rows] = _follow(path, flow_of(**columns), start)
     return result
 
 
@@ -147,42 +138,10 @@ class _LinearFlow:
         self, alpha: FloatArray, beta: FloatArray, gamma: FloatArray, exponent: FloatArray
     ) -> None:
         assert (exponent == 1.0).all()
-        self.alpha = alpha
-        self.ahead = _away_from_zero(beta + gamma)
-        self.against = _away_from_zero(beta - gamma)
-        self.lowest = np.where(self.against < 0, INSIDE * alpha / self.against, -np.inf)
+        self.step = RelaxingStep.alike(np.zeros_like(alpha), alpha, beta - gamma, beta + gamma)
 
     def advance(self, start: FloatArray, travel: FloatArray) -> FloatArray:
-        start = np.maximum(start, self.lowest)
-        crossing = np.where(
-            start < 0, np.log1p(-np.minimum(start, 0) * self.against / self.alpha) / self.against, 0
-        )[:, np.newaxis]
-        # A start below zero relaxes with one rate up to zero, and from there with the other. Models
-        # alike cross close together: only in between must both be known.
-        above = np.maximum(start, 0)
-        ends = np.min(crossing), np.max(crossing)
-        early, late = np.searchsorted(travel, ends, side="right").tolist()
-        before, between, after = np.split(travel, [early, late])
-        g = np.empty((start.size, travel.size))
-        g[:, :early] = self._relax(start, self.against, before)
-        g[:, early:late] = np.where(
-            between < crossing,
-            self._relax(start, self.against, np.minimum(between, crossing)),
-            self._relax(above, self.ahead, np.maximum(between - crossing, 0)),
-        )
-        g[:, late:] = self._relax(above, self.ahead, after - crossing)
-        return g
-
-    def _relax(self, start: FloatArray, rate: FloatArray, travel: FloatArray) -> FloatArray:
-        gone = -rate[:, np.newaxis] * travel
-        np.expm1(gone, out=gone)
-        gone *= (start - self.alpha / rate)[:, np.newaxis]
-        gone += start[:, np.newaxis]
-        return gone
-
-
-def _away_from_zero(rate: FloatArray) -> FloatArray:
-    return np.where(np.abs(rate) < TINY, TINY, rate)
+        return -self.step.along(0.0, start, travel)[0]
 
 
 def _models(arguments: dict[str, ArrayLike]) -> dict[str, FloatArray]:

@@ -22,15 +22,17 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Context, Declaration, Values
+from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag
 from bwbayes.model.operator import UNIT, Span
 
 __all__ = ["MOST_TIMES", "Creep", "creep_times"]
 
-# Prior scale of the creep per decade of time, as a part of the displacement.
-PER_DECADE = 0.02
+# Prior mean and sd of the creep per decade of time, as a part of the displacement: published are
+# 0.5 to 3 %. A normal prior, of which one in twenty-five is below zero: strengths are linear in the
+# displacement, and so their posterior is nearly normal too, which a sampler knows how to take.
+PER_DECADE, PER_DECADE_SD = 0.0175, 0.01
 
 # Prior scale of how much more the creep is at the largest voltage, as a part of it.
 GROWTH = 1.0
@@ -70,7 +72,7 @@ class Creep:
     reference: Span = UNIT
 
     def __post_init__(self) -> None:
-        rising = all(one < other for one, other in pairwise((0.0, *self.times)))
+        rising = all(earlier < later for earlier, later in pairwise((0.0, *self.times)))
         if not rising or not 0 < len(self.times) <= MOST_TIMES or not math.isfinite(self.times[-1]):
             raise InputError(
                 f"creep: {list(self.times)} are not valid times; give up to {MOST_TIMES} positive "
@@ -91,8 +93,7 @@ class Creep:
                 "-",
                 rf"c_{number}",
                 f"creep with a time of {time:g} s, as a part of the drive",
-                self._strength,
-                floor=0.0,
+                lambda _: self.strength,
             )
             for number, (name, time) in enumerate(zip(self.names, self.times, strict=True), 1)
         )
@@ -108,18 +109,19 @@ class Creep:
         )
         return (*strengths, growth)
 
-    def _strength(self, known: Context) -> Distribution:
-        del known
+    @property
+    def strength(self) -> Distribution:
+        """The default prior of each strength, by how many decades of time a lag stands for."""
         decades = 1.0
         if len(self.times) > 1:
             decades = math.log10(self.times[-1] / self.times[0]) / (len(self.times) - 1)
-        return Distribution("halfnormal", {"scale": round(PER_DECADE * decades, 4)})
+        return normal(PER_DECADE * decades, PER_DECADE_SD * decades)
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is negative or not finite."""
         for declared in self.parameters:
             values = column[declared.name]
-            allowed = np.isfinite(values) & (values >= 0)
+            allowed = np.isfinite(values) & (values >= declared.floor)
             if not allowed.all():
                 row = int(np.argmin(allowed))
                 raise InputError(

@@ -61,8 +61,8 @@ class Distribution:
             if not np.isfinite(value):
                 raise InputError(f"{self.name}: {key} is {value}; give a finite number")
         with np.errstate(invalid="ignore"):
-            middle = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
-        if not np.isfinite(middle).all() or not middle[0] < middle[2]:
+            quantiles = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
+        if not np.isfinite(quantiles).all() or not quantiles[0] < quantiles[2]:
             raise InputError(f"{self}: no proper distribution; check its arguments")
 
     def __str__(self) -> str:
@@ -88,16 +88,17 @@ class Distribution:
 
         The inverse of :meth:`to_normal`; where the bounds leave nothing, x is the lower one.
         """
-        if self._is_support(lower, upper):
+        scalar = np.ndim(lower) == np.ndim(upper) == 0
+        if scalar and self.support == (float(lower), float(upper)):  # the bounds cut nothing
             return self._uncut(z), np.ones_like(z)
         if isinstance(self.form, Scored):
             return self._cut_score(self.form, z, lower, upper)
-        whole = np.maximum(self._between(lower, upper), 0.0)
-        below = self.form.cdf(lower) + ndtr(z) * whole
-        above = self.form.sf(upper) + ndtr(-z) * whole
+        mass = np.maximum(self._between(lower, upper), 0.0)
+        below = self.form.cdf(lower) + ndtr(z) * mass
+        above = self.form.sf(upper) + ndtr(-z) * mass
         # The smaller probability is the one that keeps its precision.
         x = np.where(below < above, self.form.ppf(below), self.form.isf(above))
-        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
+        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
 
     @staticmethod
     def _cut_score(
@@ -106,12 +107,12 @@ class Distribution:
         """Do the same for what a formula maps to a standard normal, whose tails are alike."""
         low, high = form.score(lower), form.score(upper)
         start, end = ndtr(low), ndtr(-high)
-        whole = np.where(start < 0.5, ndtr(high) - start, ndtr(-low) - end)
-        whole = np.maximum(whole, 0.0)
-        below, above = start + ndtr(z) * whole, end + ndtr(-z) * whole
+        mass = np.where(start < 0.5, ndtr(high) - start, ndtr(-low) - end)
+        mass = np.maximum(mass, 0.0)
+        below, above = start + ndtr(z) * mass, end + ndtr(-z) * mass
         score = ndtri(np.minimum(below, above))
         x = form.value(np.where(below < above, score, -score))
-        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), whole
+        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
 
     def _between(self, low: FloatArray, high: FloatArray) -> FloatArray:
         """Probability between two values, from the tail in which they lie."""
@@ -119,11 +120,6 @@ class Distribution:
         rising = self.form.cdf(high) - start
         falling = self.form.sf(low) - self.form.sf(high)
         return np.where(start < 0.5, rising, falling)
-
-    def _is_support(self, lower: FloatArray, upper: FloatArray) -> bool:
-        """Tell whether the bounds cut nothing."""
-        alike = np.ndim(lower) == np.ndim(upper) == 0
-        return alike and self.support == (float(lower), float(upper))
 
     def _uncut(self, z: FloatArray) -> FloatArray:
         """Return the values of normal scores, without bounds."""
@@ -145,46 +141,45 @@ class Distribution:
     @cached_property
     def frozen(self) -> Any:
         """The frozen distribution of scipy."""
-        given = dict(self.arguments)
+        arguments = dict(self.arguments)
         if self.name not in FAMILIAR:
-            return self._by_scipy_name(given)
+            return self._by_scipy_name(arguments)
         required, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
-        missing = [key for key in required if key not in given]
-        unknown = [key for key in given if key not in (*required, *optional)]
+        missing = [key for key in required if key not in arguments]
+        unknown = [key for key in arguments if key not in (*required, *optional)]
         if missing or unknown:
             wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
             raise InputError(f"{self.name}: {wrong}; it takes {', '.join((*required, *optional))}")
-        lower, upper = given.get("lower", 0.0), given.get("upper", 1.0)
+        lower, upper = arguments.get("lower", 0.0), arguments.get("upper", 1.0)
         if not lower < upper:
             raise InputError(
                 f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
             )
         match self.name:
             case "normal":
-                return stats.norm(given["mean"], given["sd"])
+                return stats.norm(arguments["mean"], arguments["sd"])
             case "lognormal":
-                return stats.lognorm(given["sigma"], scale=given["median"])
+                return stats.lognorm(arguments["sigma"], scale=arguments["median"])
             case "uniform":
                 return stats.uniform(lower, upper - lower)
             case "halfnormal":
                 # The same as scipy's halfnorm, which loses its precision near zero.
-                return stats.chi(1, scale=given["scale"])
-        return stats.beta(given["a"], given["b"], loc=lower, scale=upper - lower)
+                return stats.chi(1, scale=arguments["scale"])
+        return stats.beta(arguments["a"], arguments["b"], loc=lower, scale=upper - lower)
 
-    def _by_scipy_name(self, given: dict[str, float]) -> Any:
+    def _by_scipy_name(self, arguments: dict[str, float]) -> Any:
         family = getattr(stats, self.name, None)
         if not isinstance(family, stats.rv_continuous):
-            known = [*FAMILIAR, *(n for n, f in vars(stats).items() if _is_continuous(f))]
-            near = difflib.get_close_matches(self.name, known, n=1)
-            usual = f"use one of {', '.join(FAMILIAR)}"
-            hint = f"did you mean {near[0]}? Else {usual}" if near else usual
+            names = [
+                *FAMILIAR,
+                *(n for n, f in vars(stats).items() if isinstance(f, stats.rv_continuous)),
+            ]
+            near = difflib.get_close_matches(self.name, names, n=1)
+            familiar = f"use one of {', '.join(FAMILIAR)}"
+            hint = f"did you mean {near[0]}? Else {familiar}" if near else familiar
             raise InputError(f"{self.name}: unknown distribution; {hint}")
         try:
-            return family(**given)
+            return family(**arguments)
         except TypeError:
             takes = ", ".join(filter(None, [family.shapes, "loc", "scale"]))
             raise InputError(f"{self.name}: wrong arguments; scipy's takes {takes}") from None
-
-
-def _is_continuous(candidate: object) -> bool:
-    return isinstance(candidate, stats.rv_continuous)

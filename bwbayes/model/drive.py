@@ -16,6 +16,7 @@ from scipy import ndimage
 from bwbayes.arrays import FloatArray, IntArray
 
 __all__ = [
+    "PIECE",
     "Stretch",
     "fastest",
     "monotone_stretches",
@@ -28,6 +29,9 @@ __all__ = [
 # Part of the range by which the voltage must come back for a turn to count. A sensor's noise and a
 # DAC's steps are well below it; the smallest loops of a decaying drive do not matter for a scale.
 RETURN = 0.05
+
+# Elements (models x samples) that one array expression handles: small enough for the cache.
+PIECE = 65_536
 
 
 class Stretch(NamedTuple):
@@ -64,13 +68,13 @@ def _cut(stretch: Stretch, longest: int | None) -> Iterator[Stretch]:
         yield Stretch(first, min(first + size, stretch.last), stretch.direction)
 
 
-def turning_points(voltage: FloatArray, least: float | None = None) -> IntArray:
-    """Return the samples (turns,) at which a voltage (samples,) turns by ``least`` V or more.
+def turning_points(voltage: FloatArray, threshold: float | None = None) -> IntArray:
+    """Return the samples (turns,) at which a voltage (samples,) turns by ``threshold`` V or more.
 
     By default a twentieth of the voltage's range.
     """
-    least = RETURN * float(np.ptp(voltage)) if least is None else least
-    if not least > 0:
+    threshold = RETURN * float(np.ptp(voltage)) if threshold is None else threshold
+    if not threshold > 0:
         return np.array([], dtype=np.int64)
     # Only where the voltage turns at all can it turn by that much.
     ends = [stretch.last for stretch in monotone_stretches(voltage)]
@@ -80,7 +84,7 @@ def turning_points(voltage: FloatArray, least: float | None = None) -> IntArray:
         back = direction * (voltage[furthest] - reached)
         if back <= 0:
             furthest = end
-        elif back >= least:
+        elif back >= threshold:
             turns.append(furthest)
             direction, furthest = -direction, end
     # A voltage that goes down first has turned nowhere yet.
@@ -95,11 +99,11 @@ def stretch_times(
     A window's borders cut stretches too; one without a turn is one stretch.
     """
     inside = np.concatenate([voltage[window] for window in windows])
-    least = RETURN * float(np.ptp(inside))
+    threshold = RETURN * float(np.ptp(inside))
     times = []
     for window in windows:
-        part = voltage[window]
-        edges = np.concatenate([[0], turning_points(part, least), [part.size - 1]])
+        segment = voltage[window]
+        edges = np.concatenate([[0], turning_points(segment, threshold), [segment.size - 1]])
         times.append(np.diff(edges) * interval)
     joined = np.concatenate(times)
     return joined[joined > 0]
@@ -141,4 +145,4 @@ def fastest(
     """
     lag = max(round(over / interval), 1)
     moved = [np.abs(v[lag:] - v[:-lag]) for v in (voltage[w] for w in windows) if v.size > lag]
-    return max([float(np.max(one)) for one in moved], default=0.0) / (lag * interval)
+    return max([float(np.max(movement)) for movement in moved], default=0.0) / (lag * interval)

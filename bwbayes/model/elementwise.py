@@ -1,7 +1,7 @@
 """What a formula needs that is written once, for a number and for arrays of them.
 
 With arrays NumPy works it out for all models at once; compiled with numbers it goes from model to
-model (:mod:`bwbayes.model.inverse.compiled`). Besides these it has arithmetic, and NumPy's
+model (:mod:`bwbayes.model.compiled`). Besides these it has arithmetic, and NumPy's
 functions of a number.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["anywhere", "look_up", "select"]
+__all__ = ["anywhere", "gone", "look_up", "select"]
 
 
 def anywhere(condition: Any) -> Any:
@@ -24,6 +24,11 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
     return np.where(condition, yes, no)
 
 
-def look_up(rows: Any, place: Any) -> Any:
+def gone(z: Any) -> Any:
+    """Return 1 − exp(−z), to rounding, for z ≥ −700."""
+    return -np.expm1(-z)
+
+
+def look_up(rows: Any, index: Any) -> Any:
     """Return the number at a place, a whole float, in a row, or at one in each column of rows."""
-    return np.take_along_axis(rows, place[np.newaxis].astype(np.intp), 0)[0]
+    return np.take_along_axis(rows, index[np.newaxis].astype(np.intp), 0)[0]

@@ -141,13 +141,13 @@ class ExponentFlow:
                 axis=2,
             )
         longest = max(rising.shape[2], relaxing.shape[2])
-        both = np.zeros((self._row.size, 2, 12, 1 << (longest - 1).bit_length()))
-        both[:, :, :2] = np.inf
-        both[:, 0, :, : rising.shape[2]] = rising[self._row]
+        curves = np.zeros((self._row.size, 2, 12, 1 << (longest - 1).bit_length()))
+        curves[:, :, :2] = np.inf
+        curves[:, 0, :, : rising.shape[2]] = rising[self._row]
         soft = np.flatnonzero(self._softening)
-        both[:, 1] = both[:, 0]
-        both[soft, 1, :, : relaxing.shape[2]] = relaxing[self._row[soft]]
-        return both
+        curves[:, 1] = curves[:, 0]
+        curves[soft, 1, :, : relaxing.shape[2]] = relaxing[self._row[soft]]
+        return curves
 
     def _join_at_zero(self) -> _Pieces:
         """Both sides of g = 0 on one clock, in V, that reads zero there."""
@@ -246,8 +246,8 @@ class _Fall:
 
     def duration(self, models: IntArray, height: FloatArray) -> FloatArray:
         """Voltage (V) from height z0 (rows,) down to z = 1 for these models (rows,)."""
-        whole = self.curve.time[self.row[models], -1] / self.rate[models]
-        descent: FloatArray = whole - self._clock(models, height)
+        total = self.curve.time[self.row[models], -1] / self.rate[models]
+        descent: FloatArray = total - self._clock(models, height)
         return descent
 
     def advance(self, models: IntArray, height: FloatArray, travel: FloatArray) -> FloatArray:

@@ -91,8 +91,8 @@ class MasterCurve:
         """Time at the coordinates logit (models,), kept within the nodes."""
         within = np.clip(logit, self.logit[0], self.logit[-1])
         cell = np.searchsorted(self.logit[1:-1], within, side="right")
-        left = self.logit[cell]
-        partial = _integral(left, within, self.power[row], self.exponent[row], self.sign)
+        lower = self.logit[cell]
+        partial = _integral(lower, within, self.power[row], self.exponent[row], self.sign)
         return self.time[row, cell + skip] + partial
 
 
@@ -132,11 +132,11 @@ def logit_of_log(log_y: FloatArray) -> FloatArray:
 
 
 def _integral(
-    left: FloatArray, right: FloatArray, power: FloatArray, exponent: FloatArray, sign: float
+    lower: FloatArray, upper: FloatArray, power: FloatArray, exponent: FloatArray, sign: float
 ) -> FloatArray:
-    """Time from logit `left` to `right` (arrays that broadcast with power and exponent)."""
-    width = right - left
-    w = (left + width / 2)[..., None] + width[..., None] * _NODES
+    """Time from logit `lower` to `right` (arrays that broadcast with power and exponent)."""
+    width = upper - lower
+    w = (lower + width / 2)[..., None] + width[..., None] * _NODES
     log_y = -np.logaddexp(0.0, -w)
     speed = 1.0 + (1.0 - sign) * np.exp(w)
     return np.asarray(width * ((np.exp(power[..., None] * log_y) / speed) @ _WEIGHTS) / exponent)

@@ -84,7 +84,7 @@ class Lag(Filter):
             "s",
             r"\tau_\mathrm{lag}",
             "time constant of the first-order lag",
-            lambda known: lognormal(LAG * known.ranges.time, LAG_SIGMA),
+            lambda context: lognormal(LAG * context.ranges.time, LAG_SIGMA),
             floor=0.0,
             aliases=("tau", "time_constant"),
         ),
@@ -99,12 +99,12 @@ class Lag(Filter):
         return first_order_lag(column["lag"], interval, hold)
 
 
-def _damping(known: Context) -> Distribution | None:
+def _damping(context: Context) -> Distribution | None:
     """Return the prior of the damping that gives such a lag, if the stiffness is known."""
-    stiffness = known.value("stiffness")
+    stiffness = context.value("stiffness")
     if stiffness is None:
         return None
-    return lognormal(LAG * known.ranges.time * stiffness, LAG_SIGMA)
+    return lognormal(LAG * context.ranges.time * stiffness, LAG_SIGMA)
 
 
 # A record shows at most the ratios of the three.

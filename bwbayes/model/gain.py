@@ -18,6 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.operator import UNIT, Span
+from bwbayes.model.step import Gone, HysteresisStep
 
 __all__ = ["PolynomialGain"]
 
@@ -67,13 +68,13 @@ class PolynomialGain:
         return tuple(self._declared(name) for name in TERMS if name in self.terms)
 
     def _declared(self, name: str) -> Declaration:
-        power, label, part = TERMS[name]
+        power, label, share = TERMS[name]
         return Declaration(
             name,
             "um",
             label,
             f"{name} part of the displacement at the edge of the voltage's range",
-            lambda known: normal(0.0, part * known.ranges.displacement),
+            lambda context: normal(0.0, share * context.ranges.displacement),
             loop=True,
             aliases=(f"q{power}",),
         )
@@ -106,11 +107,53 @@ class PolynomialGain:
     def powers(self, column: Values) -> FloatArray:
         """Return the coefficients (4, models) of 1, u, u² and u³, um/Vᵏ, that make up the gain."""
         models = np.broadcast(*column.values()).size
-        made = np.zeros((4, models))
+        coefficients = np.zeros((4, models))
         half = self.reference.half
         if half > 0:
             x = Polynomial([-self.reference.middle / half, 1 / half])
             for name in self.terms:
                 power = TERMS[name].power
-                made[: power + 1] += np.outer(np.asarray((x**power).coef, np.float64), column[name])
-        return made
+                coefficients[: power + 1] += np.outer(
+                    np.asarray((x**power).coef, np.float64), column[name]
+                )
+        return coefficients
+
+
+@dataclass(frozen=True)
+class DriveStep:
+    """Hysteresis and polynomial gain together, each model with a voltage of its own.
+
+    Parameters
+    ----------
+    step
+        The hysteresis.
+    gain
+        What is added to it, or None.
+    column
+        The gain's coefficients (models,), um, by name.
+    """
+
+    step: HysteresisStep
+    gain: PolynomialGain | None
+    column: Values
+
+    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+        """Return the drive, its slope and the memory once voltages (models,) have gone there."""
+        w, slope, after = self.step.go(memory, voltage)
+        if self.gain is None:
+            return Gone(w, slope, after)
+        x = self.gain.scaled(voltage)
+        for name in self.gain.terms:
+            w = w + self.column[name] * x ** TERMS[name].power
+        return Gone(w, slope + self.added_slope(voltage), after)
+
+    def added_slope(self, voltage: FloatArray) -> FloatArray:
+        """Return the gain's own slope, um/V, at voltages (models,) or (any, 1)."""
+        added = np.zeros(np.broadcast_shapes(voltage.shape, self.column["offset"].shape))
+        if self.gain is None or not self.gain.reference.half > 0:
+            return added
+        x = self.gain.scaled(voltage)
+        for name in self.gain.terms:
+            power = TERMS[name].power
+            added += self.column[name] * power * x ** (power - 1) / self.gain.reference.half
+        return added

@@ -130,20 +130,20 @@ class Sections:
     @property
     def unknowns(self) -> int:
         """How many numbers say in which state the sections are."""
-        return sum(one.unknowns for one in self.recursions)
+        return sum(recursion.unknowns for recursion in self.recursions)
 
     @property
     def remembered(self) -> FloatArray:
         """Largest part (models,) of a free response that is left after a sample, below one."""
-        return np.asarray(np.max([one.remembered for one in self.recursions], axis=0))
+        return np.asarray(np.max([recursion.remembered for recursion in self.recursions], axis=0))
 
     @property
     def taps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Numerators and denominators (models, sections, 3), and gains (models, sections)."""
         taps = np.zeros((2, self.gains[0].size, len(self.gains), 3))
-        for number, one in enumerate(self.recursions):
-            taps[0, :, number, : one.numerator.shape[1]] = one.numerator
-            taps[1, :, number, : one.denominator.shape[1]] = one.denominator
+        for number, recursion in enumerate(self.recursions):
+            taps[0, :, number, : recursion.numerator.shape[1]] = recursion.numerator
+            taps[1, :, number, : recursion.denominator.shape[1]] = recursion.denominator
         return taps[0], taps[1], np.stack(self.gains, axis=1)
 
     @property
@@ -166,20 +166,20 @@ class Sections:
     def begin(self, unrest: FloatArray | None) -> tuple[FloatArray, ...]:
         """Return the states of sections that are ``unrest`` (models, unknowns) away from rest."""
         if unrest is None or not unrest.size:
-            return tuple(one.at_rest() for one in self.recursions)
-        ends = np.cumsum([one.unknowns for one in self.recursions])[:-1]
+            return tuple(recursion.at_rest() for recursion in self.recursions)
+        ends = np.cumsum([recursion.unknowns for recursion in self.recursions])[:-1]
         parts = np.split(unrest, ends, axis=1)
         return tuple(
-            np.einsum("mu,mut->mt", part, one.free)
-            for part, one in zip(parts, self.recursions, strict=True)
+            np.einsum("mu,mut->mt", state, recursion.free)
+            for state, recursion in zip(parts, self.recursions, strict=True)
         )
 
     def run(self, drives: Sequence[FloatArray], states: Sequence[FloatArray]) -> FloatArray:
         """Filter ``drives`` (models, samples) in place from states, which move on; return x."""
         parts = zip(self.recursions, self.gains, drives, states, strict=True)
         result: FloatArray | None = None
-        for one, gain, drive, state in parts:
-            moved = one.run(drive, state)
+        for recursion, gain, drive, state in parts:
+            moved = recursion.run(drive, state)
             if np.any(gain != 1.0):
                 moved *= gain[:, np.newaxis]
             result = moved if result is None else np.add(result, moved, out=result)
@@ -189,15 +189,17 @@ class Sections:
     def free_responses(self, samples: int) -> FloatArray:
         """Displacement (models, unknowns, samples) after a unit of each, without a drive."""
         parts = zip(self.recursions, self.gains, strict=True)
-        responses = [gain[:, None, None] * one.free_responses(samples) for one, gain in parts]
+        responses = [
+            gain[:, None, None] * recursion.free_responses(samples) for recursion, gain in parts
+        ]
         return np.concatenate(responses, axis=1)
 
 
-def _multiplied(one: FloatArray, other: FloatArray) -> FloatArray:
+def _multiplied(first: FloatArray, other: FloatArray) -> FloatArray:
     """Return the products of polynomials (models, taps)."""
-    result = np.zeros((len(one), one.shape[1] + other.shape[1] - 1))
-    for place in range(other.shape[1]):
-        result[:, place : place + one.shape[1]] += one * other[:, place : place + 1]
+    result = np.zeros((len(first), first.shape[1] + other.shape[1] - 1))
+    for shift in range(other.shape[1]):
+        result[:, shift : shift + first.shape[1]] += first * other[:, shift : shift + 1]
     return result
 
 
@@ -231,8 +233,8 @@ def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
     decay = np.exp(z)
     now = -_z_phi_2(z) if hold == "first" else np.zeros_like(z)
     numerator = np.stack([now, -np.expm1(z) - now], axis=1)
-    one = np.ones_like(decay)
-    return Recursion(numerator, np.stack([one, -decay], axis=1), one[:, np.newaxis, np.newaxis])
+    unit = np.ones_like(decay)
+    return Recursion(numerator, np.stack([unit, -decay], axis=1), unit[:, np.newaxis, np.newaxis])
 
 
 def second_order(
@@ -260,9 +262,9 @@ def second_order(
     fast = -(decay + root) * interval
     # The slow pole from the product of both: their difference would cancel.
     slow = (natural * interval) ** 2 / fast
-    both, step, ramp = _divided_differences(slow, fast)
+    divided, step, ramp = _divided_differences(slow, fast)
 
-    e_slow, coupling, product = np.exp(slow), -fast * both, slow * fast
+    e_slow, coupling, product = np.exp(slow), -fast * divided, slow * fast
     if hold == "first":
         new_1, new_2 = -_z_phi_2(slow), product * ramp
     else:
@@ -278,7 +280,7 @@ def second_order(
     backward = np.stack(denominator, axis=1).real
     # The first two samples of the free responses: of a unit of displacement, and of speed.
     first = np.stack([np.ones_like(natural), np.zeros_like(natural)], axis=1)
-    second = np.stack([e_slow - slow * both, natural * interval * both], axis=1).real
+    second = np.stack([e_slow - slow * divided, natural * interval * divided], axis=1).real
     free = np.stack([first, second + backward[:, 1:2] * first], axis=2)
     return Recursion(np.stack(numerator, axis=1).real, backward, free)
 
@@ -287,13 +289,13 @@ def _divided_differences(
     slow: ComplexArray, fast: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return exp[z₁, z₂], exp[0, z₁, z₂] and exp[0, 0, z₁, z₂] for |z₁| ≤ |z₂|, Re z ≤ 0."""
-    both = np.exp(slow) * _phi_1(fast - slow)
+    difference = np.exp(slow) * _phi_1(fast - slow)
     near = np.abs(fast) < 1
-    apart = np.where(near, 1, fast)
-    step = (both - _phi_1(slow)) / apart
-    ramp = (step - _z_phi_2(slow) / np.where(slow == 0, 1, slow)) / apart
+    gap = np.where(near, 1, fast)
+    step = (difference - _phi_1(slow)) / gap
+    ramp = (step - _z_phi_2(slow) / np.where(slow == 0, 1, slow)) / gap
     series_step, series_ramp = _series(np.where(near, slow, 0), np.where(near, fast, 0))
-    return both, np.where(near, series_step, step), np.where(near, series_ramp, ramp)
+    return difference, np.where(near, series_step, step), np.where(near, series_ramp, ramp)
 
 
 def _series(slow: NDArray[Any], fast: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

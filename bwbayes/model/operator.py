@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["UNIT", "Operator", "Span", "narrower"]
 
@@ -49,7 +51,7 @@ def narrower(span: Span, further: tuple[float, ...] = FURTHER) -> tuple[Span, ..
 
     ``further`` is how far up they go, as parts of how far down.
     """
-    low, middle, half = span.low, span.middle, span.half
+    low, center, half = span.low, span.middle, span.half
     if not half > 0:
         return (span,)
     ends = [
@@ -58,7 +60,7 @@ def narrower(span: Span, further: tuple[float, ...] = FURTHER) -> tuple[Span, ..
         for up in further
     ]
     return tuple(
-        dict.fromkeys(Span(max(middle - down * half, low), middle + up * half) for down, up in ends)
+        dict.fromkeys(Span(max(center - down * half, low), center + up * half) for down, up in ends)
     )
 
 
@@ -117,6 +119,22 @@ class Operator(ABC):
     @abstractmethod
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return a typical slope dw/du (models,), um/V: the scale of an unknown start."""
+
+    def step(self, column: Values) -> HysteresisStep:  # noqa: ARG002  # it has none
+        """Return what goes from one voltage straight to the next in a bounded time.
+
+        With it the operator runs in a closed loop and as C, and many models are read backwards, and
+        the likelihood is worked out, compiled.
+
+        Raises
+        ------
+        InputError
+            The operator has none, as this one.
+        """
+        raise InputError(
+            f"hysteresis: {type(self).__name__} has no step of bounded time for a controller; take "
+            "one that has, such as bouc-wen, duhem or plays"
+        )
 
     def holds(self, column: Values) -> BoolArray | np.bool_:
         """Tell which models (models,) meet what the bounds of single parameters do not say.

@@ -58,35 +58,35 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 
 
 def choose[Part](
-    place: str, name: str, registry: Mapping[str, Callable[..., Part]]
+    where: str, name: str, registry: Mapping[str, Callable[..., Part]]
 ) -> Callable[..., Part]:
     """Return what makes the part of that name, or of that import path ``module:Class``.
 
     Raises
     ------
     InputError
-        No part has that name, or nothing can be imported from that path; ``place`` says where.
+        No part has that name, or nothing can be imported from that path; ``where`` says where.
     """
     if name in registry:
         return registry[name]
     module, _, attribute = name.partition(":")
     if not attribute:
-        raise InputError(f"{place}: {name!r} is unknown; {suggestion(name, registry)}")
+        raise InputError(f"{where}: {name!r} is unknown; {suggestion(name, registry)}")
     try:
         maker: Callable[..., Part] = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # a module from outside may raise anything
         reason = f"{type(error).__name__}: {error}"
         raise InputError(
-            f"{place}: cannot import {name!r} ({reason}); write module:Class, and make sure that "
+            f"{where}: cannot import {name!r} ({reason}); write module:Class, and make sure that "
             f"`python -c 'import {module}'` works where you run this"
         ) from None
     if not callable(maker):
-        raise InputError(f"{place}: {name!r} is not a class; write module:Class")
+        raise InputError(f"{where}: {name!r} is not a class; write module:Class")
     return maker
 
 
 def made[Part](
-    place: str,
+    where: str,
     name: str,
     registry: Mapping[str, Callable[..., Part]],
     options: Mapping[str, Any],
@@ -100,35 +100,35 @@ def made[Part](
         As :func:`choose`; or the part does not take an option, cannot be made, or is not of the
         ``kind`` that is asked for.
     """
-    maker = choose(place, name, registry)
-    given = {key: value for key, value in options.items() if value is not None}
+    maker = choose(where, name, registry)
+    arguments = {key: value for key, value in options.items() if value is not None}
     takes = inspect.signature(maker).parameters
-    for key in given:
+    for key in arguments:
         if key not in takes:
-            raise InputError(f"{place}: {name!r} has no option {key}; remove it")
+            raise InputError(f"{where}: {name!r} has no option {key}; remove it")
     if name in registry:
-        return maker(**given)
+        return maker(**arguments)
     try:
-        part = maker(**given)
+        component = maker(**arguments)
     except TypeError as error:  # an abstract method is missing, or an argument has no default
-        raise InputError(f"{place}: {name!r} cannot be made: {error}; complete it") from None
-    if kind is not None and not isinstance(part, kind):
+        raise InputError(f"{where}: {name!r} cannot be made: {error}; complete it") from None
+    if kind is not None and not isinstance(component, kind):
         raise InputError(
-            f"{place}: {name!r} makes a {type(part).__name__}, which is not a "
+            f"{where}: {name!r} makes a {type(component).__name__}, which is not a "
             f"{kind.__module__}.{kind.__name__}; derive it from that"
         )
-    if isinstance(part, Operator):
-        _check_parameters(place, name, part)
-    return part
+    if isinstance(component, Operator):
+        _check_parameters(where, name, component)
+    return component
 
 
-def _check_parameters(place: str, name: str, operator: Operator) -> None:
+def _check_parameters(where: str, name: str, operator: Operator) -> None:
     """Refuse an operator from outside whose state before a record has no place."""
     names = [declared.name for declared in operator.parameters]
     if len(set(names)) < len(names):
-        raise InputError(f"{place}: {name!r} declares a parameter twice: {', '.join(names)}")
+        raise InputError(f"{where}: {name!r} declares a parameter twice: {', '.join(names)}")
     if names[-1:] != ["initial"] or operator.parameters[-1].scope != "record":
         raise InputError(
-            f'{place}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
+            f'{where}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
             'scope = "record": the state before a record'
         )

@@ -43,11 +43,11 @@ def next_specimen(
     """
     prior = posterior.prior
     count = next(iter(population.parameters.values())).new.size
-    made = draws[generator.choice(len(draws), count, replace=len(draws) < count)].copy()
+    specimens = draws[generator.choice(len(draws), count, replace=len(draws) < count)].copy()
     for column, parameter in enumerate(prior.free):
         if parameter.name in population.parameters:
-            made[:, column] = population.parameters[parameter.name].new
-    kept = made[np.isfinite(prior.log_density(made))]
-    if len(kept) < LEAST * count:
+            specimens[:, column] = population.parameters[parameter.name].new
+    possible = specimens[np.isfinite(prior.log_density(specimens))]
+    if len(possible) < LEAST * count:
         raise InputError("population: hardly a draw of it is a model; look at outliers and priors")
-    return kept
+    return possible

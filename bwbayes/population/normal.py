@@ -64,17 +64,18 @@ class NormalLikelihoods:
         return weight
 
     def shrunk(
-        self, one: int, mean: FloatArray, spread: FloatArray, generator: np.random.Generator
+        self, specimen: int, mean: FloatArray, spread: FloatArray, generator: np.random.Generator
     ) -> FloatArray:
         """Draw a specimen's parameter (n,), one for each population (n,).
 
         Given μ and τ it is normal, with the precision 1/s² + 1/τ² and the mean
         (m τ² + μ s²) / (s² + τ²).
         """
-        precision = self.precision[one]
-        part = 1 / (1 + precision * spread**2)  # of the population's mean
-        centre = part * mean + (1 - part) * self.mean[one]
-        drawn: FloatArray = centre + spread * np.sqrt(part) * generator.standard_normal(mean.size)
+        precision = self.precision[specimen]
+        fraction = 1 / (1 + precision * spread**2)  # of the population's mean
+        center = fraction * mean + (1 - fraction) * self.mean[specimen]
+        sd = spread * np.sqrt(fraction)
+        drawn: FloatArray = center + sd * generator.standard_normal(mean.size)
         return drawn
 
 
@@ -111,26 +112,28 @@ def spreads(likelihoods: NormalLikelihoods, prior: Hyperprior) -> Spreads:
 
     up to a constant.
     """
-    known = likelihoods.precision > 0
-    centres = likelihoods.mean[known]
-    extent = np.std(centres) if known.any() else 0.0
-    errors = np.median(likelihoods.precision[known] ** -0.5) if known.any() else prior.scale
+    informative = likelihoods.precision > 0
+    centers = likelihoods.mean[informative]
+    extent = np.std(centers) if informative.any() else 0.0
+    errors = (
+        np.median(likelihoods.precision[informative] ** -0.5) if informative.any() else prior.scale
+    )
     u = np.linspace(0, 1, CELLS + 1)
-    middle = (u[1:] + u[:-1]) / 2
+    center = (u[1:] + u[:-1]) / 2
     size = min(extent + errors, prior.scale)
     with np.errstate(divide="ignore"):
         edges = size * u / (1 - u)
-    spread = size * middle / (1 - middle)
+    spread = size * center / (1 - center)
     weight = likelihoods.weight(spread)
-    own = 1 / prior.sd**2
-    variance = 1 / (own + np.sum(weight, axis=0))
-    mean = variance * (own * prior.mean + weight.T @ likelihoods.mean)
-    far = weight * (likelihoods.mean[:, np.newaxis] - mean) ** 2
+    prior_precision = 1 / prior.sd**2
+    variance = 1 / (prior_precision + np.sum(weight, axis=0))
+    mean = variance * (prior_precision * prior.mean + weight.T @ likelihoods.mean)
+    squares = weight * (likelihoods.mean[:, np.newaxis] - mean) ** 2
     with np.errstate(divide="ignore"):
         logs = np.where(weight > 0, np.log(weight), 0.0)
-    density = 0.5 * (np.log(variance) + np.sum(logs - far, axis=0))
-    density -= 0.5 * own * (prior.mean - mean) ** 2 + 0.5 * (spread / prior.scale) ** 2
-    density -= 2 * np.log1p(-middle)  # dτ/du
+    density = 0.5 * (np.log(variance) + np.sum(logs - squares, axis=0))
+    density -= 0.5 * prior_precision * (prior.mean - mean) ** 2 + 0.5 * (spread / prior.scale) ** 2
+    density -= 2 * np.log1p(-center)  # dτ/du
     probability = np.exp(density - np.max(density))
     probability /= np.sum(probability)
     return Spreads(spread, edges, probability, mean, variance)
@@ -144,13 +147,13 @@ def left_out(likelihoods: NormalLikelihoods, prior: Hyperprior) -> FloatArray:
     """
     count = likelihoods.mean.size
     p = np.ones(count)
-    for one in np.flatnonzero(likelihoods.precision > 0):
-        rest = np.arange(count) != one
-        others = NormalLikelihoods(likelihoods.mean[rest], likelihoods.precision[rest])
-        seen = spreads(others, prior)
-        sd = np.sqrt(1 / likelihoods.precision[one] + seen.spread**2 + seen.variance)
-        z = (likelihoods.mean[one] - seen.mean) / sd
+    for specimen in np.flatnonzero(likelihoods.precision > 0):
+        others = np.arange(count) != specimen
+        shown = NormalLikelihoods(likelihoods.mean[others], likelihoods.precision[others])
+        posterior = spreads(shown, prior)
+        sd = np.sqrt(1 / likelihoods.precision[specimen] + posterior.spread**2 + posterior.variance)
+        z = (likelihoods.mean[specimen] - posterior.mean) / sd
         # From the nearer tail, which keeps its digits.
-        tails = [np.sum(seen.probability * stats.norm.cdf(side * z)) for side in (1, -1)]
-        p[one] = 2 * min(tails)
+        tails = [np.sum(posterior.probability * stats.norm.cdf(side * z)) for side in (1, -1)]
+        p[specimen] = 2 * min(tails)
     return p

@@ -12,13 +12,10 @@ came to, and reweighted. Pareto k says where that is not to be trusted: a specim
 not reach where the population has it (k above 0.7, or few effective draws) is taken for normal, and
 so are all if the populations' own weights fail.
 
-Source: D. Lunn et al., Fully Bayesian hierarchical modelling in two stages, with application to
+Source: D. Lunn et al., Fully Bayesian hierarchical modeling in two stages, with application to
 meta-analysis, J. R. Stat. Soc. C 62 (2013) 551; A. Vehtari et al., Pareto smoothed importance
 sampling, J. Mach. Learn. Res. 25 (2024).
 """
-
-# mypy: allow-untyped-calls
-# arviz_stats says that it has types, but its functions have none.
 
 from __future__ import annotations
 
@@ -26,17 +23,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 from scipy import stats
-from scipy.special import logsumexp
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
 from bwbayes.population.specimen import Specimen, likelihoods, shared
+from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
 
-__all__ = ["FEWEST", "Among", "Population", "Spread", "population"]
+__all__ = ["FEWEST", "Population", "PopulationParameter", "SpecimenEstimate", "population"]
 
 # Specimens below which nothing is said of a spread.
 FEWEST = 3
@@ -46,7 +42,6 @@ DRAWS = 1000
 # Of how many populations one serves as a prior of a specimen; so many are enough for that.
 EVERY = 4
 
-LARGEST_PARETO_K = 0.7
 # Effective draws of a specimen's weights that its own draws must keep.
 LEAST_EFFECTIVE = 50
 
@@ -59,7 +54,7 @@ FALSE_ALARM = 0.05
 
 
 @dataclass(frozen=True)
-class Among:
+class SpecimenEstimate:
     """One specimen's parameter among the others.
 
     ``lower``, ``median`` and ``upper`` are the 95 % interval with the population for a prior, and
@@ -85,7 +80,7 @@ class Among:
 
 
 @dataclass(frozen=True)
-class Spread:
+class PopulationParameter:
     """A population's distribution of one parameter.
 
     Parameters
@@ -113,7 +108,7 @@ class Spread:
     mean: FloatArray
     spread: FloatArray
     new: FloatArray
-    specimens: Mapping[str, Among]
+    specimens: Mapping[str, SpecimenEstimate]
     pareto_k: float
 
     def numbers(self) -> dict[str, object]:
@@ -131,37 +126,37 @@ class Spread:
     @property
     def outliers(self) -> list[str]:
         """Names of the specimens that lie off the population."""
-        return [name for name, one in self.specimens.items() if one.outlier]
+        return [name for name, among in self.specimens.items() if among.outlier]
 
 
 @dataclass(frozen=True)
 class Population:
-    """What specimens say together: a :class:`Spread` for each parameter, by its name."""
+    """What specimens say together: a :class:`PopulationParameter` for each, by its name."""
 
     __repr__ = brief
 
     names: tuple[str, ...]
-    parameters: Mapping[str, Spread]
+    parameters: Mapping[str, PopulationParameter]
 
     def summary(self) -> dict[str, object]:
         """Return it as ``campaign.json`` holds it."""
-        return {name: one.numbers() for name, one in self.parameters.items()}
+        return {name: spread.numbers() for name, spread in self.parameters.items()}
 
     def to_pandas(self) -> object:
         """Return a pandas.DataFrame, a row for each parameter."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
         rows = {}
-        for name, one in self.parameters.items():
+        for name, spread in self.parameters.items():
             rows[name] = {
-                f"{what}_{key}": value
-                for what, values in (
-                    ("mean", one.mean),
-                    ("spread", one.spread),
-                    ("new", one.new),
+                f"{quantity}_{key}": value
+                for quantity, values in (
+                    ("mean", spread.mean),
+                    ("spread", spread.spread),
+                    ("new", spread.new),
                 )
                 for key, value in _interval(values).items()
-            } | {"unit": one.unit, "outliers": ", ".join(one.outliers)}
+            } | {"unit": spread.unit, "outliers": ", ".join(spread.outliers)}
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -176,58 +171,52 @@ def population(specimens: Sequence[Specimen], generator: np.random.Generator) ->
     InputError
         Fewer than ``FEWEST`` specimens, or no parameter that all have.
     """
-    every = list(specimens)
-    if len(every) < FEWEST:
-        raise InputError(f"population: needs {FEWEST} specimens or more; there are {len(every)}")
-    names = shared(every)
+    count = len(specimens)
+    if count < FEWEST:
+        raise InputError(f"population: needs {FEWEST} specimens or more; there are {count}")
+    names = shared(specimens)
     if not names:
         raise InputError("population: the specimens have no parameter of the actuator in common")
-    tests = len(every) * len(names)
+    tests = count * len(names)
     return Population(
-        tuple(one.name for one in every),
-        {name: _spread(every, name, generator, tests) for name in names},
+        tuple(specimen.name for specimen in specimens),
+        {name: _population_of(specimens, name, generator, tests) for name in names},
     )
 
 
-def _spread(
-    specimens: list[Specimen], name: str, generator: np.random.Generator, tests: int
-) -> Spread:
+def _population_of(
+    specimens: Sequence[Specimen], name: str, generator: np.random.Generator, tests: int
+) -> PopulationParameter:
     """Find the population of one parameter."""
-    columns = [one.names.index(name) for one in specimens]
-    first, at = specimens[0], columns[0]
-    logarithmic = bool(first.logarithmic[at])
+    columns = [specimen.names.index(name) for specimen in specimens]
     pairs = list(zip(specimens, columns, strict=True))
-    width = float(np.mean([one.prior_sd[i] for one, i in pairs]))
-    prior = Hyperprior(float(np.mean([one.prior_mean[i] for one, i in pairs])), width, width)
+    logarithmic = bool(specimens[0].logarithmic[columns[0]])
+    width = float(np.mean([specimen.prior_sd[i] for specimen, i in pairs]))
+    mean = float(np.mean([specimen.prior_mean[i] for specimen, i in pairs]))
+    prior = Hyperprior(mean, width, width)
     normal = likelihoods(specimens, name)
-    draws = [(one.draws[:, i], one.log_prior[:, i]) for one, i in pairs]
+    draws = [(specimen.draws[:, i], specimen.log_prior[:, i]) for specimen, i in pairs]
     reweighted = _reweighted(draws, normal, prior, generator)
     p = left_out(normal, prior)
-    scale = np.exp if logarithmic else _same
+    scale = np.exp if logarithmic else np.positive
     among = {}
-    for i, (one, k, taken) in enumerate(
-        zip(specimens, reweighted.shapes, reweighted.normal, strict=True)
-    ):
-        lower, median, upper = scale(
-            np.quantile(reweighted.shrunk[i], [0.025, 0.5, 0.975])
-        ).tolist()
-        own = scale(np.quantile(draws[i][0], [0.025, 0.5, 0.975])).tolist()
-        among[one.name] = Among(
-            lower,
-            median,
-            upper,
-            own_lower=own[0],
-            own_median=own[1],
-            own_upper=own[2],
+    for i, specimen in enumerate(specimens):
+        shrunk, alone = (
+            scale(np.quantile(y, [0.025, 0.5, 0.975])).tolist()
+            for y in (reweighted.shrunk[i], draws[i][0])
+        )
+        among[specimen.name] = SpecimenEstimate(
+            **dict(zip(("lower", "median", "upper"), shrunk, strict=True)),
+            **dict(zip(("own_lower", "own_median", "own_upper"), alone, strict=True)),
             p=float(p[i]),
             outlier=bool(p[i] * tests < FALSE_ALARM),
-            pareto_k=float(k),
-            normal=bool(taken),
+            pareto_k=float(reweighted.shapes[i]),
+            normal=bool(reweighted.normal[i]),
         )
     new = reweighted.mean + reweighted.spread * generator.standard_normal(DRAWS)
-    return Spread(
+    return PopulationParameter(
         name,
-        first.units[at],
+        specimens[0].units[columns[0]],
         logarithmic,
         scale(reweighted.mean),
         reweighted.spread,
@@ -256,31 +245,31 @@ def _reweighted(
     generator: np.random.Generator,
 ) -> _Reweighted:
     """Propose populations, weigh them by the specimens' draws, and shrink the specimens."""
-    seen = spreads(normal, prior)
-    mean, spread = seen.draw(generator, DRAWS)
-    shapes, taken = _judged(draws, float(np.median(mean)), float(np.median(spread)))
+    posterior = spreads(normal, prior)
+    mean, spread = posterior.draw(generator, DRAWS)
+    shapes, as_normal = _judged(draws, float(np.median(mean)), float(np.median(spread)))
     proposed = prior.log_density(mean, spread) + np.sum(normal.marginal(mean, spread), axis=0)
-    weights, k = np.zeros(DRAWS), 0.0
+    weights, k = np.full(DRAWS, 1 / DRAWS), 0.0
     for _ in range(ROUNDS):
         target = prior.log_density(mean, spread)
-        target += np.sum(_marginals(draws, taken, normal, mean, spread), axis=0)
-        weights, k = _smoothed(target - proposed)
+        target += np.sum(_marginals(draws, as_normal, normal, mean, spread), axis=0)
+        weights, k = smoothed_weights(target - proposed)
         if k <= LARGEST_PARETO_K:
             break
         mean, spread, proposed = _around(mean, spread, weights, generator)
     else:
         # Nothing that reweights can be trusted: the normal likelihoods alone.
-        mean, spread = seen.draw(generator, DRAWS)
-        taken, weights = np.ones(len(draws), dtype=np.bool_), np.full(DRAWS, -np.log(DRAWS))
-    chosen = generator.choice(DRAWS, DRAWS, p=np.exp(weights))
+        mean, spread = posterior.draw(generator, DRAWS)
+        as_normal, weights = np.ones(len(draws), dtype=np.bool_), np.full(DRAWS, 1 / DRAWS)
+    chosen = generator.choice(DRAWS, DRAWS, p=weights)
     mean, spread = mean[chosen], spread[chosen]
     shrunk = [
         normal.shrunk(i, mean, spread, generator)
-        if taken[i]
+        if as_normal[i]
         else _resampled(y, log_prior, mean, spread, generator)
         for i, (y, log_prior) in enumerate(draws)
     ]
-    return _Reweighted(mean, spread, np.stack(shrunk), shapes, taken, k)
+    return _Reweighted(mean, spread, np.stack(shrunk), shapes, as_normal, k)
 
 
 def _judged(
@@ -290,15 +279,14 @@ def _judged(
     shapes = np.empty(len(draws))
     effective = np.empty(len(draws))
     for i, (y, log_prior) in enumerate(draws):
-        logs = _log_normal(y, mean, spread) - log_prior
-        smoothed, shapes[i] = _smoothed(logs)
-        effective[i] = np.exp(-logsumexp(2 * smoothed))
+        weights, shapes[i] = smoothed_weights(-0.5 * ((y - mean) / spread) ** 2 - log_prior)
+        effective[i] = 1 / np.sum(weights**2)
     return shapes, ~((shapes <= LARGEST_PARETO_K) & (effective >= LEAST_EFFECTIVE))
 
 
 def _marginals(
     draws: Sequence[tuple[FloatArray, FloatArray]],
-    taken: BoolArray,
+    as_normal: BoolArray,
     normal: NormalLikelihoods,
     mean: FloatArray,
     spread: FloatArray,
@@ -306,7 +294,7 @@ def _marginals(
     """Log p(data of i | μ, τ), (specimens, n), each up to a constant of its own."""
     logs = normal.marginal(mean, spread)
     for i, (y, log_prior) in enumerate(draws):
-        if not taken[i]:
+        if not as_normal[i]:
             weights, largest = _weights(y, log_prior, mean, spread)
             logs[i] = largest + np.log(np.sum(weights, axis=0))
     return logs
@@ -335,9 +323,8 @@ def _resampled(
     generator: np.random.Generator,
 ) -> FloatArray:
     """Draw a specimen's coordinate with populations (n,) for its prior, from its own draws."""
-    some = slice(None, None, EVERY)
-    each, _ = _weights(y, log_prior, mean[some], spread[some])
-    weights = np.mean(each / np.sum(each, axis=0), axis=1)
+    by_population, _ = _weights(y, log_prior, mean[::EVERY], spread[::EVERY])
+    weights = np.mean(by_population / np.sum(by_population, axis=0), axis=1)
     drawn: FloatArray = generator.choice(y, DRAWS, p=weights / np.sum(weights))
     return drawn
 
@@ -350,35 +337,13 @@ def _around(
     A Student distribution of μ and log τ with the weighted moments.
     """
     places = np.stack([mean, np.log(spread)], axis=1)
-    w = np.exp(weights)
-    centre = w @ places
-    away = places - centre
-    covariance = (away * w[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
-    student = stats.multivariate_t(centre, covariance, df=DEGREES, seed=generator)
+    center = weights @ places
+    away = places - center
+    covariance = (away * weights[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
+    student = stats.multivariate_t(center, covariance, df=DEGREES, seed=generator)
     drawn = student.rvs(DRAWS)
     # The density of τ is that of log τ over τ.
     return drawn[:, 0], np.exp(drawn[:, 1]), student.logpdf(drawn) - drawn[:, 1]
-
-
-def _smoothed(logs: FloatArray) -> tuple[FloatArray, float]:
-    """Pareto-smoothed log weights (n,), their sum one, and their k."""
-    logs = logs - logsumexp(logs)
-    if not np.isfinite(logs).all() or np.ptp(logs) < 1e-9:
-        # Equal weights have no tail; what is not finite is not to be trusted.
-        k = 0.0 if np.isfinite(logs).all() else np.inf
-        return np.full(logs.size, -np.log(logs.size)), k
-    smoothed, k = array_stats.psislw(-logs)
-    smoothed = np.asarray(smoothed, dtype=np.float64)
-    return smoothed - logsumexp(smoothed), float(k)
-
-
-def _log_normal(y: FloatArray, mean: FloatArray | float, spread: FloatArray | float) -> FloatArray:
-    logs: FloatArray = -0.5 * ((y - mean) / spread) ** 2 - np.log(spread)
-    return logs
-
-
-def _same(values: FloatArray) -> FloatArray:
-    return values
 
 
 def _interval(values: FloatArray) -> dict[str, float]:

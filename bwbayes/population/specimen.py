@@ -8,8 +8,10 @@ divided out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,34 +67,19 @@ class Specimen:
 
     def save(self, path: Path) -> None:
         """Write it to an .npz file, whole or not at all."""
+        arrays = {key: value for key, value in vars(self).items() if key != "name"}
         draft = path.with_suffix(".partial")
         with draft.open("wb") as file:
-            np.savez(
-                file,
-                names=np.array(self.names),
-                units=np.array(self.units),
-                logarithmic=self.logarithmic,
-                draws=self.draws,
-                log_prior=self.log_prior,
-                prior_mean=self.prior_mean,
-                prior_sd=self.prior_sd,
-            )
+            np.savez(file, **arrays)
         draft.replace(path)
 
     @classmethod
     def load(cls, name: str, path: Path) -> Specimen:
         """Read it back."""
         with np.load(path) as file:
-            return cls(
-                name,
-                tuple(file["names"].tolist()),
-                tuple(file["units"].tolist()),
-                file["logarithmic"],
-                file["draws"],
-                file["log_prior"],
-                file["prior_mean"],
-                file["prior_sd"],
-            )
+            arrays: dict[str, Any] = dict(file)
+        arrays |= {key: tuple(arrays[key].tolist()) for key in ("names", "units")}
+        return cls(name, **arrays)
 
 
 def specimen_of(
@@ -113,19 +100,19 @@ def specimen_of(
     """
     prior = posterior.prior
     table = posterior.table
-    own = {
+    of_actuator = {
         column.name
         for column in table.layout
         if column.name in table.physical and column.declaration.scope == "actuator"
     }
-    columns = [i for i, p in enumerate(prior.free) if p.name in own]
+    columns = [i for i, p in enumerate(prior.free) if p.name in of_actuator]
     chosen = draws
     if len(draws) > DRAWS:
         chosen = draws[generator.choice(len(draws), DRAWS, replace=False)]
     before = prior.draw(generator, MOMENTS)
-    logarithmic = np.array([_is_logarithmic(prior.free[i]) for i in columns], dtype=np.bool_)
+    logarithmic = np.array([prior.free[i].positive for i in columns], dtype=np.bool_)
     y = _coordinates(chosen[:, columns], logarithmic)
-    known = _coordinates(before[:, columns], logarithmic)
+    prior_coordinates = _coordinates(before[:, columns], logarithmic)
     log_prior = [_log_prior(prior, i, chosen[:, i], generator) for i in columns]
     log_prior = [
         # dx/dy = x of the logarithm.
@@ -139,32 +126,32 @@ def specimen_of(
         logarithmic,
         y,
         np.stack(log_prior, axis=1) if columns else np.empty((len(y), 0)),
-        np.mean(known, axis=0),
-        np.std(known, axis=0),
+        np.mean(prior_coordinates, axis=0),
+        np.std(prior_coordinates, axis=0),
     )
 
 
-def likelihoods(specimens: list[Specimen], name: str) -> NormalLikelihoods:
+def likelihoods(specimens: Sequence[Specimen], name: str) -> NormalLikelihoods:
     """Return normal likelihoods of one parameter: each posterior's less its prior's.
 
     With the moments of posterior and prior, 1/s² = 1/v₁ − 1/v₀ and m/s² = m₁/v₁ − m₀/v₀.
     """
     means, precisions = [], []
-    for one in specimens:
-        i = one.names.index(name)
-        after, before = np.var(one.draws[:, i]) ** -1.0, one.prior_sd[i] ** -2.0
+    for specimen in specimens:
+        i = specimen.names.index(name)
+        after, before = np.var(specimen.draws[:, i]) ** -1.0, specimen.prior_sd[i] ** -2.0
         precision = after - before
         if precision < LEAST * before:
-            means.append(float(one.prior_mean[i]))
+            means.append(float(specimen.prior_mean[i]))
             precisions.append(0.0)
             continue
-        pull = np.mean(one.draws[:, i]) * after - one.prior_mean[i] * before
+        pull = np.mean(specimen.draws[:, i]) * after - specimen.prior_mean[i] * before
         means.append(float(pull / precision))
         precisions.append(float(precision))
     return NormalLikelihoods(np.array(means), np.array(precisions))
 
 
-def shared(specimens: list[Specimen]) -> tuple[str, ...]:
+def shared(specimens: Sequence[Specimen]) -> tuple[str, ...]:
     """Return the parameters that all specimens have, in the same coordinate."""
     first, *others = specimens
     logarithmic = dict(zip(first.names, first.logarithmic, strict=True))
@@ -172,14 +159,11 @@ def shared(specimens: list[Specimen]) -> tuple[str, ...]:
         name
         for name in first.names
         if all(
-            name in one.names and one.logarithmic[one.names.index(name)] == logarithmic[name]
-            for one in others
+            name in specimen.names
+            and specimen.logarithmic[specimen.names.index(name)] == logarithmic[name]
+            for specimen in others
         )
     )
-
-
-def _is_logarithmic(parameter: Parameter) -> bool:
-    return parameter.positive
 
 
 def _coordinates(values: FloatArray, logarithmic: BoolArray) -> FloatArray:
@@ -194,16 +178,16 @@ def _log_prior(
     Its own prior's, times the part of all others' prior that the constraints leave at x: by draws
     at some quantiles of x, and on straight lines between those.
     """
-    own = prior.free[column].prior
-    assert own is not None
+    marginal = prior.free[column].prior
+    assert marginal is not None
     others = np.stack([_single(p, generator) for p in prior.free], axis=1)
     places = np.quantile(x, np.linspace(0, 1, PLACES))
     tried = np.tile(others, (PLACES, 1))
     tried[:, column] = np.repeat(places, OTHERS)
     inside = np.isfinite(prior.log_density(tried)).reshape(PLACES, OTHERS)
     # A place where draws of the posterior lie has not nothing.
-    left = np.maximum(np.mean(inside, axis=1), 0.5 / OTHERS)
-    density: FloatArray = own.frozen.logpdf(x) + np.interp(x, places, np.log(left))
+    possible = np.maximum(np.mean(inside, axis=1), 0.5 / OTHERS)
+    density: FloatArray = marginal.frozen.logpdf(x) + np.interp(x, places, np.log(possible))
     return density
 
 

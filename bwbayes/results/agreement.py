@@ -27,20 +27,21 @@ of 1 if the noise that the records share is its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, stats
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference import pointfit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.innovations import innovations
 
-__all__ = ["Agreement", "agreements", "numbers", "remarks"]
+__all__ = ["Agreement", "agreements", "disagreements", "numbers"]
 
 # Below these weights together nothing can be compared: what a record tells by itself alone differs
 # by rounding. And the part of a parameter's variance that the others are taken to take away, at
@@ -215,39 +216,42 @@ def _cost(alone: Posterior, own: FloatArray, joint: FloatArray) -> float:
     return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
 
 
-def remarks(every: Mapping[str, Agreement]) -> list[str]:
-    """Say, a line each, which records do not go with the others."""
-    return [
-        f"{name}: does not agree with the other records: its residual is {one.joint_um:.3g} um rms "
-        f"in the joint fit and {one.own_um:.3g} um in a fit of its own, and {one.moved[0]} is "
-        f"{abs(one.moved[1]):.1f} sds {'higher' if one.moved[1] > 0 else 'lower'} there "
-        f"(chi-square {one.distance:.4g} with {one.degrees:.3g} degrees of freedom, "
-        f"p = {one.p_value:.1g}): fit it alone, or give it what differs as its own with "
-        f'model.per_record = ["{one.moved[0]}"]'
-        for name, one in every.items()
-        if one.disagrees
-    ] + [
-        f"{name}: has another noise than the records share: its innovations are {one.size:.2g} "
-        "times as large as they should be; give it a noise of its own with model.per_record = "
-        '["sensor_sd", "discrepancy_sd"]'
-        for name, one in every.items()
-        if one.noisier
-    ]
+def disagreements(compared: Mapping[str, Agreement]) -> Iterator[Finding]:
+    """Yield the records that do not go with the others."""
+    for name, record in compared.items():
+        parameter, away = record.moved
+        if record.disagrees:
+            yield Finding(
+                name,
+                f"is inconsistent with the other records: its residual is {record.joint_um:.3g} um "
+                f"rms in the joint fit and {record.own_um:.3g} um in a fit of its own, where "
+                f"{parameter} is {abs(away):.1f} SD {'higher' if away > 0 else 'lower'} "
+                f"(chi-square {record.distance:.4g} with {record.degrees:.3g} degrees of freedom, "
+                f"p = {record.p_value:.1g})",
+                f'fit it alone, or set model.per_record = ["{parameter}"]',
+            )
+        if record.noisier:
+            yield Finding(
+                name,
+                f"has another noise than the records share: its innovations are {record.size:.2g} "
+                "times as large as they should be",
+                'set model.per_record = ["sensor_sd", "discrepancy_sd"]',
+            )
 
 
-def numbers(every: Mapping[str, Agreement]) -> dict[str, object]:
+def numbers(compared: Mapping[str, Agreement]) -> dict[str, object]:
     """Return agreements as ``summary.json`` holds them."""
     return {
         name: {
-            "residual_joint_um": one.joint_um,
-            "residual_own_um": one.own_um,
-            "chi_square": one.distance,
-            "degrees_of_freedom": one.degrees,
-            "p_value": one.p_value,
-            "farthest": one.moved[0],
-            "farthest_sds": one.moved[1],
-            "agrees": not one.disagrees,
-            "innovations_rms": one.size,
+            "residual_joint_um": record.joint_um,
+            "residual_own_um": record.own_um,
+            "chi_square": record.distance,
+            "degrees_of_freedom": record.degrees,
+            "p_value": record.p_value,
+            "farthest": record.moved[0],
+            "farthest_sds": record.moved[1],
+            "agrees": not record.disagrees,
+            "innovations_rms": record.size,
         }
-        for name, one in every.items()
+        for name, record in compared.items()
     }

@@ -17,7 +17,7 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.shown import brief
 
-__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "Switched", "titled"]
+__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "titled"]
 
 Kind = Literal["parameter", "displacement", "sensor"]
 KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
@@ -33,38 +33,17 @@ def titled(name: str, *, training: bool, separate: bool) -> str:
 
 
 @dataclass(frozen=True)
-class Switched:
-    """A transient A exp(−t/τ) at the start of a record, of which a lead-in alone may not tell.
-
-    ``size`` A in um, ``decay`` τ in s; it adds ``nats`` to the log density of all readings.
-    """
-
-    size: float
-    decay: float
-    nats: float
-
-    def line(self, start: float) -> str:
-        """Say what it is, of a record whose lead-in begins at ``start``, s."""
-        return (
-            f"a transient of {self.size:.3g} um that decays within {self.decay:.2g} s from "
-            f"{start:.4g} s on explains the readings better, by {self.nats:.3g} nats"
-        )
-
-
-@dataclass(frozen=True)
 class LeadIn:
     """The stretch that told a record's start, and how well it fits.
 
     It goes from ``start`` to ``stop`` in s and holds ``samples`` readings; ``p_value`` is that of
-    a test of its innovations, small where the model cannot have made them. ``transient`` is the one
-    that explains this stretch, and what comes after it, best.
+    a test of its innovations, small where the model cannot have made them.
     """
 
     start: float
     stop: float
     samples: int
     p_value: float
-    transient: Switched | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ What did not converge is counted, and ranked with the rest if it has draws at al
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import ndtr
@@ -23,6 +23,7 @@ from scipy.stats import binom, poisson
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.parameters import Parameter
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.replicates import RANKED, Entry
 from bwbayes.shown import brief
@@ -137,6 +138,8 @@ class Calibration:
         Probability that the smooth test finds a posterior sd that is wrong by so much.
     shortcomings
         Why the calibration has failed; empty if it has passed.
+    name, parameters, facts, provenance
+        What was calibrated, and what its numbers depend on: seed, digest of the data, versions.
     """
 
     __repr__ = brief
@@ -150,6 +153,10 @@ class Calibration:
     bands: Mapping[str, Coverage]
     power: Mapping[str, float]
     shortcomings: tuple[str, ...]
+    name: str = "calibration"
+    parameters: Sequence[Parameter] = ()
+    facts: Sequence[tuple[str, str]] = ()
+    provenance: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -210,7 +217,7 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
         power={text: smooth_power(len(ranked), each, width) for text, width in WIDTHS.items()},
         shortcomings=(
             *_unconverged_remark(len(unconverged), len(entries)),
-            *(remark for name, one in statistics.items() for remark in _remarks(name, one)),
+            *(remark for name, even in statistics.items() for remark in _remarks(name, even)),
             *(_band_remarks(bands) if len(ranked) >= JUDGED_FROM else ()),
         ),
     )
@@ -341,12 +348,12 @@ def _unconverged_remark(unconverged: int, replicates: int) -> list[str]:
     ]
 
 
-def _remarks(name: str, one: Uniformity) -> list[str]:
+def _remarks(name: str, statistic: Uniformity) -> list[str]:
     """Say what is wrong with a statistic's ranks."""
     remarks = []
-    if one.adjusted < FAMILY_LEVEL / 2:
-        remarks.append(f"{name}: ranks are not even (smooth test, p = {one.p:.1g})")
-    if one.outside:
+    if statistic.adjusted < FAMILY_LEVEL / 2:
+        remarks.append(f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})")
+    if statistic.outside:
         remarks.append(f"{name}: the distribution of ranks leaves its band")
     return remarks
 
@@ -354,11 +361,11 @@ def _remarks(name: str, one: Uniformity) -> list[str]:
 def _band_remarks(bands: Mapping[str, Coverage]) -> list[str]:
     """Say which bands do not keep their promise; written so that nan fails."""
     remarks = []
-    for name, one in bands.items():
+    for name, coverage in bands.items():
         other, (kind, level) = _whose(name), name.split()[-2:]
-        if not abs(one.mean - int(level) / 100) <= LIMIT * one.error:
+        if not abs(coverage.mean - int(level) / 100) <= LIMIT * coverage.error:
             remarks.append(
-                f"the {level} % {kind} band covers {one.mean:.1%} ± {one.error:.1%} of "
+                f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} of "
                 + (f"the record {other}" if other else "held-out samples")
             )
     return remarks
@@ -366,7 +373,7 @@ def _band_remarks(bands: Mapping[str, Coverage]) -> list[str]:
 
 def summary(calibration: Calibration) -> dict[str, object]:
     """Return the numbers as ``calibration.json`` holds them."""
-    return {
+    return dict(calibration.provenance) | {
         "passed": calibration.passed,
         "telling": calibration.telling,
         "shortcomings": list(calibration.shortcomings),
@@ -378,16 +385,16 @@ def summary(calibration: Calibration) -> dict[str, object]:
         "power_of_one_smooth_test": dict(calibration.power),
         "statistics": {
             name: {
-                "p": one.p,
-                "p_adjusted": one.adjusted,
-                "ecdf_leaves_band": one.outside,
-                "covered": {str(level): part for level, part in one.covered.items()},
+                "p": statistic.p,
+                "p_adjusted": statistic.adjusted,
+                "ecdf_leaves_band": statistic.outside,
+                "covered": {str(level): covered for level, covered in statistic.covered.items()},
             }
-            for name, one in calibration.statistics.items()
+            for name, statistic in calibration.statistics.items()
         },
         "binomial_limits": {str(level): list(pair) for level, pair in calibration.limits.items()},
         "bands": {
-            name: {"covered": one.mean, "error": one.error}
-            for name, one in calibration.bands.items()
+            name: {"covered": coverage.mean, "error": coverage.error}
+            for name, coverage in calibration.bands.items()
         },
     }

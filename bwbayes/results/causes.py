@@ -1,398 +1,278 @@
-"""Why bands do not hold: what the residuals of a record look like, and what helps.
+"""Why bands fail on readings that were not fitted: shapes in the residuals, by evidence.
 
-Each cause leaves its mark on the residuals: a constant, a trend, a beginning that differs, spikes,
-a part that follows the loop. Least squares says how much of the residuals' energy each mark
-explains; the simplest one that explains most of it is the likeliest cause. It comes with its
-remedy, a line of config or an option of the command line.
+Given the bands, residuals are jointly normal: the parameters' error, the discrepancy, the sensor's
+noise. Each cause adds shapes of unknown size (a constant, a trend, a decay at the start, the mean
+itself, ...) with a normal prior, so that its evidence is exact and costs one pass of the noise's
+filter. What was fitted has :mod:`bwbayes.diagnosis.explanations` instead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from scipy import ndimage
+from scipy.special import logsumexp
 
-from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.data.inspection import MOST_LEFT_OUT, SETTLE_FIRST
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.data.io.grid import clock
+from bwbayes.diagnosis.explanations import likely_causes
+from bwbayes.diagnosis.finding import Finding, joined
+from bwbayes.diagnosis.noise import tail_nats
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.drive import rate
-from bwbayes.results.bands import Bands
+from bwbayes.results.bands import KINDS, Bands
 
-__all__ = ["Cause", "Kind", "Residuals", "cause", "drifts", "likeliest"]
+__all__ = ["LEAD_IN_ALARM", "cause", "goes_against"]
 
-Kind = Literal[
-    "sign",
-    "outliers",
-    "lead-in",
-    "start",
-    "offset",
-    "drift",
-    "extrapolation",
-    "gain",
-    "delay",
-    "loop",
-    "noise",
-    "unknown",
-]
+# Prior sds: of what is added, as a fraction of the mean's range; of a gain; and of a delay, as a
+# fraction of the time in which the mean changes by its sd.
+SIZE, GAIN, DELAY = 0.1, 0.3, 0.3
 
-# A mark that explains this part of the energy is taken for the cause; a later one in the list
-# below must explain more, because it has more to fit with.
-EXPLAINS = 0.6
+# Time constants of a bad start, as fractions of the record, evenly probable.
+DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
 
-# A mark that explains less than this, be it the best of all, explains nothing.
-LEAST = 0.3
+# A lead-in whose test says less than this does not fit.
+LEAD_IN_ALARM = 0.002
+
+# Innovations beyond this many sds are named by their times.
+FAR = 5.0
 
 # Voltage and displacement that correlate less than this go against each other.
 REVERSED = -0.5
 
-# Spikes: in sds of what changes from sample to sample, and the part of that variance they add.
-SPIKE = 8.0
-SPIKE_PART = 0.1
 
-# Part of the fitted voltages' range that counts as inside; a sensor's noise.
-SLACK = 0.02
+def goes_against(bands: Bands, judged: BoolArray, fitted: tuple[float, float]) -> list[str]:
+    """Say that the readings go against the voltage, where it goes up and down by enough.
 
-# Spikes that are named by their time.
-NAMED = 3
+    A lag of many seconds and a gain beyond all reason can follow even these. ``fitted`` are the
+    lowest and the highest voltage of training.
+    """
+    assert bands.measured is not None
+    change = rate(bands.voltage, bands.interval)[judged] * bands.interval
+    travel = min(float(np.sum(np.maximum(sign * change, 0))) for sign in (1, -1))
+    together = _correlation(bands.voltage[judged], bands.measured[judged])
+    if travel < (fitted[1] - fitted[0]) / 2 or together >= REVERSED:
+        return []
+    return [f"the readings fall where the voltage rises (correlation {together:.2f})"]
 
 
-@dataclass(frozen=True)
-class Cause:
-    """A likely cause: its kind, what it looks like, and what helps."""
+def cause(
+    bands: Bands,
+    judged: BoolArray,
+    memory: float,
+    fitted: tuple[float, float],
+    beyond: Sequence[Finding] = (),
+) -> Finding:
+    """Return the likely cause of bands that fail, or that there is none among those that are known.
 
-    kind: Kind
-    text: str
-    remedy: str
+    Parameters
+    ----------
+    bands, judged
+        Bands with readings, and which of these (samples,) count.
+    memory
+        Correlation time of the discrepancy, s.
+    fitted
+        Lowest and highest voltage of training, V.
+    beyond
+        In what the drive leaves training.
+    """
+    if goes_against(bands, judged, fitted):
+        return Finding("sign", *WORDS["sign"])
+    residuals = Residuals.of(bands, judged, memory)
+    ranked = sorted(residuals.explanations(fitted), key=lambda finding: -finding.nats)
+    likely = joined(likely_causes(ranked)) or Finding(
+        "unknown",
+        "unknown (no pattern in the residuals)",
+        "look at the residuals in the figure; train on a record like this one",
+    )
+    lead = bands.lead_in
+    hidden = likely.kind in ("start", "offset", "noise", "unknown")
+    if lead is not None and lead.p_value < LEAD_IN_ALARM and hidden:
+        told = clock(lead.stop, bands.interval)
+        return Finding(
+            "lead-in",
+            "a start that the lead-in does not show (a transient, a drift, or another actuator)",
+            f"set lead_in_from = {told} in [validation.{bands.name}], or predict with "
+            f"--lead-in-from {told}; a longer --lead-in or a --window may help too",
+            nats=likely.nats,
+        )
+    # Creep widens loops, and is too small for another gain or a delay.
+    creeps = likely.kind in ("loop", "noise", "unknown")
+    far = [way for way in beyond if creeps or way.kind in ("range", "speed")]
+    if far and (creeps or likely.kind in ("gain", "delay")):
+        return Finding("extrapolation", f"extrapolation: {far[0].text}", far[0].fix)
+    return likely
 
-    @property
-    def line(self) -> str:
-        """Cause and fix, as a part of a line."""
-        return f"Likely cause: {self.text}. Fix: {self.remedy}."
+
+def _correlation(left: FloatArray, right: FloatArray) -> float:
+    left, right = left - np.mean(left), right - np.mean(right)
+    size = float(np.sqrt(np.sum(left**2) * np.sum(right**2)))
+    return float(left @ right) / size if size > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Readings that were judged, and all that may explain their residuals.
+    """Residuals (readings,), um, at ``rows`` (readings,) of the bands, and what these say of them.
 
-    All arrays are (readings,): ``time`` in s, ``residual``, ``mean`` and ``measured`` in um,
-    ``voltage`` in V, ``rate`` its change in V/s, ``follow`` the mean's in um/s.
+    ``expected`` (readings, columns) are the parameters' errors, um, each of an independent standard
+    normal size; ``noise`` (1, 3) are the parameters of the discrepancy.
     """
 
-    name: str
-    training: bool
-    interval: float
-    time: FloatArray
+    bands: Bands
+    rows: IntArray
     residual: FloatArray
-    mean: FloatArray
-    measured: FloatArray
-    voltage: FloatArray
-    rate: FloatArray
-    follow: FloatArray
-    spikes: BoolArray
-    fitted: tuple[float, float]
-    told_until: float
+    expected: FloatArray
+    noise: FloatArray
 
     @classmethod
-    def of(cls, bands: Bands, judged: BoolArray, fitted: tuple[float, float]) -> Residuals:
-        """Take the judged readings (samples,) out of bands."""
+    def of(cls, bands: Bands, judged: BoolArray, memory: float) -> Residuals:
+        """Take the judged readings (samples,) out of bands; ``memory`` of the discrepancy, s."""
         assert bands.measured is not None
-        mean = bands.mean
-        steps = (np.gradient(mean) if mean.size > 1 else np.zeros_like(mean))[judged]
-        residual = (bands.measured - bands.mean)[judged]
-        covered = bands.covers("sensor", 95, bands.measured)[judged]
-        return cls(
-            bands.name,
-            bands.training,
-            bands.interval,
-            bands.time[judged],
-            residual,
-            bands.mean[judged],
-            bands.measured[judged],
-            bands.voltage[judged],
-            rate(bands.voltage, bands.interval)[judged],
-            steps / bands.interval,
-            # What a band covers is no outlier of it.
-            _spikes(residual, steps) & ~covered,
-            fitted,
-            bands.time[0] if bands.lead_in is None else bands.lead_in.stop,
-        )
+        rows, mean = np.flatnonzero(judged), bands.mean[judged]
+        # Half a 90 % band is 1.645 sds wide.
+        variances = [
+            float(np.mean((bands.upper[kind, 90] - bands.lower[kind, 90])[rows] ** 2)) / 3.29**2
+            for kind in KINDS
+        ]
+        least = 1e-12 * max(variances[2], 1e-300)
+        discrepancy, sensor = np.sqrt(np.maximum(np.diff(variances), least))
+        if memory <= 0:
+            discrepancy = np.sqrt(least)
+        shape = (mean - np.mean(mean)) / (np.std(mean) or 1.0)
+        varying = np.sqrt(max(variances[0] - bands.common_sd**2, 0.0))
+        expected = np.stack([np.full(rows.size, bands.common_sd), varying * shape], axis=1)
+        noise = np.array([[sensor, discrepancy, max(memory, bands.interval)]])
+        return cls(bands, rows, bands.measured[rows] - mean, expected, noise)
 
-    @property
-    def isolated(self) -> list[str]:
-        """Say how many readings stand alone and far off, if they matter."""
-        count = int(np.sum(self.spikes))
-        if not count:
-            return []
-        largest = float(np.max(np.abs(self.residual[self.spikes])))
-        lie = "reading lies" if count == 1 else "readings lie up to"
-        return [f"{count} isolated {lie} {largest:.3g} um off"]
+    def fitted(self, columns: FloatArray, residual: FloatArray) -> tuple[float, FloatArray]:
+        """Explain a residual (readings,) by columns (readings, columns) of standard normal sizes.
 
-    @property
-    def reversed(self) -> list[str]:
-        """Say that the readings go against the voltage, where it goes up and down by enough.
-
-        A lag of many seconds and a gain beyond all reason can follow even these.
+        Returns its log density, up to what is the same for all columns, and the innovations
+        (readings,) less what the columns explain, in sds.
         """
-        up, down = (np.sum(np.maximum(way * self.rate, 0)) * self.interval for way in (1, -1))
-        low, high = self.fitted
-        together = _correlation(self.voltage, self.measured)
-        if min(up, down) < (high - low) / 2 or together >= REVERSED:
-            return []
-        return [f"the readings fall where the voltage rises (correlation {together:.2f})"]
+        series = np.column_stack([residual, self.expected, columns]).T
+        skipped = np.concatenate([[0.0], np.diff(self.rows) - 1.0])
+        noise = DiscrepancyNoise(self.bands.interval)
+        white = noise.whiten(self.noise, series[np.newaxis], skipped)[0][0]
+        precision = np.eye(len(series) - 1) + white[1:] @ white[1:].T
+        pull = white[1:] @ white[0]
+        sizes = np.linalg.solve(precision, pull)
+        squares = float(white[0] @ white[0] - pull @ sizes)
+        log_volume = float(np.linalg.slogdet(precision)[1])
+        return -0.5 * (squares + log_volume), white[0] - sizes @ white[1:]
+
+    def evidence(self, columns: FloatArray) -> float:
+        """Return the log density with columns (readings, columns) of standard normal sizes."""
+        return self.fitted(columns, self.residual)[0]
+
+    def shapes(self, fitted: tuple[float, float]) -> dict[str, FloatArray]:
+        """Columns (readings, columns) of what may be added to the mean, by kind, um."""
+        mean, voltage = self.bands.mean[self.rows], self.bands.voltage[self.rows]
+        slope = np.gradient(self.bands.mean, self.bands.interval)[self.rows]
+        size = SIZE * (float(np.ptp(mean)) or 1.0)
+        along = self.along
+        level = (voltage - np.mean(voltage)) / (float(np.max(np.abs(voltage))) or 1.0)
+        speed = rate(self.bands.voltage, self.bands.interval)[self.rows]
+        way = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
+        loops = level, level**2, level**3, way, way * level, way * level**2
+        outside = np.maximum(voltage - fitted[1], 0) - np.maximum(fitted[0] - voltage, 0)
+        outside /= float(np.max(np.abs(outside))) or 1.0
+        columns = {
+            "drift": size * np.stack([along, along**2]),
+            "offset": np.full((1, along.size), size),
+            "gain": GAIN * (mean - np.mean(mean))[np.newaxis],
+            "delay": DELAY * np.std(mean) / (np.std(slope) or 1.0) * slope[np.newaxis],
+            "loop": size * np.stack(loops),
+        }
+        if outside.any():
+            powers = np.abs(outside), outside, outside**2, outside * np.abs(outside)
+            columns["extrapolation"] = 3 * size * np.stack(powers)
+        return {kind: rows.T for kind, rows in columns.items()}
+
+    @property
+    def along(self) -> FloatArray:
+        """Time (readings,) from the first reading to the last, as a fraction."""
+        time = self.bands.time[self.rows] - self.bands.time[self.rows[0]]
+        fraction: FloatArray = time / max(float(time[-1]), self.bands.interval)
+        return fraction
+
+    def explanations(self, fitted: tuple[float, float]) -> list[Finding]:
+        """Weigh all causes, with nats against none."""
+        plain, white = self.fitted(np.empty((self.rows.size, 0)), self.residual)
+        shapes = self.shapes(fitted)
+        nats = {kind: self.evidence(columns) - plain for kind, columns in shapes.items()}
+        # Twice the mean to the readings: then they are its opposite.
+        opposite = self.residual + 2 * self.bands.mean[self.rows]
+        nats["sign"] = self.fitted(shapes["offset"], opposite)[0] - plain
+        starts = [
+            self.evidence(3 * shapes["offset"] * np.exp(-self.along / decay)[:, np.newaxis])
+            for decay in DECAYS
+        ]
+        nats["start"] = float(logsumexp(starts)) - np.log(len(DECAYS)) - plain
+        nats["outliers"] = tail_nats(white)
+        square = float(np.mean(white**2))
+        nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
+        duration = float(np.ptp(self.bands.time[self.rows]))
+        until = self.bands.time[self.rows[0]] + 3 * DECAYS[int(np.argmax(starts))] * duration
+        words = {
+            "name": self.bands.name,
+            "settled": clock(until, self.bands.interval),
+            "size": f"{np.mean(self.residual):+.3g}",
+            "span": f"{fitted[0]:.4g} to {fitted[1]:.4g} V",
+            "spikes": self._windows(np.abs(white) > FAR),
+        }
+        return [
+            Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
+            for kind, (text, fix) in WORDS.items()
+            if kind in nats
+        ]
+
+    def _windows(self, far: BoolArray) -> str:
+        """Write the windows of the first readings that are far off."""
+        interval = self.bands.interval
+        times = self.bands.time[self.rows[far]][:3].tolist()
+        return ", ".join(f"[{clock(t, interval)}, {clock(t + interval, interval)}]" for t in times)
 
 
-def likeliest(r: Residuals) -> Cause:
-    """Return the likeliest cause of residuals that are too large."""
-    if _correlation(r.voltage, r.measured) < REVERSED:
-        return cause("sign", r)
-    if r.spikes.any() and _energy(r.residual[r.spikes]) > LEAST * _energy(r.residual):
-        return cause("outliers", r)
-    shares = {kind: share(r) for kind, share in _MARKS}
-    for kind, share in shares.items():
-        if share > EXPLAINS:
-            return cause(kind, r)
-    best = max(shares, key=lambda kind: shares[kind])
-    if shares[best] > LEAST:
-        return cause(best, r)
-    if r.spikes.any():
-        return cause("outliers", r)
-    forgets = _correlation(r.residual[1:], r.residual[:-1]) < 0.5 if r.residual.size > 2 else False
-    return cause("noise" if forgets else "unknown", r)
+REFIT = "fit this record itself: bwbayes run CONFIG --record FILE"
 
-
-def drifts(r: Residuals, after: float) -> bool:
-    """Tell whether the residuals after a time, s, still drift: a bad start alone does not."""
-    late = r.time >= after
-    if np.sum(late) < 3:
-        return False
-    at = r.time[late] - after
-    residual = r.residual[late] - np.mean(r.residual[late])
-    return _explained(residual, at, at**2) > EXPLAINS
-
-
-def _energy(values: FloatArray) -> float:
-    return float(np.sum(values**2))
-
-
-def _correlation(one: FloatArray, other: FloatArray) -> float:
-    one, other = one - np.mean(one), other - np.mean(other)
-    size = np.sqrt(_energy(one) * _energy(other))
-    return float(np.sum(one * other) / size) if size > 0 else 0.0
-
-
-def _explained(residual: FloatArray, *features: FloatArray) -> float:
-    """Part of the residual's energy that least squares on a constant and features explains."""
-    columns = [np.ones_like(residual)]
-    for feature in features:
-        spread = np.std(feature)
-        if spread > 0:
-            columns.append((feature - np.mean(feature)) / spread)
-    matrix = np.stack(columns, axis=1)
-    weights, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
-    total = _energy(residual)
-    return 1 - _energy(residual - matrix @ weights) / total if total > 0 else 0.0
-
-
-def _beside(residual: FloatArray, where: BoolArray) -> float:
-    """Part of the energy that is in excess of what the other samples have, at ``where``."""
-    total, other = _energy(residual), ~where
-    if not where.any() or not other.any() or total == 0:
-        return 0.0
-    return 1 - _energy(residual[other]) / np.sum(other) * residual.size / total
-
-
-def _start(r: Residuals) -> float:
-    """Part of the energy that the first third has in excess of the last half."""
-    late = r.time >= (r.time[0] + r.time[-1]) / 2
-    early = r.time < r.time[0] + (r.time[-1] - r.time[0]) / 3
-    if not early.any() or not late.any():
-        return 0.0
-    tail = _energy(r.residual[late]) / np.sum(late)
-    # An offset of the remaining readings does not count as a start.
-    total = _energy(r.residual)
-    return max(0.0, (_energy(r.residual[early]) - tail * np.sum(early)) / total) if total else 0.0
-
-
-def _offset(r: Residuals) -> float:
-    return _explained(r.residual)
-
-
-def _drift(r: Residuals) -> float:
-    """Trend, bent or not, that a drive which goes back and forth does not make."""
-    at = (r.time - r.time[0]) / max(r.time[-1] - r.time[0], r.interval)
-    share = _explained(r.residual, at, at**2)
-    # A trend beside an offset that is far larger does not count.
-    return share if _offset(r) < 0.85 * share else 0.0
-
-
-def _extrapolation(r: Residuals) -> float:
-    low, high = r.fitted
-    if not np.isfinite(high - low):
-        return 0.0
-    slack = SLACK * (high - low)
-    return _beside(r.residual, (r.voltage < low - slack) | (r.voltage > high + slack))
-
-
-def _gain(r: Residuals) -> float:
-    return _explained(r.residual, r.mean)
-
-
-def _delay(r: Residuals) -> float:
-    return _explained(r.residual, r.follow)
-
-
-def _loop(r: Residuals) -> float:
-    """Share of a smooth function of the voltage, one for each direction."""
-    size = np.max(np.abs(r.voltage)) or 1.0
-    v = (r.voltage - np.mean(r.voltage)) / size
-    typical = np.sqrt(np.mean(r.rate**2)) or 1.0
-    way = np.tanh(3 * r.rate / typical)
-    return _explained(
-        r.residual, v, v**2, v**3, way, way * v, way * v**2, r.follow, r.mean
-    )  # fmt: skip
-
-
-# In the order in which they are believed: a mark comes after those that it may imitate.
-_MARKS: tuple[tuple[Kind, Callable[[Residuals], float]], ...] = (
-    ("extrapolation", _extrapolation),
-    ("start", _start),
-    ("drift", _drift),
-    ("offset", _offset),
-    ("gain", _gain),
-    ("delay", _delay),
-    ("loop", _loop),
-)
-
-
-def _spikes(residual: FloatArray, steps: FloatArray) -> BoolArray:
-    """Tell readings that stand alone: far from their neighbours, where the drive does not jump.
-
-    None, if they add little to the variance of what changes from sample to sample.
-    """
-    if residual.size < 20:
-        return np.zeros(residual.size, dtype=bool)
-    # Against the line between the readings two before and two after: spikes are short.
-    padded = np.pad(residual, 2, mode="reflect")
-    beside = residual - (padded[:-4] + padded[4:]) / 2
-    fast = 1.4826 * float(np.median(np.abs(beside)))
-    fast = max(fast, 1e-6 * float(np.ptp(residual)))
-    jumps = ndimage.maximum_filter1d(np.abs(steps), 5)
-    # As long as they are few; many are not outliers.
-    far = (np.abs(beside) > SPIKE * fast) & (np.abs(beside) > jumps)
-    # The top of something broader does not count.
-    level = np.maximum(np.abs(padded[:-4]), np.abs(padded[4:]))
-    far &= np.abs(beside) > 0.5 * level
-    # A spike throws its neighbours off too, by half.
-    far &= np.abs(beside) > 0.75 * ndimage.maximum_filter1d(np.abs(beside), 5)
-    matters = _energy(beside[far]) > SPIKE_PART * residual.size * fast**2
-    few = np.sum(far) <= 0.05 * residual.size
-    return far & (matters and bool(few))
-
-
-def cause(kind: Kind, r: Residuals, settled: float | None = None) -> Cause:
-    """Put a cause and its fix into words; ``settled`` is when an odd start ends, if known."""
-    text, for_fit, for_other = _WORDS[kind]
-    until = _settled(r) if settled is None else settled
-    if kind == "start" and r.training:  # more than a few percent of the drive are not left out
-        steps = np.abs(np.diff(r.voltage, prepend=r.voltage[0]))
-        if steps[r.time < until].sum() > MOST_LEFT_OUT * steps.sum():
-            for_fit = SETTLE_FIRST
-    words = {
-        "name": r.name,
-        "begin": f"{r.time[0]:.4g}",
-        "settled": f"{until:.4g}",
-        "size": f"{np.mean(r.residual):+.3g}",
-        "low": f"{r.fitted[0]:.4g}",
-        "high": f"{r.fitted[1]:.4g}",
-        "spikes": _windows(r),
-        "told": f"{r.told_until:.4g}",
-    }
-    return Cause(kind, text.format(**words), (for_fit if r.training else for_other).format(**words))
-
-
-def _settled(r: Residuals) -> float:
-    """Time from which on the residuals are as large as in the record's second half, s."""
-    late = r.time >= (r.time[0] + r.time[-1]) / 2
-    level = np.sqrt(np.mean(r.residual[late] ** 2))
-    above = np.flatnonzero((np.abs(r.residual) > 3 * level) & ~late)
-    # To a tenth of a second, or a hundredth of the record if that is less.
-    step = 10 ** np.floor(np.log10(max(r.time[-1] - r.time[0], r.interval) / 10))
-    last = float(r.time[above[-1]]) if above.size else float(r.time[0])
-    return float(np.ceil(last / min(step, 0.1)) * min(step, 0.1))
-
-
-def _windows(r: Residuals) -> str:
-    """Return the windows of the first spikes, as ``exclude`` takes them."""
-    windows = [f"[{t:.6g}, {t + r.interval:.6g}]" for t in r.time[r.spikes][:NAMED]]
-    return ", ".join(windows) + (", ..." if np.sum(r.spikes) > NAMED else "")
-
-
-# What a cause is called, and its fix: where the record was fitted, and where it was not.
-_WORDS: dict[Kind, tuple[str, str, str]] = {
+# What a cause is called, and what to do about it.
+WORDS: Mapping[str, tuple[str, str]] = {
     "sign": (
         "reversed sign of the displacement",
-        "change the sign of the displacement in the file",
         "change the sign of the displacement in the file",
     ),
     "outliers": (
         "outliers",
-        "set exclude = [{spikes}] in [record]",
         "empty their cells in the file, at {spikes} s: they are missing readings then",
-    ),
-    "lead-in": (
-        "a start that the lead-in does not show (a transient, a drift, or another actuator)",
-        "set lead_in_from = {told} in [validation.{name}]",
-        "set lead_in_from = {told} in [validation.{name}], or predict with --lead-in-from {told}; "
-        "a longer --lead-in or a --window may help too",
     ),
     "start": (
         "the start of the record (large residuals until {settled} s)",
-        "set exclude = [[{begin}, {settled}]] in [record]",
         "set lead_in_from = {settled} in [validation.{name}], or predict with "
         "--lead-in-from {settled}",
     ),
+    "drift": (
+        "a drift of the readings",
+        "validate a shorter part: set window in [validation.{name}], or predict with --window",
+    ),
     "offset": (
         "an offset of {size} um",
-        "free the offset: remove [parameters.offset]",
         "set own_offset = true and a longer lead_in in [validation.{name}], or predict with "
         "--lead-in and without --same-offset",
     ),
-    "drift": (
-        "a drift of the readings",
-        "measure again after a longer warm-up",
-        "validate a shorter part: set window in [validation.{name}], or predict with --window",
-    ),
-    "extrapolation": (
-        "extrapolation beyond the {low} to {high} V of the training",
-        "train on a record that spans this range",
-        "train on a record that spans this range, or predict a --window within these voltages",
-    ),
-    "gain": (
-        "another gain (another actuator, load or sensor range)",
-        "give d a wider prior in [parameters.d]",
-        "fit this record itself: bwbayes run CONFIG --record FILE",
-    ),
+    "gain": ("another gain (another actuator, load or sensor range)", REFIT),
     "delay": (
         "a delay (another hold of the voltage, or dynamics that the model lacks)",
-        'set hold in [model], or dynamics = "second-order" there',
         'set voltage_is to "command" or "output", whichever it is, in [validation.{name}]',
     ),
-    "loop": (
-        "loop-shaped residuals (model too simple, or a different actuator)",
-        'free the exponent by a prior in [parameters.exponent], or set dynamics = "second-order" '
-        "in [model]",
-        "fit this record itself: bwbayes run CONFIG --record FILE",
-    ),
+    "loop": ("loop-shaped residuals (model too simple, or a different actuator)", REFIT),
     "noise": (
         "noise of another size than in training",
-        'set noise = "discrepancy" in [model]',
         "train on a record of this sensor with this sampling",
     ),
-    "unknown": (
-        "unknown (no pattern in the residuals)",
-        "look at the residuals in the report",
-        "look at the residuals in the figure; train on a record like this one",
+    "extrapolation": (
+        "extrapolation beyond the {span} of the training",
+        "train on a record that spans this range, or predict a --window within {span}",
     ),
 }

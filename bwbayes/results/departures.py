@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special, stats
 
 from bwbayes.arrays import BoolArray
+from bwbayes.data.io.grid import clock
 from bwbayes.results.bands import LEVELS, Bands
 from bwbayes.results.standard import Standard
 
@@ -17,8 +18,8 @@ __all__ = [
     "ALARM",
     "DOUBT",
     "coverage",
+    "extremes",
     "leaning",
-    "locally",
     "missed",
     "percent",
     "size",
@@ -42,11 +43,9 @@ ODDS = 1.5
 # Bands count as too wide where the residuals are smaller than they say by this factor or more.
 TOO_WIDE = 0.5
 
-# Residuals beyond this many sds count as this many, where their size is judged.
-FAR = 6.0
-
-# Readings in a row that are judged by themselves, so that a bad start is not lost in a long record.
-IN_A_ROW = 5
+# So many readings so many sds off are a failure by themselves, so that a bad start or spikes are
+# not lost in a long record: of a good one a reading is that far off once in five hundred million.
+EXTREME, FAR = 5, 6.0
 
 
 def coverage(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[str, float]]:
@@ -79,14 +78,11 @@ def size(standard: Standard) -> list[tuple[str, float]]:
         (standard.z, standard.for_size, ""),
         (standard.varying, standard.for_varying, " about their mean"),
     ):
-        # A few spikes are told as such.
-        square = float(np.mean(np.clip(z, -FAR, FAR) ** 2))
+        square = float(np.mean(z**2))
         chance = float(stats.f.sf(square, worth, standard.known))
         if square > ODDS:
-            ratio = float(np.sqrt(np.mean(z**2)))
-            text = (
-                f"the residuals are {ratio:.2g} times as large{about} as the sensor band predicts"
-            )
+            ratio = f"{np.sqrt(square):.2g} times as large{about}"
+            text = f"the residuals are {ratio} as the sensor band predicts"
             found.append((text, chance))
     return _least_likely(found)
 
@@ -120,17 +116,17 @@ def too_wide(standard: Standard) -> list[str]:
     return [f"the sensor band is {1 / max(np.sqrt(square), 1e-9):.2g} times too wide"]
 
 
-def locally(bands: Bands, judged: BoolArray, standard: Standard) -> list[str]:
-    """Say where readings in a row are farther off than any good record has them."""
-    if standard.z.size < IN_A_ROW:
-        return []
-    rows = np.convolve(standard.z, np.ones(IN_A_ROW) / IN_A_ROW, mode="valid")
-    at = int(np.argmax(np.abs(rows)))
+def extremes(bands: Bands, judged: BoolArray, standard: Standard) -> list[str]:
+    """Say that several readings are farther off than a good record has any."""
     # A noise whose size is hardly known may well be larger here.
-    if np.abs(rows[at]) <= FAR * np.exp(2 * standard.unsure):
+    far = np.flatnonzero(np.abs(standard.z) > FAR * np.exp(2 * standard.unsure))
+    if far.size < EXTREME:
         return []
+    first = clock(bands.time[judged][far[0]], bands.interval)
+    largest = float(np.max(np.abs(standard.z)))
     return [
-        f"at {bands.time[judged][at]:.4g} s the readings lie {abs(rows[at]):.2g} SDs off the mean"
+        f"{far.size} readings lie more than {FAR:g} SDs off the mean, first at {first} s, the "
+        f"farthest {largest:.2g} SDs"
     ]
 
 

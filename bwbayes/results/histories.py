@@ -3,7 +3,8 @@
 Most operators' states are one number, ``initial``. Those that remember extrema have more: how far
 earlier drives went leaves states of their own, and each such range is a history. What a lead-in
 says of a history, and of the states in it, is computed on a grid that closes in on where it
-allows them; every draw then chooses its own.
+allows them. There may be dozens of histories, and draws think much alike of them: then a few draws
+are asked on grids, and the others choose among what these have drawn, by importance.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
@@ -31,8 +33,13 @@ IMPROBABLE = 10.0
 # The grid is fine enough when neighbours within two nats of the best node differ by less than this.
 FINE = 1.5
 
-# Draws that say which histories are possible at all: asking every draw about each takes long.
-FEW = 50
+# Draws that are asked about each of many histories, and pairs of a history and a state that they
+# draw from these; so many of them are proposed to each of the other draws.
+FEW, POOL, PROPOSED = 50, 500, 64
+
+# Proposals of which effectively fewer are left do not cover what a draw allows (of ten draws of a
+# normal distribution one is beyond 1.6 sds).
+COVERED = 4.0
 
 # Cells between two nodes that a state is chosen from.
 BETWEEN = 8
@@ -51,8 +58,8 @@ class Histories:
         """Ask every draw's own likelihood about it; return answers (draws, ...)."""
         groups = [np.flatnonzero(self.which == k) for k in range(len(self.likelihoods))]
         answers = [
-            ask(one, theta[rows])
-            for one, rows in zip(self.likelihoods, groups, strict=True)
+            ask(likelihood, theta[rows])
+            for likelihood, rows in zip(self.likelihoods, groups, strict=True)
             if rows.size
         ]
         back = np.argsort(np.concatenate(groups))
@@ -97,7 +104,7 @@ class States:
         self.ordered = np.stack([low, high])
         if alone:
             ranges = narrower(actuator.span, further=(1.0,))
-            left = [operator.left(column, voltage, one) for one in ranges]
+            left = [operator.left(column, voltage, swept) for swept in ranges]
             self.ordered = np.sort(np.concatenate(left), axis=0)
             self.ordered[0] = np.minimum(self.ordered[0], low)
             self.ordered[-1] = np.maximum(self.ordered[-1], high)
@@ -167,34 +174,96 @@ def chosen(
 
     Beforehand all histories are equally probable, and in each all :class:`States`.
     """
-    draws = np.arange(len(theta))
+    draws = len(theta)
     alone = len(likelihoods) == 1
-    likelihoods = _possible(likelihoods, theta)
-    states = [States(one, theta, alone=alone) for one in likelihoods]
-    if alone and not states[0].open:
-        return Histories(likelihoods, np.zeros_like(draws)), states[0].at(np.zeros(draws.size))
-    grids = [_grid(*both) for both in zip(likelihoods, states, strict=True)]
-    which = np.zeros_like(draws)
+    if alone and not States(likelihoods[0], theta, alone=True).open:
+        which, place = np.zeros(draws, dtype=np.int64), np.zeros(draws)
+    elif alone or draws < 2 * FEW:
+        which, place, _ = _by_grids(likelihoods, theta, generator)
+    else:
+        which, place = _by_importance(likelihoods, theta, generator)
+    histories = Histories(likelihoods, which)
+    return histories, _begun(histories, theta, place)
+
+
+def _begun(histories: Histories, theta: FloatArray, place: FloatArray) -> FloatArray:
+    """Return θ (draws, parameters) with the states at places (draws,) of the draws' histories."""
+    alone = len(histories.likelihoods) == 1
+    (begun,) = histories.each(
+        np.column_stack([theta, place]),
+        lambda likelihood, rows: (States(likelihood, rows[:, :-1], alone=alone).at(rows[:, -1]),),
+    )
+    return begun
+
+
+def _by_grids(
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    generator: np.random.Generator,
+    each: int = 1,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Draw histories and places, so many for each draw, and the log evidence (draws,) for all.
+
+    Those of one draw follow one another, (draws * each,).
+    """
+    states = [States(likelihood, theta, alone=len(likelihoods) == 1) for likelihood in likelihoods]
+    grids = [_grid(*pair) for pair in zip(likelihoods, states, strict=True)]
+    evidence = np.stack([grid.evidence for grid in grids])
+    rows = np.repeat(np.arange(len(theta)), each)
+    best = np.max(evidence, axis=0)
+    weight = np.cumsum(np.exp(evidence - best), axis=0)
+    which = np.zeros(rows.size, dtype=np.int64)
     if len(grids) > 1:
-        evidence = np.stack([grid.evidence for grid in grids])
-        weight = np.cumsum(np.exp(evidence - np.max(evidence, axis=0)), axis=0)
-        which = np.sum(weight < uniform(generator, draws.size) * weight[-1], axis=0)
-    places, density = (np.stack([grid[i] for grid in grids])[which, :, draws].T for i in range(2))
+        which = np.sum(weight[:, rows] < uniform(generator, rows.size) * weight[-1, rows], axis=0)
+    places, density = (np.stack([grid[i] for grid in grids])[which, :, rows].T for i in range(2))
     # In one of many histories a place is the part of states below, whichever of them it is.
-    place = _drawn(places, _weights(states[0], places, density), uniform(generator, draws.size))
-    state = np.stack([one.placed(place) for one in states])[which, draws]
-    begun = likelihoods[0].table.replaced(theta, "initial", state)
-    return Histories(likelihoods, which), begun
+    cells = _weights(states[0], places, density)
+    place = _drawn(places, cells, uniform(generator, rows.size))
+    return which, place, best + np.log(weight[-1] / len(grids))
 
 
-def _possible(likelihoods: tuple[Likelihood, ...], theta: FloatArray) -> tuple[Likelihood, ...]:
-    """Leave out the histories that the lead-in rules out with each of a few of the draws."""
-    few = theta[:: len(theta) // FEW] if len(theta) >= 2 * FEW else theta[:0]
-    if len(likelihoods) == 1 or not few.size:
-        return likelihoods
-    told = np.stack([_grid(one, States(one, few, alone=False)).evidence for one in likelihoods])
-    possible = np.any(told > np.max(told, axis=0) - IMPROBABLE, axis=1)
-    return tuple(one for one, able in zip(likelihoods, possible, strict=True) if able)
+def _by_importance(
+    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+) -> tuple[IntArray, FloatArray]:
+    """Draw histories and places (draws,) from those that a few draws would draw.
+
+    With the likelihood Lⱼ and the evidence Zⱼ of J of the draws, pairs that these have drawn in
+    equal numbers have the density Σ Lⱼ / (J Zⱼ) beside the prior. So a draw with the likelihood L
+    takes one of those that are proposed to it with a weight of L / Σ (Lⱼ / Zⱼ). Draws that few
+    proposals suit are asked on grids of their own.
+    """
+    draws = len(theta)
+    few = np.arange(0, draws, draws // FEW)
+    each = -(-POOL // few.size)
+    pool_which, pool_place, evidence = _by_grids(likelihoods, theta[few], generator, each)
+    pool = np.arange(pool_which.size)
+
+    def density(rows: IntArray, proposed: IntArray) -> FloatArray:
+        """Log density of the lead-in, of draws and proposals (any, any)."""
+        histories = Histories(likelihoods, pool_which[proposed].ravel())
+        start = _begun(histories, theta[rows.ravel()], pool_place[proposed].ravel())
+        (values,) = histories.each(start, lambda likelihood, its: (likelihood.log_density(its),))
+        return np.nan_to_num(values.reshape(rows.shape), nan=-np.inf, posinf=-np.inf)
+
+    asked = density(*np.broadcast_arrays(few[:, np.newaxis], pool))
+    pooled = logsumexp(asked - evidence[:, np.newaxis], axis=0)
+    # Spread evenly over the pool, from another place for each draw.
+    apart = pool.size * np.arange(PROPOSED) // PROPOSED
+    proposed = generator.permutation(pool)[
+        (generator.integers(pool.size, size=draws) + apart[:, np.newaxis]) % pool.size
+    ]
+    rows = np.broadcast_to(np.arange(draws), proposed.shape)
+    log_weight = density(rows, proposed) - pooled[proposed]
+    # Where none is possible all weights are zero.
+    weight = np.exp(log_weight - np.max(log_weight, axis=0, initial=-1e300))
+    total = np.cumsum(weight, axis=0)
+    index = np.sum(total < uniform(generator, draws) * total[-1], axis=0)
+    pick = proposed[index, np.arange(draws)]
+    which, place = pool_which[pick], pool_place[pick]
+    alone = np.flatnonzero(~(total[-1] ** 2 > COVERED * np.sum(weight**2, axis=0)))
+    if alone.size:
+        which[alone], place[alone], _ = _by_grids(likelihoods, theta[alone], generator)
+    return which, place
 
 
 def _grid(likelihood: Likelihood, states: States) -> _Grid:
@@ -209,8 +278,8 @@ def _grid(likelihood: Likelihood, states: States) -> _Grid:
         )
     for _ in range(ROUNDS):
         places = np.linspace(low, high, NODES)
-        every = np.concatenate([states.at(place) for place in places])
-        density = likelihood.log_density(every).reshape(NODES, draws)
+        nodes = np.concatenate([states.at(place) for place in places])
+        density = likelihood.log_density(nodes).reshape(NODES, draws)
         density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
         best = np.max(density, axis=0)
         density = np.maximum(density - best, -1e3)

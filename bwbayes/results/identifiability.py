@@ -9,13 +9,14 @@ posterior itself, which trusts the noise model, may look surer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
@@ -23,7 +24,16 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.drive import monotone_stretches, turning_points
 from bwbayes.sampling.diagnostics import pareto_k
 
-__all__ = ["Sway", "percent", "remarks", "spectrum", "stretches_once", "sway", "undetermined"]
+__all__ = [
+    "LEFT_OPEN",
+    "Sway",
+    "combined",
+    "percent",
+    "spectrum",
+    "stretches_once",
+    "sway",
+    "undetermined",
+]
 
 # A model discrepancy that no Bouc-Wen fit of a piezo actuator is free of, part of the range.
 DISCREPANCY = 0.01
@@ -33,6 +43,9 @@ SAME_START = 0.01
 
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
+
+# Members of a combination have this fraction of its largest component or more.
+MEMBER = 0.2
 
 # The prior decides where one twice as wide moves a mean by this part of its sd, or widens it so.
 MOVED, WIDENED = 0.3, 1.2
@@ -77,21 +90,10 @@ class Sway(NamedTuple):
         return self.moved >= MOVED or self.widened >= WIDENED or self.part > WIDE
 
 
-def undetermined(posterior: Posterior, point: PointFit) -> list[str]:
-    """Name the combinations of loop parameters that the record does not determine.
+def undetermined(posterior: Posterior, point: PointFit, draws: FloatArray) -> Iterator[Finding]:
+    """Yield combinations of loop parameters that the record does not determine.
 
-    ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
-    while the other falls.
-    """
-    names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
-    if not names:
-        return []
-    parts, directions = spectrum(posterior, point)
-    return [_combination(d, names) for d in directions.T[parts > LEFT_OPEN]]
-
-
-def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[str]:
-    """Say, a line each, what the record does not tell, what decides then, and what to measure.
+    Each says how much of the prior's sd is left, what decides then, and what to measure.
 
     Parameters
     ----------
@@ -99,24 +101,20 @@ def remarks(posterior: Posterior, point: PointFit, draws: FloatArray) -> list[st
         The posterior and its point fit.
     draws
         (draws, free), of the posterior or of its Gaussian approximation
-        (:func:`bwbayes.inference.conflict.around`).
+        (:func:`bwbayes.diagnosis.conflict.around`).
     """
     names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
     if not names:
-        return []
+        return
     parts, directions = spectrum(posterior, point)
-    lines = []
     for i in np.flatnonzero(parts > LEFT_OPEN):
-        combination = _combination(directions[:, i], names)
-        left = percent(parts[i])
-        text = f"the record does not determine {combination}: {left} of the prior's sd left"
+        combination = combined(directions[:, i], names)
+        text = f"{combination}: {percent(parts[i])} of the prior's SD remains"
         if i + 1 < parts.size:
-            following = _combination(directions[:, i + 1], names)
-            text += f", next {following} with {parts[i + 1]:.0%}"
+            text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
         members = [name for name in names if name in combination.split()]
         decider = _decider(posterior.prior, draws, members)
-        lines.append(f"{text}; {decider}; {_advice(posterior, draws, members)}")
-    return lines
+        yield Finding("not identifiable", f"{text}; {decider}", _advice(posterior, draws, members))
 
 
 def percent(left: float) -> str:
@@ -312,9 +310,16 @@ def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, flo
     return weights, voltage.size / len(stretches)
 
 
-def _combination(move: FloatArray, names: list[str]) -> str:
-    move = move / move[np.argmax(np.abs(move))]
-    order = np.argsort(-np.abs(move), kind="stable")
-    first, *others = [i for i in order if abs(move[i]) > 0.2]
-    parts = [f"{'with' if move[i] > 0 else 'against'} {names[i]}" for i in others]
-    return " ".join([names[first], *parts])
+def combined(direction: FloatArray, names: Sequence[str]) -> str:
+    """Name a direction (names,) in words, the largest component first.
+
+    ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
+    while the other falls; components below :data:`MEMBER` of the largest are left out.
+    """
+    shares = direction / direction[np.argmax(np.abs(direction))]
+    first, *others = [
+        i for i in np.argsort(-np.abs(shares), kind="stable") if abs(shares[i]) > MEMBER
+    ]
+    return " ".join(
+        [names[first], *(f"{'with' if shares[i] > 0 else 'against'} {names[i]}" for i in others)]
+    )

@@ -1,12 +1,12 @@
 """Innovations: what each reading adds to those before it, and whether that is pure chance.
 
 Where model and noise model are right, a residual less what the readings before it predict, over
-its standard deviation, is an independent standard normal number. Five things can be seen in these
+its standard deviation, is an independent standard normal number. Three things can be seen in these
 innovations that the residuals hide: whether they are white, whether something oscillates in them,
-whether they are normal, whether their size depends on the drive (its rate, its voltage, its
-direction), and whether the record starts as it goes on. A remark is made where a departure is both
-beyond chance and large enough to matter; on a record that the model describes this happens to fewer
-than one in a hundred.
+and whether their mean depends on the drive (its rate, its voltage, its direction). Heavy tails, and
+noise that grows with the drive, are explanations (:mod:`bwbayes.diagnosis.noise`). A departure is
+found where it is both beyond chance and large enough to matter; on a record that the model
+describes this happens to fewer than one in a hundred.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import stats
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.noise import SteadyState
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.drive import rate
@@ -33,11 +34,9 @@ __all__ = [
     "GROUPS",
     "LAGS",
     "Innovations",
-    "OddStart",
+    "departures",
     "innovations",
     "numbers",
-    "odd_start",
-    "remarks",
 ]
 
 # Lags of the autocorrelation that is looked at.
@@ -46,9 +45,8 @@ LAGS = 40
 # Probability of a false alarm of each of the tests; there are about ten.
 ALARM = 1e-4
 
-# Departures that are smaller do not matter, however sure they are: an autocorrelation; an excess
-# kurtosis; a ratio of sds between parts of the drive; a mean in sds.
-CORRELATED, HEAVY, UNEVEN, ONE_SIDED = 0.1, 1.0, 1.3, 0.15
+# Smaller departures do not matter, however sure they are: an autocorrelation; a mean in sds.
+CORRELATED, ONE_SIDED = 0.1, 0.15
 
 # Parts of the drive that are compared.
 GROUPS = 3
@@ -58,13 +56,6 @@ NAMED = 3
 
 # Fewer innovations show nothing.
 FEWEST = 100
-
-# A start is odd where its innovations sum up to so many sds, and to so many times what any other
-# stretch of that length does.
-ODD, MORE = 5.5, 2.0
-
-# An odd start has ended where what comes next is this part as odd.
-ENDED = 0.6
 
 
 @dataclass(frozen=True)
@@ -133,15 +124,6 @@ class Innovations:
         return tuple((name, self.white[place == i]) for i, name in enumerate(names))
 
 
-@dataclass(frozen=True)
-class OddStart:
-    """A start of the record that does not go with the rest: until when, and how far off."""
-
-    begin: float
-    until: float
-    size: float
-
-
 def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> Innovations:
     """Return the innovations of the fitted readings at one set of free parameters (free,).
 
@@ -162,53 +144,20 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     return Innovations(time, white[0, 0], voltage, changes, residual[0], apart, steady)
 
 
-def remarks(series: Innovations) -> tuple[str, ...]:
-    """Say, one line each, where the innovations depart from what the noise model assumes."""
+def departures(series: Innovations) -> tuple[Finding, ...]:
+    """Return where the innovations depart from what the noise model assumes."""
     if series.white.size < FEWEST:
         return ()
     oscillations = series.spectrum().lines
     others = [line for line in oscillations if not line.at_drive]
     rest = without_lines(series.time, series.white, others)
-    lines = [*_oscillating(oscillations), *_heavy(series)]
+    findings = [*_oscillating(oscillations)]
     # An oscillation correlates, and spoils the noise's parameters, as far as it is large.
     if np.var(rest) > (1 - CORRELATED) * np.var(series.white):
-        lines += _correlated(series)
+        findings += _correlated(series)
     for what in ("rate", "voltage", "direction"):
-        lines += _uneven(series, what)
-    return tuple(f"noise model: {line}" for line in lines)
-
-
-def odd_start(series: Innovations) -> OddStart | None:
-    """Find a start of the record that the noise model cannot have made, if there is one.
-
-    The first innovations are summed up over 4, 8, ... readings, up to an eighth of all. A sum that
-    is odd is larger than chance allows, and than all sums of as many readings in the second half.
-    The start lasts until what comes after it is odd no longer.
-    """
-    size = _oddness(series.white)
-    if not size:
-        return None
-    first = 0
-    # Up to a third of the record: what is odd for longer is not a start.
-    while first < series.white.size // 3 and _oddness(series.white[first:], ENDED):
-        first = max(first + 1, round(1.2 * first))
-    return OddStart(float(series.time[0]), float(series.time[first]), size)
-
-
-def _oddness(white: FloatArray, part: float = 1.0) -> float:
-    """Return the largest odd sum of first innovations, in sds; 0 if none is odd.
-
-    ``part`` is that of what is odd elsewhere.
-    """
-    size, largest, length = white.size, 0.0, 4
-    while length <= size // 8:
-        sums = ndimage.uniform_filter1d(white, length, mode="nearest") * np.sqrt(length)
-        first = float(abs(np.sum(white[:length])) / np.sqrt(length))
-        usual = float(np.max(np.abs(sums[size // 2 : size - length])))
-        if first > part * max(ODD, MORE * usual):
-            largest = max(largest, first)
-        length *= 2
-    return largest
+        findings += _one_sided(series, what)
+    return tuple(findings)
 
 
 def numbers(series: Innovations) -> dict[str, object]:
@@ -234,71 +183,46 @@ def numbers(series: Innovations) -> dict[str, object]:
     }
 
 
-def _oscillating(lines: Sequence[SpectralLine]) -> Iterator[str]:
+def _oscillating(lines: Sequence[SpectralLine]) -> Iterator[Finding]:
     """Name the strongest lines of the residual's spectrum, those of the drive by themselves."""
     for at_drive, fix in (
         (False, "look for the source: a cable's shield and ground, a vibration"),
-        (True, "the model misses something that follows the drive"),
+        (True, "try what explains it: bwbayes run --improve"),
     ):
         named = [line.description for line in lines if line.at_drive == at_drive][:NAMED]
         if named:
             plural = "a line" if len(named) == 1 else "lines"
-            yield f"the residual has {plural} at {', '.join(named)}: {fix}"
+            yield Finding("noise model", f"the residual has {plural} at {', '.join(named)}", fix)
 
 
-def _correlated(series: Innovations) -> list[str]:
+def _correlated(series: Innovations) -> Iterator[Finding]:
     correlation = series.correlation
     bound = stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
     lag = int(np.argmax(np.abs(correlation)))
-    if abs(correlation[lag]) <= max(bound, CORRELATED):
-        return []
-    after = series.time[lag + 1] - series.time[0]
-    return [
-        f"innovations {after:.3g} s apart correlate by {correlation[lag]:.2f}, and should not: "
-        "the discrepancy does not forget exponentially, or the sensor filters"
-    ]
+    if abs(correlation[lag]) > max(bound, CORRELATED):
+        after = series.time[lag + 1] - series.time[0]
+        yield Finding(
+            "noise model",
+            f"innovations {after:.3g} s apart correlate by {correlation[lag]:.2f}",
+            "check whether the sensor filters; else the discrepancy does not forget exponentially",
+        )
 
 
-def _heavy(series: Innovations) -> list[str]:
-    excess, error = series.kurtosis, np.sqrt(24 / series.white.size)
-    # Kurtosis of few numbers is skewed: one more sd than its size would need.
-    if excess <= max(HEAVY, (stats.norm.isf(ALARM) + 2) * error):
-        return []
-    far = int(np.sum(np.abs(series.white) > 4))
-    return [
-        f"the innovations have heavy tails (excess kurtosis {excess:.1f}, {far} of "
-        f"{series.white.size} beyond 4 sds): look for outliers, or for jumps of the drive"
-    ]
-
-
-def _uneven(series: Innovations, what: str) -> list[str]:
-    """Compare the sds, and the means, of the innovations in parts of the drive."""
+def _one_sided(series: Innovations, what: str) -> Iterator[Finding]:
+    """Compare the means of the innovations in parts of the drive."""
     groups = [(name, values) for name, values in series.by(what) if values.size >= FEWEST // GROUPS]
     if len(groups) < 2:
-        return []
-    lines = []
-    sds = [float(np.std(values)) for _, values in groups]
-    high, low = int(np.argmax(sds)), int(np.argmin(sds))
-    # The variance of tails that are heavy is less sure.
-    heavy = 1 + max(series.kurtosis, 0) / 2
-    error = np.sqrt(heavy * sum(0.5 / values.size for _, values in groups))
-    ratio = sds[high] / max(sds[low], np.finfo(float).tiny)
-    bound = stats.norm.isf(ALARM / 6) * error
-    if ratio > UNEVEN and np.log(ratio) > bound:
-        lines.append(
-            f"the innovations are {ratio:.2g} times as large where the {_part(what, groups[high])} "
-            f"as where it is {groups[low][0]}: the noise depends on the drive's {what}"
-        )
-    means = [float(np.mean(v)) * np.sqrt(v.size) / max(float(np.std(v)), 1e-300) for _, v in groups]
+        return
+    means = [
+        float(np.mean(values)) * np.sqrt(values.size) / max(float(np.std(values)), 1e-300)
+        for _, values in groups
+    ]
     worst = int(np.argmax(np.abs(means)))
     mean = float(np.mean(groups[worst][1]))
     if abs(means[worst]) > stats.norm.isf(ALARM / 6) and abs(mean) > ONE_SIDED:
-        lines.append(
-            f"the innovations average {mean:+.2f} sds where the {_part(what, groups[worst])}: "
-            "the model misses something that follows the loop"
+        subject = "drive" if what == "rate" else "voltage"
+        yield Finding(
+            "noise model",
+            f"the innovations average {mean:+.2f} SD where the {subject} is {groups[worst][0]}",
+            "try what explains it: bwbayes run --improve",
         )
-    return lines
-
-
-def _part(what: str, group: tuple[str, FloatArray]) -> str:
-    return f"voltage is {group[0]}" if what != "rate" else f"drive is {group[0]}"

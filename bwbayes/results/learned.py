@@ -12,7 +12,7 @@ know before quoting a single parameter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import arviz_base
@@ -21,8 +21,9 @@ from arviz_stats import psense  # type: ignore[attr-defined]  # not in an __all_
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.results.identifiability import percent
+from bwbayes.results.identifiability import LEFT_OPEN, combined, percent
 from bwbayes.shown import brief
 
 __all__ = ["Combination", "Learned", "Taught", "learned", "numbers"]
@@ -33,11 +34,8 @@ PRIOR_DRAWS, DRAWS = 4000, 4000
 # Sensitivities above this are not small (Kallioinen and others, section 4).
 SENSITIVE = 0.05
 
-# Combinations that are named: so many, where this part of the prior's sd or more is left.
-COMBINATIONS, LEFT = 3, 1 / 3
-
-# Members of a combination have this part of its largest weight or more.
-MEMBER = 0.3
+# Combinations that are named, at most.
+COMBINATIONS = 3
 
 # Normal scores beyond this have no probability that a float can hold.
 FARTHEST = 37.0
@@ -77,13 +75,13 @@ class Combination:
 
 @dataclass(frozen=True)
 class Learned:
-    """What a record taught: by parameter, the worst combinations, and what to say of it."""
+    """What a record taught: by parameter, the worst combinations, and what the prior decides."""
 
     __repr__ = brief
 
     parameters: Mapping[str, Taught]
     combinations: tuple[Combination, ...]
-    remarks: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def learned(
@@ -122,7 +120,7 @@ def learned(
         for i, name in enumerate(prior.free_names)
     }
     combinations = tuple(_combinations(prior.free_names, before, after))
-    return Learned(parameters, combinations, tuple(_remarks(parameters, combinations)))
+    return Learned(parameters, combinations, tuple(_findings(parameters, combinations)))
 
 
 def numbers(taught: Learned) -> dict[str, object]:
@@ -130,15 +128,15 @@ def numbers(taught: Learned) -> dict[str, object]:
     return {
         "parameters": {
             name: {
-                "contraction": one.contraction,
-                "prior_sensitivity": one.prior,
-                "likelihood_sensitivity": one.likelihood,
-                "prior_decides": one.prior_decides,
+                "contraction": parameter.contraction,
+                "prior_sensitivity": parameter.prior,
+                "likelihood_sensitivity": parameter.likelihood,
+                "prior_decides": parameter.prior_decides,
             }
-            for name, one in taught.parameters.items()
+            for name, parameter in taught.parameters.items()
         },
-        "combinations": [asdict(one) for one in taught.combinations],
-        "remarks": list(taught.remarks),
+        "combinations": [asdict(combination) for combination in taught.combinations],
+        "findings": [str(finding) for finding in taught.findings],
     }
 
 
@@ -184,31 +182,28 @@ def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -
     said: list[Combination] = []
     for i in range(len(variances) - 1, -1, -1):
         left = float(np.sqrt(max(variances[i], 0.0)))
-        if left < LEFT or len(said) == COMBINATIONS:
+        if left < LEFT_OPEN or len(said) == COMBINATIONS:
             break
         # How the scores move together along it, and not what picks it out.
         move = posterior @ directions[:, i]
-        said.append(Combination(_worded(move, names), left))
+        said.append(Combination(combined(move, names), left))
     return said
 
 
-def _worded(move: FloatArray, names: Sequence[str]) -> str:
-    move = move / move[np.argmax(np.abs(move))]
-    order = np.argsort(-np.abs(move), kind="stable")
-    first, *others = [i for i in order if abs(move[i]) > MEMBER]
-    parts = [f"{'with' if move[i] > 0 else 'against'} {names[i]}" for i in others]
-    return " ".join([names[first], *parts])
-
-
-def _remarks(parameters: Mapping[str, Taught], combinations: Sequence[Combination]) -> list[str]:
-    said = [
-        f"{name}: the prior decides (power-scaling sensitivity {one.prior:.2f} to the prior, "
-        f"{one.likelihood:.2f} to the readings; contraction {one.contraction:.2f})"
-        for name, one in parameters.items()
-        if one.prior_decides
-    ]
-    if combinations:
-        worst = combinations[0]
-        left = percent(worst.left)
-        said.append(f"determined worst: {worst.text}, with {left} of the prior's sd left")
-    return said
+def _findings(
+    parameters: Mapping[str, Taught], combinations: Sequence[Combination]
+) -> Iterator[Finding]:
+    for name, taught in parameters.items():
+        if taught.prior_decides:
+            yield Finding(
+                name,
+                f"the prior decides (power-scaling sensitivity {taught.prior:.2f} to the prior, "
+                f"{taught.likelihood:.2f} to the readings; contraction {taught.contraction:.2f})",
+                "give it the prior that is known, or a record that shows it",
+            )
+    for combination in combinations[:1]:
+        yield Finding(
+            "determined worst",
+            f"{combination.text}: {percent(combination.left)} of the prior's SD remains",
+            "quote its members together, or add a record that tells them apart",
+        )

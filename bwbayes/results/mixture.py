@@ -17,14 +17,15 @@ from bwbayes.arrays import FloatArray
 
 __all__ = ["VALUES", "crps", "log_density", "quantile", "ranked_values", "stratified_scores"]
 
-# Values of the mixture at a sample, at least.
-VALUES = 4000
+# Values of the mixture at a sample, at least: one of each of as many draws as predictions take, so
+# that a quantile is as sure as the draws themselves make it.
+VALUES = 1000
 
 
 def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     """Draw standard normal scores for posterior draws, (scores, draws).
 
-    With S draws and the least number K of scores that makes S K values 4,000 or more, draw i gets
+    With S draws and the least number K of scores that makes S K values 1,000 or more, draw i gets
     Φ⁻¹((j + (π_j(i) + 1/2) / S) / K) for j = 0 ... K - 1, each π_j a random permutation of
     0 ... S - 1. So each draw has a score in each of K equal parts of the probability, and all
     together have one in each of S K.

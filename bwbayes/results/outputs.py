@@ -61,10 +61,10 @@ def posterior_tree(
             ensembles * walkers, len(values), *values.shape[3:]
         )
 
-    of = {f"_{name}" if len(records) > 1 else "": one for name, one in records.items()}
-    measured = {f"displacement{end}": np.asarray(one.displacement) for end, one in of.items()}
-    driven = {f"voltage{end}": one.voltage for end, one in of.items()}
-    times = {f"time{end}": one.time for end, one in of.items()}
+    of = {f"_{name}" if len(records) > 1 else "": record for name, record in records.items()}
+    measured = {f"displacement{end}": np.asarray(record.displacement) for end, record in of.items()}
+    driven = {f"voltage{end}": record.voltage for end, record in of.items()}
+    times = {f"time{end}": record.time for end, record in of.items()}
     drawn = chains(result.draws)
     tree = arviz_base.from_dict(
         {

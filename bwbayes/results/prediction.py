@@ -187,7 +187,7 @@ def predict_record(
     """
     part = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
-    begun = started(posterior, theta, record, start, generator, part.stop)
+    begun = started(posterior, theta, record, start, generator)
     if part.stop <= begun.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
     bands = _bands(name, _draws(posterior, theta, begun), record, part)

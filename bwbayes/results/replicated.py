@@ -96,36 +96,36 @@ def replicated(
     record
         The record's name; may be left out of one alone.
     """
-    one = posterior.only if record is None else posterior.alone(record).only
+    dataset = posterior.only if record is None else posterior.alone(record).only
     count = min(RECORDS, len(draws))
     chosen = draws[generator.choice(len(draws), count, replace=False)]
     theta = posterior.prior.theta(chosen)
-    rows = one.readings.rows
-    noise = one.table.noise(posterior.table.of(theta, one.name))
+    rows = dataset.readings.rows
+    noise = dataset.table.noise(posterior.table.of(theta, dataset.name))
     middle, spread = _moments(posterior.simulations(theta, rows, record))
-    variance = np.sum(np.square(one.noise.marginal_sd(noise)), axis=0)
+    variance = np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0)
     sd = np.sqrt(np.mean(variance) + spread)
-    voltage, samples = one.voltage[rows], int(rows[-1]) + 1
+    voltage, samples = dataset.voltage[rows], int(rows[-1]) + 1
     # Where readings are missing they are missing in all.
-    neighbours = np.flatnonzero(np.diff(rows) == one.readings.stride)
+    neighbours = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
 
     def looked_at(readings: FloatArray) -> FloatArray:
         return _statistics(readings, voltage, middle, sd, neighbours)
 
-    made, left = [], iter(noise)
+    pieces, noises_left = [], iter(noise)
     # Once more, rather than to keep them all.
     for simulated in posterior.simulations(theta, rows, record):
-        for some in batches(len(simulated), rows.size, LARGEST):
+        for batch in batches(len(simulated), rows.size, LARGEST):
             noises = (
-                one.noise.draw(own[np.newaxis], samples, generator)
-                for own in islice(left, len(simulated[some]))
+                dataset.noise.draw(own[np.newaxis], samples, generator)
+                for own in islice(noises_left, len(simulated[batch]))
             )
             added = np.array([(discrepancy + sensor)[rows] for discrepancy, sensor in noises])
-            made.append(looked_at(simulated[some] + added))
-    every = np.concatenate(made)
-    observed = looked_at(np.asarray(one.readings.values)[np.newaxis])[0]
-    lower, upper = np.quantile(every, [0.025, 0.975], axis=0)
-    p = np.mean(every > observed, axis=0) + 0.5 * np.mean(every == observed, axis=0)
+            pieces.append(looked_at(simulated[batch] + added))
+    replicates = np.concatenate(pieces)
+    observed = looked_at(np.asarray(dataset.readings.values)[np.newaxis])[0]
+    lower, upper = np.quantile(replicates, [0.025, 0.975], axis=0)
+    p = np.mean(replicates > observed, axis=0) + 0.5 * np.mean(replicates == observed, axis=0)
     values = np.stack([observed, lower, upper, p], axis=1).tolist()
     return Replicated(
         {name: Statistic(*row) for name, row in zip(STATISTICS, values, strict=True)}, count
@@ -138,13 +138,13 @@ def numbers(checked: Replicated) -> dict[str, object]:
         "records": checked.records,
         "statistics": {
             name: {
-                "observed": one.observed,
-                "lower_95": one.lower,
-                "upper_95": one.upper,
-                "p": one.p,
-                "odd": one.odd,
+                "observed": statistic.observed,
+                "lower_95": statistic.lower,
+                "upper_95": statistic.upper,
+                "p": statistic.p,
+                "odd": statistic.odd,
             }
-            for name, one in checked.statistics.items()
+            for name, statistic in checked.statistics.items()
         },
     }
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results import agreement, innovations, learned, loops, replicated, steps
 from bwbayes.results.agreement import Agreement
@@ -66,6 +67,8 @@ class Result:
         converged.
     agreement
         Of several records, how each agrees with the others, by name; empty unless converged.
+    explanations
+        What may explain each fitted record better, by name, the best first; empty unless converged.
     learned
         What the record taught: prior against posterior; None unless converged.
     replicated
@@ -93,6 +96,7 @@ class Result:
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
     agreement: Mapping[str, Agreement] = field(default_factory=dict)
+    explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
     learned: Learned | None = None
     replicated: Mapping[str, Replicated] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -119,8 +123,8 @@ def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
     ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
-    ``identifiability`` and ``replicated`` are None unless the sampling has converged;
-    ``agreement`` is there for several records alone.
+    ``identifiability``, ``replicated`` and ``explanations`` are None unless the sampling has
+    converged; ``agreement`` is there for several records alone.
     """
     outcome = result.outcome
     known: dict[str, object] = {
@@ -143,6 +147,7 @@ def summary(result: Result) -> dict[str, object]:
         "step_responses": None,
         "identifiability": None,
         "replicated": None,
+        "explanations": None,
     }
     if outcome.converged:
         known["parameters"] = _parameters(result)
@@ -150,10 +155,12 @@ def summary(result: Result) -> dict[str, object]:
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
-        every = {name: innovations.numbers(one) for name, one in result.innovations.items()}
-        if every:
+        whitened = {
+            name: innovations.numbers(series) for name, series in result.innovations.items()
+        }
+        if whitened:
             # Those of one record stand alone, those of several by their names.
-            known["innovations"] = every if len(every) > 1 else next(iter(every.values()))
+            known["innovations"] = whitened if len(whitened) > 1 else next(iter(whitened.values()))
         if result.agreement:
             known["agreement"] = agreement.numbers(result.agreement)
         if result.loops is not None:
@@ -161,8 +168,12 @@ def summary(result: Result) -> dict[str, object]:
         if result.learned is not None:
             known["identifiability"] = learned.numbers(result.learned)
         known["replicated"] = {
-            name: replicated.numbers(one) for name, one in result.replicated.items()
+            name: replicated.numbers(checks) for name, checks in result.replicated.items()
         } or None
+        known["explanations"] = {
+            name: [explanation.numbers for explanation in found]
+            for name, found in result.explanations.items()
+        }
         known["step_responses"] = steps.numbers(result.steps)
     return known
 

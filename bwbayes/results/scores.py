@@ -14,7 +14,7 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.results.bands import LEVELS, Bands, Kind
-from bwbayes.sampling.ensemble import autocorrelation_time
+from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.shown import brief
 
 __all__ = ["Scores", "as_summary", "block_bootstrap_error", "block_length", "score"]
@@ -232,7 +232,7 @@ def block_length(residual: FloatArray) -> int:
     residual
         (samples,) value minus the mean of its band.
     """
-    time = float(autocorrelation_time(residual[:, None, None])[0])
+    time = autocorrelation_time(residual[np.newaxis])
     return max(1, round(BLOCK_TIMES * time)) if np.isfinite(time) else 1
 
 

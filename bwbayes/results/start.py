@@ -31,7 +31,6 @@ from bwbayes.model.operator import Span
 from bwbayes.results.bands import LeadIn
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.histories import Histories, States, chosen, uniform
-from bwbayes.results.transient import switched
 from bwbayes.shown import brief
 
 if TYPE_CHECKING:
@@ -217,9 +216,8 @@ def started(
     record: Record,
     start: Start,
     generator: np.random.Generator,
-    stop: int | None = None,
 ) -> Started:
-    """Give every draw θ (draws, parameters) a start of another record, judged up to a sample.
+    """Give every draw θ (draws, parameters) a start of another record.
 
     Raises
     ------
@@ -233,7 +231,7 @@ def started(
     window = start.window(record, float(np.median(memory)))
     whole = _likelihood(posterior, actuator, record, start, window)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
-    likelihoods = tuple(replace(whole, actuator=replace(actuator, span=one)) for one in earlier)
+    likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
     if window is None:
         return _unseen(likelihoods, theta, generator, settled=start.settled)
     if start.own_offset:
@@ -241,7 +239,7 @@ def started(
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
     histories, begun = chosen(likelihoods, theta, generator)
-    told = _informed(histories, begun, record, window, stop, generator)
+    told = _informed(histories, begun, record, window, generator)
     return going_on(told, likelihoods[0], theta, generator) if start.after else told
 
 
@@ -315,17 +313,19 @@ def _unseen(
     if not alone:
         which = (len(likelihoods) * uniform(generator, draws)).astype(np.int64)
     histories = Histories(likelihoods, which)
-    (sd,) = histories.each(theta, lambda one, some: (one.start_sd(some),))
+    (sd,) = histories.each(theta, lambda likelihood, rows: (likelihood.start_sd(rows),))
     if settled:
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    part = uniform(generator, draws)
+    below = uniform(generator, draws)
     (begun,) = histories.each(
-        np.column_stack([theta, part]),
-        lambda one, some: (States(one, some[:, :-1], alone=alone).drawn(some[:, -1]),),
+        np.column_stack([theta, below]),
+        lambda likelihood, rows: (
+            States(likelihood, rows[:, :-1], alone=alone).drawn(rows[:, -1]),
+        ),
     )
     model, none = first.table.actuator(begun), np.zeros(draws)
-    actuators = tuple(one.actuator for one in likelihoods)
+    actuators = tuple(likelihood.actuator for likelihood in likelihoods)
     start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
     if settled:
         offset = first.actuator.parameters.index("offset")
@@ -338,7 +338,6 @@ def _informed(
     theta: FloatArray,
     record: Record,
     window: slice,
-    stop: int | None,
     generator: np.random.Generator,
 ) -> Started:
     """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
@@ -361,10 +360,9 @@ def _informed(
         float(record.time[window.stop]),
         likelihood.readings.rows.size,
         _p_value(histories, theta, posterior.squares),
-        switched(histories, theta, record, slice(window.start, stop)),
     )
     model = likelihood.table.actuator(begun)
-    actuators = tuple(one.actuator for one in histories.likelihoods)
+    actuators = tuple(likelihood.actuator for likelihood in histories.likelihoods)
     from_rest, which = likelihood.from_rest, histories.which
     known = which, model, unrest, sd, from_rest, lead_in, window.stop
     return Started(actuators, *known, engine=likelihood.engine)
@@ -379,13 +377,15 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
     readings = histories.likelihoods[0].readings.rows
     p = stats.chi2.sf(squares, readings.size)
     if readings.size > MANY:
-        some = slice(None, None, -(-len(theta) // TESTED))
+        few = slice(None, None, -(-len(theta) // TESTED))
         place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
         shapes = np.polynomial.legendre.legvander(place, SLOW).T[1:]
-        tested = replace(histories, which=histories.which[some])
-        (taken,) = tested.each(theta[some], lambda one, few: (one.score(few, shapes).together,))
+        tested = replace(histories, which=histories.which[few])
+        (taken,) = tested.each(
+            theta[few], lambda likelihood, rows: (likelihood.score(rows, shapes).together,)
+        )
         slow = stats.chi2.sf(taken, SLOW)
-        p = np.minimum(2 * np.minimum(p[some], slow), 1.0)
+        p = np.minimum(2 * np.minimum(p[few], slow), 1.0)
     return float(np.mean(p))
 
 

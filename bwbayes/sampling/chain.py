@@ -28,10 +28,10 @@ Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
 
-def thinning(draws: int, most: int = MOST_DRAWS) -> int:
+def thinning(draws: int, limit: int = MOST_DRAWS) -> int:
     """Return of how many steps one is used where a chain has so many draws: a power of two."""
     thin = 1
-    while draws > most * thin:
+    while draws > limit * thin:
         thin *= 2
     return thin
 
@@ -144,8 +144,8 @@ class Chain:
     def _joined(self, phase: Phase, name: str, thin: int) -> FloatArray:
         parts, done = [], 0
         for blocks in self._counting(phase):
-            each = [getattr(block, name) for block in blocks]
+            arrays = [getattr(block, name) for block in blocks]
             first = -(done + 1) % thin  # of steps counted from one, those that thin divides
-            parts.append(np.stack([values[first::thin] for values in each], axis=1))
-            done += len(each[0])
+            parts.append(np.stack([values[first::thin] for values in arrays], axis=1))
+            done += len(arrays[0])
         return np.concatenate(parts)

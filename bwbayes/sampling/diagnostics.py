@@ -20,16 +20,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from emcee.autocorr import auto_window
 from scipy import fft
 from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.sampling.ensemble import autocorrelation_time
 from bwbayes.shown import brief
 
 __all__ = [
     "Check",
     "as_chains",
+    "autocorrelation_time",
     "check",
     "effective_draws",
     "nested_rhat",
@@ -58,6 +59,9 @@ LENGTH = 50
 STILL = 25
 
 TAIL = (0.05, 0.95)
+
+# Sokal's window for an autocorrelation time: the first lag of so many times that time.
+WINDOW = 5
 
 # Digits behind the point beyond which a number is not told from its limit.
 MOST_DIGITS = 9
@@ -96,37 +100,35 @@ class Check:
         """Whether the proposal, if there is one, covers the draws."""
         return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
-    def shortcomings(self, ess: float, part: float = 1.0) -> list[str]:
+    def shortcomings(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
         First what more draws need not cure. Of effective draws, and of autocorrelation times, a
         ``part`` is enough. Every comparison is written so that nan fails it.
         """
         reasons = self.disagreements()
-        fewest = np.min([self.ess_bulk, self.ess_tail])
-        if not fewest >= part * ess:
-            reasons.append(f"ESS {_told(fewest, part * ess)} has not reached {part * ess:g}")
-        times = self.steps / np.max(self.autocorrelation)
-        if not times >= part * LENGTH:
-            least = f"{part * LENGTH:g}"
-            reasons.append(
-                f"{_told(times, part * LENGTH)} autocorrelation times are fewer than {least}"
-            )
+        fewest, draws = np.min([self.ess_bulk, self.ess_tail]), fraction * ess
+        if not fewest >= draws:
+            reasons.append(f"ESS {_beside_limit(fewest, draws)} has not reached {draws:g}")
+        times, length = self.steps / np.max(self.autocorrelation), fraction * LENGTH
+        if not times >= length:
+            shown = _beside_limit(times, length)
+            reasons.append(f"{shown} autocorrelation times are fewer than {length:g}")
         return reasons
 
     def disagreements(self) -> list[str]:
         """Say what is wrong with the draws that there are; empty if nothing is."""
         reasons = []
         if not (self.rhat < LARGEST_RHAT).all():
-            rhat = _told(np.max(self.rhat), LARGEST_RHAT, 3)
+            rhat = _beside_limit(np.max(self.rhat), LARGEST_RHAT, 3)
             reasons.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
-            rhat = _told(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
+            rhat = _beside_limit(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
             reasons.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
         if self.stuck:
             reasons.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
-            shape = _told(self.pareto_k, LARGEST_PARETO_K, 2)
+            shape = _beside_limit(self.pareto_k, LARGEST_PARETO_K, 2)
             reasons.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
         return reasons
 
@@ -151,7 +153,7 @@ class _Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
 AVERAGED = _Averaged()
 
 
-def _told(value: float, limit: float, digits: int = 0) -> str:
+def _beside_limit(value: float, limit: float, digits: int = 0) -> str:
     """Write a value with so many digits, or as many as tell it from the limit that it misses."""
     text = f"{value:.{digits}f}"
     while digits < MOST_DIGITS and float(text) == float(f"{limit:g}") != value:
@@ -160,14 +162,27 @@ def _told(value: float, limit: float, digits: int = 0) -> str:
     return text
 
 
+def autocorrelation_time(chains: FloatArray) -> float:
+    """Integrated autocorrelation time, in steps, of chains (chains, steps) of one parameter.
+
+    As ``emcee.autocorr.integrated_time`` has it, from the mean of the chains' autocorrelations. It
+    is nan where it cannot be told, for instance where nothing moves.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        away = chains - np.mean(chains, axis=1, keepdims=True)
+        away /= np.sqrt(np.sum(away**2, axis=1, keepdims=True))
+        correlation = chains.shape[1] * AVERAGED.autocov(away)[0]
+    time = 2 * np.cumsum(correlation) - 1
+    windowed = float(time[auto_window(time, WINDOW)])
+    return windowed if windowed > 0 else np.nan
+
+
 def times(draws: FloatArray, thin: int = 1) -> FloatArray:
     """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
-    steps, ensembles, walkers, free = draws.shape
-    walks = draws.reshape(steps, ensembles * walkers, free)
     # One parameter at a time: the spectra of all would be many times as large as the draws.
-    each = [autocorrelation_time(walks[..., i : i + 1]) for i in range(free)]
+    columns = np.moveaxis(draws, -1, 0)
     # A thinned series does not tell times below its own step.
-    return thin * np.concatenate(each)
+    return thin * np.array([autocorrelation_time(as_chains(values)) for values in columns])
 
 
 def check(
@@ -197,8 +212,8 @@ def check(
         autocorrelation = times(draws, thin)
     # Where threads silence warnings side by side, as arviz does, the last to end may leave them so.
     with warnings.catch_warnings(), ThreadPoolExecutor(THREADS) as executor:
-        each = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
-        rhat, bulk, tail, mean, walker_rhat = np.array([*each]).T
+        statistics = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
+        rhat, bulk, tail, mean, walker_rhat = np.array([*statistics]).T
     return Check(
         steps=len(accepted) * block,
         rhat=rhat,
@@ -218,16 +233,15 @@ def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers.
     """
     steps, ensembles, _ = values.shape
-    draws = np.ascontiguousarray(values)[..., np.newaxis]
-    scores, folded = _scores(draws)
-    bulk, tail, mean = (float(ess[0]) for ess in _effective_draws(draws, scores))
+    scores, folded = _scores(values)
     half = steps // 2
     halves, folded_halves = (
-        np.concatenate([s[..., :half], s[..., steps - half :]], axis=1) for s in (scores, folded)
+        np.concatenate([s[:, :half], s[:, steps - half :]]) for s in (scores, folded)
     )
-    # np.maximum keeps a nan of either.
-    rhat = np.maximum(_rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles))
-    return float(rhat[0]), bulk, tail, mean, _walker_rhat(scores)
+    # The halves of all ensembles are superchains of their own: first halves, then second ones.
+    rhats = _rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles)
+    # np.max keeps a nan of either.
+    return float(np.max(rhats)), *_effective_draws(values, scores), _walker_rhat(scores)
 
 
 def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
@@ -262,114 +276,107 @@ def pareto_k(log_weights: FloatArray) -> float:
 def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     """Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
 
-    The largest weights are replaced by the order statistics of the generalised Pareto distribution
-    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted.
+    The largest weights are replaced by the order statistics of the generalized Pareto distribution
+    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted, or a
+    weight is not a number.
 
     Notes
     -----
     A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling,
     Journal of Machine Learning Research 25 (2024).
     """
-    if log_weights.size and np.ptp(log_weights) < EQUAL:
-        return np.full(log_weights.size, 1 / log_weights.size), 0.0
+    finite = np.isfinite(log_weights).all()
+    if not finite or (log_weights.size and np.ptp(log_weights) < EQUAL):
+        return np.full(log_weights.size, 1 / log_weights.size), 0.0 if finite else np.inf
     smoothed, shape = array_stats.psislw(-log_weights)
     weights = np.exp(smoothed - np.max(smoothed))
     return weights / np.sum(weights), float(shape) if np.isfinite(shape) else np.inf
 
 
-def as_chains(draws: FloatArray) -> FloatArray:
-    """Return draws (steps, ensembles, walkers, free) as (ensembles x walkers, steps, free).
-
-    Every walker is a chain. Folding walkers into one chain step by step instead would count
-    neighbours at the same step as a long independent series and overstate the effective draws.
-    """
-    steps, ensembles, walkers, free = draws.shape
-    return np.moveaxis(draws, 0, 2).reshape(ensembles * walkers, steps, free)
-
-
 def nested_rhat(draws: FloatArray) -> FloatArray:
     """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
-    return _rhat(*_scores(draws), draws.shape[1])
+    columns = np.moveaxis(draws, -1, 0)
+    return np.array([_rhat(*_scores(values), values.shape[1]) for values in columns])
 
 
-def effective_draws(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Effective number of draws, bulk and tail, (free,) each.
+def effective_draws(values: FloatArray) -> tuple[float, float]:
+    """Effective number of draws (steps, ensembles, walkers) of one parameter, bulk and tail.
 
     With walkers as arviz's chains, and no more than the series of ensemble means allow: a mean of
     W independent walkers has a W-th of the variance, so n effective means are worth n times the
     ratio of the variances.
     """
-    bulk, tail, _ = _effective_draws(draws, _scores(draws)[0])
+    bulk, tail, _ = _effective_draws(values, _scores(values)[0])
     return bulk, tail
 
 
-def _effective_draws(
-    draws: FloatArray, scores: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Effective draws, given the normal scores of the draws too.
+def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, float, float]:
+    """Effective draws in bulk and tail and for the mean, given the draws' normal scores too.
 
     Of the means of the scores and of being in a tail: what arviz calls bulk and tail, which would
     rank the draws three times more. And of the mean of the draws as they are: those of a heavy
     tail are worth another number.
     """
+    means = np.mean(values, axis=2)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        cap = _ensemble_mean_ess(draws)
+        cap = array_stats.ess(means.T, method="mean") * np.var(values) / np.var(means)
         bulk = AVERAGED.ess(scores, method="mean")
         # A comparison would take what is not a number for a draw beyond the tail.
-        low, high = (np.where(np.isnan(scores), np.nan, scores <= ndtri(part)) for part in TAIL)
-        tails = [AVERAGED.ess(tail, method="mean") for tail in (low, high)]
-        mean = AVERAGED.ess(_series(draws), method="mean")
-    every = bulk, np.min(tails, axis=0), mean
-    bulk, tail, mean = (np.minimum(np.atleast_1d(ess), cap) for ess in every)
+        tails = [
+            AVERAGED.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
+            for p in TAIL
+        ]
+        mean = AVERAGED.ess(as_chains(values), method="mean")
+    # np.minimum keeps a nan of either.
+    bulk, tail, mean = np.minimum([bulk, np.min(tails), mean], cap).tolist()
     return bulk, tail, mean
 
 
-def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> FloatArray:
-    """Nested R-hat (free,) of scores (free, chains, steps), an ensemble's chains in a row.
+def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> float:
+    """Nested R-hat of scores (chains, steps), an ensemble's chains in a row.
 
     Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
     calls rank, which would rank the draws once more.
     """
-    superchain = np.repeat(np.arange(ensembles), scores.shape[1] // ensembles)
+    superchain = np.repeat(np.arange(ensembles), len(scores) // ensembles)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        both = [
-            array_stats.rhat_nested(each, superchain_ids=superchain, method="split")
-            for each in (scores, folded)
+        rhats = [
+            array_stats.rhat_nested(ranked, superchain_ids=superchain, method="split")
+            for ranked in (scores, folded)
         ]
-    # np.maximum keeps a nan of either.
-    return np.atleast_1d(np.maximum(*both))
+    return float(np.max(rhats))
 
 
 def _walker_rhat(scores: FloatArray) -> float:
-    """Largest R-hat, √(1 + variance of the walkers' means / mean of their variances).
+    """R-hat of chains (chains, steps), √(1 + variance of their means / mean of their variances).
 
     Walkers that share modes between them in the same way in each ensemble, and never change, look
     alike to the nested R-hat, and are worth as many effective draws as they are.
     """
-    between = np.var(np.mean(scores, axis=-1), axis=-1)
-    within = np.mean(np.var(scores, axis=-1), axis=-1)
+    between = np.var(np.mean(scores, axis=1))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return float(np.max(np.sqrt(1 + between / within)))
+        return float(np.sqrt(1 + between / np.mean(np.var(scores, axis=1))))
 
 
-def _series(draws: FloatArray) -> FloatArray:
-    """Return chains (free, chains, steps), each parameter's together in memory."""
-    return np.ascontiguousarray(np.moveaxis(as_chains(draws), -1, 0))
+def as_chains(values: FloatArray) -> FloatArray:
+    """Return draws (steps, ensembles, walkers) as (ensembles x walkers, steps).
+
+    Every walker is a chain. Folding walkers into one chain step by step instead would count
+    neighbors at the same step as a long independent series and overstate the effective draws.
+    """
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1)).reshape(-1, len(values))
 
 
-def _scores(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rank draws (steps, ensembles, walkers, free) into normal scores (free, chains, steps).
+def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rank draws (steps, ensembles, walkers) into normal scores (chains, steps).
 
     With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)). The second ones are
     those of the draws' distances from their median.
     """
-    every = _series(draws)
-    scores, folded = np.empty_like(every), np.empty_like(every)
+    chains = as_chains(values)
     with np.errstate(invalid="ignore"):
-        for i, series in enumerate(every):
-            scores[i], median = _normal_scores(series)
-            folded[i], _ = _normal_scores(np.abs(series - median))
-    return scores, folded
+        scores, median = _normal_scores(chains)
+        return scores, _normal_scores(np.abs(chains - median))[0]
 
 
 def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
@@ -384,13 +391,5 @@ def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
     rank = first + 0.5 * (equal + 1)
     scores = np.empty(values.size)
     scores[order] = np.repeat(ndtri((rank - 3 / 8) / (values.size + 1 / 4)), equal)
-    middle = ordered[(values.size - 1) // 2], ordered[values.size // 2]
-    return scores.reshape(draws.shape), float(np.mean(middle))
-
-
-def _ensemble_mean_ess(draws: FloatArray) -> FloatArray:
-    means = np.mean(draws, axis=2)
-    ess = array_stats.ess(np.moveaxis(means, 0, 1), chain_axis=0, draw_axis=1, method="mean")
-    ratio = np.var(draws, axis=(0, 1, 2)) / np.var(means, axis=(0, 1))
-    worth: FloatArray = np.atleast_1d(ess) * ratio
-    return worth
+    center = ordered[(values.size - 1) // 2], ordered[values.size // 2]
+    return scores.reshape(draws.shape), float(np.mean(center))

@@ -12,10 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from emcee.autocorr import auto_window
 from emcee.moves import Move
 from numpy.typing import NDArray
-from scipy import fft
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -30,7 +28,6 @@ __all__ = [
     "EnsembleState",
     "advance",
     "advance_together",
-    "autocorrelation_time",
     "start",
 ]
 
@@ -41,9 +38,6 @@ RANDOM_STATE_WORDS = 628
 FAR = 10.0
 TIGHT = 0.2
 TRIALS = 100
-
-# Sokal's window for an autocorrelation time: the first lag of so many times that time.
-WINDOW = 5
 
 
 @dataclass(frozen=True)
@@ -141,24 +135,24 @@ def advance_together(
     """
     randoms = [_generator(state.random_state) for state in states]
     walks = [
-        walk(own, state.coordinates, state.log_density, random, steps)
-        for own, state, random in zip(moves, states, randoms, strict=True)
+        walk(ensemble_moves, state.coordinates, state.log_density, random, steps)
+        for ensemble_moves, state, random in zip(moves, states, randoms, strict=True)
     ]
-    ended: dict[int, Steps] = {}
+    finished: dict[int, Steps] = {}
     # Far away a proposal may overflow: such a place has no density.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        asked = {number: next(one) for number, one in enumerate(walks)}
-        while asked:
-            density = _log_density(posterior, np.concatenate([*asked.values()]))
-            ends = np.cumsum([len(places) for places in asked.values()])[:-1]
-            answers = zip([*asked], np.split(density, ends), strict=True)
-            asked = {}
+        proposed = {number: next(walk) for number, walk in enumerate(walks)}
+        while proposed:
+            density = _log_density(posterior, np.concatenate([*proposed.values()]))
+            ends = np.cumsum([len(places) for places in proposed.values()])[:-1]
+            answers = zip([*proposed], np.split(density, ends), strict=True)
+            proposed = {}
             for number, answer in answers:
                 try:
-                    asked[number] = walks[number].send(answer)
+                    proposed[number] = walks[number].send(answer)
                 except StopIteration as end:
-                    ended[number] = end.value
-    return [_block(ended[number], random) for number, random in enumerate(randoms)]
+                    finished[number] = end.value
+    return [_block(finished[number], random) for number, random in enumerate(randoms)]
 
 
 def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
@@ -175,37 +169,17 @@ def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
     return density
 
 
-def _block(made: Steps, random: np.random.RandomState) -> Block:
+def _block(steps: Steps, random: np.random.RandomState) -> Block:
     end = EnsembleState(
-        made.coordinates[-1].copy(), made.log_density[-1].copy(), _pack(random.get_state())
+        steps.coordinates[-1].copy(), steps.log_density[-1].copy(), _pack(random.get_state())
     )
-    return Block(made.coordinates, made.log_density, made.accepted, made.moves, end)
-
-
-def autocorrelation_time(draws: FloatArray) -> FloatArray:
-    """Integrated autocorrelation time (free,) in steps of draws (steps, walkers, free).
-
-    As ``emcee.autocorr.integrated_time`` has it, from the mean of the walkers' autocorrelations,
-    here for all walkers at once: the mean is taken of their spectra, and transformed back once. It
-    is nan where it cannot be told, for instance where nothing moves.
-    """
-    steps = draws.shape[0]
-    padded = fft.next_fast_len(2 * steps, real=True)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        away = np.ascontiguousarray(np.moveaxis(draws - np.mean(draws, axis=0), 0, -1))
-        spectrum = fft.rfft(away, padded)
-        power = spectrum.real**2 + spectrum.imag**2
-        power /= np.sum(away**2, axis=-1, keepdims=True)
-        correlation = fft.irfft(np.mean(power, axis=0), padded)[:, :steps]
-    times = 2 * np.cumsum(correlation, axis=1) - 1
-    windowed = np.array([time[auto_window(time, WINDOW)] for time in times])
-    return np.where(windowed > 0, windowed, np.nan)
+    return Block(steps.coordinates, steps.log_density, steps.accepted, steps.moves, end)
 
 
 def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:
     _, words, position, has_normal, normal = state
-    rest = np.array([position, has_normal], dtype=np.uint32)
-    return np.concatenate([words, rest, np.array([normal]).view(np.uint32)])
+    position_and_flag = np.array([position, has_normal], dtype=np.uint32)
+    return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
 
 
 def _generator(words: NDArray[np.uint32]) -> np.random.RandomState:

@@ -42,9 +42,9 @@ class Image(FileIO):
         if head[VERSION] in NEW:
             self._end = max(self._end, min(int.from_bytes(head[STORED_END], "little"), LARGEST))
 
-    def seek(self, place: int, whence: int = SEEK_SET) -> int:
+    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
         """Move to a place; the end is where the file says that it should be."""
-        return super().seek(self._end if whence == SEEK_END else place)
+        return super().seek(self._end if whence == SEEK_END else offset)
 
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer, or say that what should be there is missing."""

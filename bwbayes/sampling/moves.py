@@ -95,17 +95,15 @@ class AmongPlaces(moves.MHMove):  # type: ignore[misc]  # emcee has no types
         part it falls is again such a number.
         """
         rows = np.arange(here.size)
-        if len(weight) == 1:  # to the last bit as emcee
-            return np.zeros_like(rows), np.log(chance) < weight[0] - here, weight[0]
         largest = np.maximum(np.max(weight, axis=0), here)
         parts = np.exp(weight - largest)
         ends = np.cumsum(parts, axis=0)
         point = chance * ends[-1]
-        one = np.minimum(np.sum(point >= ends, axis=0), len(weight) - 1)
-        own, chosen = parts[one, rows], weight[one, rows]
-        others = ends[-1] - own + np.exp(here - largest)
-        taken = (point - (ends[one, rows] - own)) * others < own * ends[-1]
-        return one, taken, chosen
+        which = np.minimum(np.sum(point >= ends, axis=0), len(weight) - 1)
+        share, chosen = parts[which, rows], weight[which, rows]
+        others = ends[-1] - share + np.exp(here - largest)
+        accepted = (point - (ends[which, rows] - share)) * others < share * ends[-1]
+        return which, accepted, chosen
 
 
 def pilot_moves(proposal: Proposal | None = None, places: int = 1) -> Weighted:

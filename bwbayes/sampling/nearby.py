@@ -49,26 +49,28 @@ class Nearby:
         """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
         count, free = coordinates.shape
         bend, components = self.mixture.bend, self.mixture.components
-        z = coordinates if bend is None else bend.straight(coordinates)
+        z = coordinates if bend is None else bend.to_straight(coordinates)
         whose = self._drawn(z, random)
-        squares = np.stack([one.squares(z) for one in components])[whose, np.arange(count)]
+        squares = np.stack([component.squares(z) for component in components])[
+            whose, np.arange(count)
+        ]
         freedom = components[0].freedom
         spread = np.sqrt((freedom + squares) / random.chisquare(freedom + free, count))
-        part = SHORTEST ** random.random_sample(count)
-        normal = random.standard_normal((count, free)) * (part * spread)[:, np.newaxis]
-        kept = np.sqrt(1 - part**2)[:, np.newaxis]
+        beta = SHORTEST ** random.random_sample(count)
+        normal = random.standard_normal((count, free)) * (beta * spread)[:, np.newaxis]
+        retained = np.sqrt(1 - beta**2)[:, np.newaxis]
         near = np.empty_like(z)
-        for j, one in enumerate(components):
-            mine = whose == j
-            near[mine] = one.centre + kept[mine] * (z[mine] - one.centre)
-            near[mine] += normal[mine] @ one.factor.T
-        proposed = near if bend is None else bend.bent(near)
+        for j, component in enumerate(components):
+            rows = whose == j
+            near[rows] = component.center + retained[rows] * (z[rows] - component.center)
+            near[rows] += normal[rows] @ component.factor.T
+        proposed = near if bend is None else bend.to_curved(near)
         old, new = np.split(self.mixture.log_density(np.concatenate([coordinates, proposed])), 2)
         return proposed, old - new
 
     def _drawn(self, z: FloatArray, random: np.random.RandomState) -> IntArray:
         """Draw the component (count,) that each of z (count, free) may be of."""
-        parts = np.stack([one.log_density(z) for one in self.mixture.components])
+        parts = np.stack([component.log_density(z) for component in self.mixture.components])
         logs = np.log(self.mixture.weights)[:, np.newaxis] + parts
         ends = np.cumsum(np.exp(logs - np.max(logs, axis=0)), axis=0)
         drawn: IntArray = np.sum(random.random_sample(len(z)) * ends[-1] >= ends, axis=0)

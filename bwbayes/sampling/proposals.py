@@ -2,9 +2,9 @@
 
 A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian. A
 skewed one, with a long tail along some ridge, takes a few of them: a mixture fitted by expectation
-maximisation, in coordinates that straighten the ridge if it is curved
-(:class:`~bwbayes.sampling.bends.Bend`). Heavy tails on every component keep the ratio of posterior
-to proposal bounded.
+maximization, in coordinates that straighten the ridge if it is curved
+(:class:`~bwbayes.sampling.curvature.QuadraticMap`). Heavy tails on every component keep the ratio
+of posterior to proposal bounded.
 """
 
 from __future__ import annotations
@@ -17,14 +17,19 @@ import numpy as np
 from scipy.stats import skew
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.bends import Bend, some_of
+from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
 __all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
 
 # Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
 CUTS = (0.5, 0.85)
-COMPONENTS = len(CUTS) + 1
+PARTS = len(CUTS) + 1
+COMPONENTS = PARTS + 1  # at most: one more for the draws that these cover worst
+
+# Which part of the draws that is, and how often it proposes.
+WORST = 0.02
+WORST_SHARE = 0.1
 
 # Part of a first guess that goes to all components alike.
 LEAST_GUESS = 0.25
@@ -62,13 +67,13 @@ class Proposal(Protocol):
 class StudentProposal:
     """A multivariate Student-t distribution as an independence proposal.
 
-    With ν degrees of freedom, centre μ and covariance-like scale LLᵀ over p coordinates,
+    With ν degrees of freedom, center μ and covariance-like scale LLᵀ over p coordinates,
 
         log q(x) = −(ν + p)/2 log(1 + |L⁻¹(x − μ)|² / ν) − log det L + constant.
 
     Parameters
     ----------
-    centre
+    center
         μ, (free,).
     factor
         L, lower triangular, (free, free).
@@ -78,7 +83,7 @@ class StudentProposal:
 
     __repr__ = brief
 
-    centre: FloatArray
+    center: FloatArray
     factor: FloatArray
     freedom: float = 6.0
 
@@ -101,14 +106,14 @@ class StudentProposal:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free), up to a constant."""
-        power = 0.5 * (self.freedom + self.centre.size)
+        power = 0.5 * (self.freedom + self.center.size)
         tails = power * np.log1p(self.squares(coordinates) / self.freedom)
         density: FloatArray = -tails - self.log_volume
         return density
 
     def squares(self, coordinates: FloatArray) -> FloatArray:
         """Squared distances |L⁻¹(x − μ)|² (..., count) of coordinates (..., count, free) from μ."""
-        white = (coordinates - self.centre) @ self._whitening
+        white = (coordinates - self.center) @ self._whitening
         distances: FloatArray = np.einsum("...j,...j->...", white, white)
         return distances
 
@@ -124,9 +129,9 @@ class StudentProposal:
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
-        normal = random.standard_normal((count, self.centre.size))
+        normal = random.standard_normal((count, self.center.size))
         spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
-        coordinates: FloatArray = self.centre + (normal * spread[:, np.newaxis]) @ self.factor.T
+        coordinates: FloatArray = self.center + (normal * spread[:, np.newaxis]) @ self.factor.T
         return coordinates
 
     def __call__(
@@ -155,11 +160,15 @@ class StudentMixture:
 
     weights: FloatArray
     components: tuple[StudentProposal, ...]
-    bend: Bend | None = None
+    bend: QuadraticMap | None = None
 
     @classmethod
-    def fitted(cls, draws: FloatArray) -> StudentMixture:
-        """Fit to draws (count, free), by expectation maximisation of a Gaussian mixture.
+    def fitted(cls, draws: FloatArray, log_density: FloatArray | None = None) -> StudentMixture:
+        """Fit to draws (count, free), by expectation maximization of a Gaussian mixture.
+
+        With their log densities (count,) under what they are drawn from, the mixture gets one more
+        component, of the draws where log p − log q is largest: a walker that is there would hardly
+        be led away.
 
         Raises
         ------
@@ -167,15 +176,17 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
-        bend = Bend.fitted(draws)
+        bend = QuadraticMap.fitted(draws)
         if bend is not None:
-            draws = bend.straight(draws)
-        some = some_of(draws, ROUGH_DRAWS)
-        mixture = _first_cut(some)
+            draws = bend.to_straight(draws)
+        sample = subsample(draws, ROUGH_DRAWS)
+        mixture = _first_cut(sample)
         for _ in range(ROUGH_ROUNDS):
-            mixture = mixture._fitted_on(some)
+            mixture = mixture._fitted_on(sample)
         for _ in range(ROUNDS):
             mixture = mixture._fitted_on(draws)
+        if log_density is not None:
+            mixture = mixture._with_worst(draws, log_density - mixture.log_density(draws))
         return replace(mixture, bend=bend)
 
     @classmethod
@@ -187,14 +198,14 @@ class StudentMixture:
         The first three modes; of fewer, the same ones again, twice and three times as wide. No
         component gets less than a twelfth: the shares of modes are a guess.
         """
-        modes = np.arange(COMPONENTS) % len(optima)
+        modes = np.arange(PARTS) % len(optima)
         factors = np.linalg.cholesky(covariances)
         parts = (
             StudentProposal(optima[mode], (1 + i // len(optima)) * factors[mode])
             for i, mode in enumerate(modes)
         )
-        each = shares[modes] / np.bincount(modes)[modes]
-        weights = (1 - LEAST_GUESS) * each / np.sum(each) + LEAST_GUESS / COMPONENTS
+        split_shares = shares[modes] / np.bincount(modes)[modes]
+        weights = (1 - LEAST_GUESS) * split_shares / np.sum(split_shares) + LEAST_GUESS / PARTS
         return cls(weights, tuple(parts))
 
     @cached_property
@@ -205,24 +216,33 @@ class StudentMixture:
 
     @cached_property
     def _places(self) -> tuple[FloatArray, FloatArray]:
-        """The components' centres (components, free) and factors (components, free, free)."""
-        centres, factors = zip(*((c.centre, c.factor) for c in self.components), strict=True)
-        return np.stack(centres), np.stack(factors)
+        """The components' centers (components, free) and factors (components, free, free)."""
+        centers, factors = zip(*((c.center, c.factor) for c in self.components), strict=True)
+        return np.stack(centers), np.stack(factors)
 
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
-        """Take a round of expectation maximisation."""
+        """Take a round of expectation maximization."""
         parts = [_gaussian(component, draws) for component in self.components]
         logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
         density = np.exp(logs - np.max(logs, axis=0))
         return _of_shares(draws, _kept_alive(density / np.sum(density, axis=0)))
 
+    def _with_worst(self, draws: FloatArray, log_ratio: FloatArray) -> StudentMixture:
+        """Add the component of the draws (count, free) with the largest log p − log q (count,)."""
+        worst = log_ratio >= np.quantile(log_ratio, 1 - WORST)
+        component = _components(draws, _kept_alive(np.stack([worst, ~worst])))[0]
+        weights = np.append((1 - WORST_SHARE) * self.weights, WORST_SHARE)
+        return StudentMixture(weights, (*self.components, component))
+
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free), up to a constant."""
         lost = 0.0
         if self.bend is not None:
-            coordinates, lost = self.bend.straight(coordinates), self.bend.log_volume
+            coordinates, lost = self.bend.to_straight(coordinates), self.bend.log_volume
         parts = [component.log_density(coordinates) for component in self.components]
-        logs = np.stack([log + part for log, part in zip(np.log(self.weights), parts, strict=True)])
+        logs = np.stack(
+            [log + values for log, values in zip(np.log(self.weights), parts, strict=True)]
+        )
         density: FloatArray = np.logaddexp.reduce(logs) - lost
         return density
 
@@ -230,13 +250,13 @@ class StudentMixture:
         """Draw coordinates (count, free) with emcee's generator."""
         # As ``random.choice`` does with these weights, without its checks of them.
         chosen = self._ends.searchsorted(random.random_sample(count), side="right")
-        centres, factors = self._places
+        centers, factors = self._places
         freedom = self.components[0].freedom
-        normal = random.standard_normal((count, centres.shape[1]))
+        normal = random.standard_normal((count, centers.shape[1]))
         spread = np.sqrt(freedom / random.chisquare(freedom, count))
         away = (factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
-        drawn: FloatArray = centres[chosen] + away
-        return drawn if self.bend is None else self.bend.bent(drawn)
+        drawn: FloatArray = centers[chosen] + away
+        return drawn if self.bend is None else self.bend.to_curved(drawn)
 
     def __call__(
         self, coordinates: FloatArray, random: np.random.RandomState
@@ -260,11 +280,11 @@ def _require_spread(draws: FloatArray) -> None:
 def _first_cut(draws: FloatArray) -> StudentMixture:
     """Cut draws (count, free) along their most skewed coordinate."""
     shape = np.asarray(skew(draws, axis=0))
-    most = int(np.argmax(np.abs(shape)))
+    axis = int(np.argmax(np.abs(shape)))
     # Ranks from the body of the distribution to its longer tail.
-    along = draws[:, most] * (1 if shape[most] >= 0 else -1)
+    along = draws[:, axis] * (1 if shape[axis] >= 0 else -1)
     start = np.searchsorted(np.quantile(along, CUTS), along)
-    return _of_shares(draws, _kept_alive(np.equal.outer(np.arange(COMPONENTS), start)))
+    return _of_shares(draws, _kept_alive(np.equal.outer(np.arange(PARTS), start)))
 
 
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:
@@ -274,22 +294,24 @@ def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:
 
 def _kept_alive(share: FloatArray) -> FloatArray:
     """Give every component something of each draw; its weight says how little it matters."""
-    kept: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * len(share))
-    return kept
+    raised: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * len(share))
+    return raised
 
 
 def _components(draws: FloatArray, share: FloatArray) -> list[StudentProposal]:
     """Weighted means and covariances, one component for each row of ``share``."""
     parts = share / share.sum(axis=1, keepdims=True)
-    centres = parts @ draws
-    apart = [(draws - centre).T for centre in centres]
-    own = np.stack([(part * away) @ away.T for part, away in zip(parts, apart, strict=True)])
-    together = np.average(own, axis=0, weights=share.mean(axis=1))
-    factors = np.linalg.cholesky((1 - SHRINKAGE) * own + SHRINKAGE * together)
-    return [StudentProposal(*pair) for pair in zip(centres, factors, strict=True)]
+    centers = parts @ draws
+    deviations = [(draws - center).T for center in centers]
+    covariances = np.stack(
+        [(weights * away) @ away.T for weights, away in zip(parts, deviations, strict=True)]
+    )
+    together = np.average(covariances, axis=0, weights=share.mean(axis=1))
+    factors = np.linalg.cholesky((1 - SHRINKAGE) * covariances + SHRINKAGE * together)
+    return [StudentProposal(*pair) for pair in zip(centers, factors, strict=True)]
 
 
 def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:
-    """Log density of the normal distribution with a component's centre and scale."""
+    """Log density of the normal distribution with a component's center and scale."""
     density: FloatArray = -0.5 * component.squares(draws) - component.log_volume
     return density

@@ -45,7 +45,7 @@ from bwbayes.sampling.diagnostics import (
     pareto_k,
 )
 from bwbayes.sampling.ensemble import Block, advance_together, start
-from bwbayes.sampling.judge import Judge, constrained
+from bwbayes.sampling.monitor import ConvergenceMonitor, constrain_steps
 from bwbayes.sampling.moves import MOVES, pilot_moves, sampling_moves, spreading_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
@@ -89,10 +89,6 @@ FIRST_PART = 0.5
 Watcher = Callable[[Phase, Check | None], None]
 
 
-def _unwatched(phase: Phase, latest: Check | None) -> None:
-    """Watch nothing."""
-
-
 @dataclass(frozen=True)
 class Outcome:
     """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
@@ -131,7 +127,7 @@ def sample(
     plan: SamplingPlan,
     chain: Chain,
     executor: Executor,
-    watcher: Watcher = _unwatched,
+    watcher: Watcher = lambda *_: None,
 ) -> Outcome:
     """Extend ``chain`` until it has converged or the budget is used up.
 
@@ -143,7 +139,7 @@ def sample(
     if not chain.history("sampling"):
         _tune(posterior, plan, chain, executor, watcher)
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        _fall_back(chain)
+        _refit_proposal(chain)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
@@ -153,7 +149,7 @@ def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> Floa
     Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
     """
     thin = thinning(chain.draws(phase))
-    return constrained(posterior, chain.coordinates(phase, thin))
+    return constrain_steps(posterior, chain.coordinates(phase, thin))
 
 
 def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
@@ -168,20 +164,20 @@ def _sampled(
 
     A chain that has blocks already is judged where it was, or would have been, on its way.
     """
-    judge = Judge(posterior, chain, plan.ess)
+    monitor = ConvergenceMonitor(posterior, chain, plan.ess)
     # A chain may be longer than its budget, if that was made smaller.
-    most = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+    budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
     blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
     while True:
-        blocks = min(blocks, most)
+        blocks = min(blocks, budget)
         while chain.blocks("sampling") < blocks:
             _extend(posterior, plan, chain, "sampling", executor, watcher)
         # Mostly the last thing that is missing, and cheap to see.
-        least = judge.least(blocks, 1.0 if passed else FIRST_PART)
-        if least > blocks and blocks < most:
-            blocks = math.ceil(min(least, LARGEST_STRETCH * blocks))
+        required = monitor.blocks_needed(blocks, 1.0 if passed else FIRST_PART)
+        if required > blocks and blocks < budget:
+            blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
             continue
-        now = judge(blocks)
+        now = monitor(blocks)
         watcher("sampling", now)
         missing = now.shortcomings(plan.ess)
         at_end = blocks == chain.blocks("sampling")
@@ -189,7 +185,7 @@ def _sampled(
         done = not missing and 0 < APART * passed <= blocks
         if done and at_end:
             return Outcome(True, "converged on two checks in a row", now)
-        if blocks == most:
+        if blocks == budget:
             why = "; ".join(missing) or "only the last check passed"
             return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
         if not now.covered and at_end:
@@ -205,22 +201,22 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
-    part = 1.0 if passed else FIRST_PART
+    fraction = 1.0 if passed else FIRST_PART
     fewest = np.min([latest.ess_bulk, latest.ess_tail])
     with np.errstate(divide="ignore"):
         steps = np.maximum(
             latest.steps * plan.ess / fewest, LENGTH * np.max(latest.autocorrelation)
         )
-    following = max(part * steps / plan.block, APART * passed)
+    following = max(fraction * steps / plan.block, APART * passed)
     if not following > blocks:  # nan too
         following = LEAST_STRETCH * blocks
     return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
-def _fall_back(chain: Chain) -> None:
+def _refit_proposal(chain: Chain) -> None:
     """Set what the sampling has made aside; the first time, go on with a fit to that."""
     thin = thinning(chain.draws("sampling"))
-    second = None if chain.set_aside else _fitted(chain.coordinates("sampling", thin))
+    second = None if chain.set_aside else _fitted(chain, "sampling", slice(None), thin)
     chain.fall_back(len(chain.history("sampling")), second)
 
 
@@ -233,20 +229,21 @@ def _remarks(chain: Chain) -> tuple[str, ...]:
     if not chain.set_aside:
         return ()
     aside = chain.history("sampling")[: chain.set_aside]
+    poor = _describe_poor_coverage(first, aside[: refitted or None])
+    story = f"the proposal {poor}: they are set aside, and "
     if not refitted:
-        return (f"the proposal {_uncovered(first, aside)}: they are set aside, and {alone}",)
-    told = f"the proposal {_uncovered(first, aside[:refitted])}: they are set aside, and "
+        return (f"{story}{alone}",)
     if chain.second is None or chain.set_aside == refitted:
-        return (f"{told}a second one, fitted to them, made draws that count",)
-    again = _uncovered(chain.second, aside[refitted:])
-    return (f"{told}so are those of a second one, fitted to them, which {again}: {alone}",)
+        return (f"{story}a second one, fitted to them, made draws that count",)
+    again = _describe_poor_coverage(chain.second, aside[refitted:])
+    return (f"{story}so are those of a second one, fitted to them, which {again}: {alone}",)
 
 
-def _uncovered(proposal: StudentMixture, aside: Sequence[Sequence[Block]]) -> str:
+def _describe_poor_coverage(proposal: StudentMixture, aside: Sequence[Sequence[Block]]) -> str:
     """Say how badly a proposal covers the blocks that were set aside."""
-    each = [block for blocks in aside for block in blocks]
-    coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in each])
-    density = np.concatenate([b.log_density.ravel() for b in each])
+    flat = [block for blocks in aside for block in blocks]
+    coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in flat])
+    density = np.concatenate([b.log_density.ravel() for b in flat])
     shape = pareto_k(density - proposal.log_density(coordinates))
     steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
     return (
@@ -292,13 +289,15 @@ def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
     steps = chain.steps("pilot")
     if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
         return steps >= plan.most_pilot_steps
-    second_half = constrained(posterior, chain.coordinates("pilot")[steps // 2 :])
+    second_half = constrain_steps(posterior, chain.coordinates("pilot")[steps // 2 :])
     if (nested_rhat(second_half) < PILOT_RHAT).all():
         return True
-    return steps >= APART_STEPS and all(_stays(each) for each in np.moveaxis(second_half, 1, 0))
+    return steps >= APART_STEPS and all(
+        _is_stationary(draws) for draws in np.moveaxis(second_half, 1, 0)
+    )
 
 
-def _stays(draws: FloatArray) -> bool:
+def _is_stationary(draws: FloatArray) -> bool:
     """Tell whether the halves of an ensemble's draws (steps, walkers, free) agree."""
     half = len(draws) // 2
     halves = np.stack([draws[:half], draws[len(draws) - half :]], axis=1)
@@ -312,14 +311,14 @@ def _tune(
 
     A run that goes on within a round fits again to what that round had begun with.
     """
-    proposal = _fitted(chain.coordinates("pilot")[chain.steps("pilot") // 2 :])
+    proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
     begin, end, rate = 0, TUNING_BLOCKS, 0.0
     while rate < TAKEN and end <= (1 if rate > HARDLY_TAKEN else 4) * MOST_TUNING_BLOCKS:
         if chain.blocks("tuning") < end:
             chain.freeze("tuning", proposal)
         while chain.blocks("tuning") < end:
             _extend(posterior, plan, chain, "tuning", executor, watcher)
-        proposal = _fitted(chain.coordinates("tuning")[begin * plan.block : end * plan.block])
+        proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
         rate = _taken(chain.history("tuning")[begin:end])
         begin, end = end, 2 * end
     chain.freeze("sampling", proposal)
@@ -329,14 +328,16 @@ def _taken(blocks: Sequence[Sequence[Block]]) -> float:
     """Return which part of the places that the proposal proposed was taken; 1 without one."""
     independent = MOVES.index("mixture")
     # Blocks count the moves that were offered to them, and blocks from a file all that there are.
-    counts = [one.moves[independent:][:1] for each in blocks for one in each]
+    counts = [block.moves[independent:][:1] for ensembles in blocks for block in ensembles]
     proposed, accepted = np.sum(np.concatenate(counts), axis=0)
     return float(accepted / proposed) if proposed else 1.0
 
 
-def _fitted(draws: FloatArray) -> StudentMixture | None:
-    """Fit a proposal to draws (..., free), if they span the space."""
+def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentMixture | None:
+    """Fit a proposal to the draws of these steps of a phase, if they span the space."""
+    draws = chain.coordinates(phase, thin)[steps]
+    log_density = chain.log_density(phase, thin)[steps]
     try:
-        return StudentMixture.fitted(draws.reshape(-1, draws.shape[-1]))
+        return StudentMixture.fitted(draws.reshape(-1, draws.shape[-1]), log_density.ravel())
     except np.linalg.LinAlgError:
         return None

@@ -31,11 +31,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.arrays import IntArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.sampling.bends import Bend, rows_of
 from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.curvature import QuadraticMap, rows_of
 from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
 from bwbayes.sampling.hdf5 import DAMAGE, Image, either, put, reserve
 from bwbayes.sampling.moves import MOVES
@@ -86,29 +85,30 @@ class ChainFile(Chain):
         InputError
             There is no room for it.
         """
-        made = cls(path, point, chain.starts, block, attributes)
+        opened = cls(path, point, chain.starts, block, attributes)
         temporary = path.with_suffix(".partial")
         # Laid out in memory: HDF5 does not survive a disk that is full.
         layout = BytesIO()
         with h5py.File(layout, "w", libver="latest") as file:
-            _lay_out(file, point, chain.starts, block)
+            _create_all(file, point, chain.starts, block)
             file.attrs["format"] = FORMAT
             for name, value in attributes.items():
                 file.attrs[name] = value
-        with _told(path), made._or_nothing(temporary):
+        with _write_errors(path), opened._delete_on_failure(temporary):
             temporary.write_bytes(layout.getbuffer())
             _replace(temporary, path)
-        with made._or_nothing(path):
-            made._open()
+        with opened._delete_on_failure(path):
+            opened._file = h5py.File(path, "r+", libver="latest", locking=False)
+            opened._file.swmr_mode = True
             for phase in PHASES:
-                made.freeze(phase, chain.proposals[phase])
+                opened.freeze(phase, chain.proposals[phase])
                 for blocks in chain.history(phase):
-                    made.append(phase, blocks)
+                    opened.append(phase, blocks)
             if chain.set_aside and chain.second is not None:
-                made.fall_back(chain.refitted, chain.second)
-            if chain.set_aside != made.set_aside:
-                made.fall_back(chain.set_aside)
-        return made
+                opened.fall_back(chain.refitted, chain.second)
+            if chain.set_aside != opened.set_aside:
+                opened.fall_back(chain.set_aside)
+        return opened
 
     @classmethod
     def read(cls, path: Path) -> ChainFile:
@@ -138,10 +138,10 @@ class ChainFile(Chain):
         if chain is None:
             raise InputError(f"{path}: the chain cannot be read ({damage}); run again")
         if damage:
-            whole = sum(len(chain.history(phase)) for phase in PHASES)
+            n_blocks = sum(len(chain.history(phase)) for phase in PHASES)
             warnings.warn(
-                f"{path}: damaged ({damage}); the {whole} whole blocks before that are used, and "
-                "resuming makes the others again",
+                f"{path}: damaged ({damage}); the {n_blocks} whole blocks before that are used, "
+                "and resuming makes the others again",
                 InputWarning,
                 stacklevel=2,
             )
@@ -169,11 +169,11 @@ class ChainFile(Chain):
         if check is not None:
             check(old.attributes())
         fresh = path.with_suffix(".fresh")
-        made = cls.create(fresh, old, old.point, old.block, old.attributes())
+        opened = cls.create(fresh, old, old.point, old.block, old.attributes())
         # The name changes under the open file: it is the same file all along.
         _replace(fresh, path)
-        made.path = path
-        return made
+        opened.path = path
+        return opened
 
     def attributes(self) -> dict[str, str | int]:
         """Return what was run: config, versions, platform, seed, hash of the data."""
@@ -187,14 +187,15 @@ class ChainFile(Chain):
         InputError
             There is no room for it; the file is whole without it.
         """
+        unused = len(MOVES) - len(blocks[0].moves)
         rows: dict[str, NDArray[Any]] = {
             "coordinates": np.stack([b.coordinates for b in blocks], axis=1),
             "log_density": np.stack([b.log_density for b in blocks], axis=1),
             "accepted": np.stack([b.accepted for b in blocks])[np.newaxis],
-            "moves": np.stack([_padded(b.moves) for b in blocks])[np.newaxis],
+            "moves": np.stack([np.pad(b.moves, [(0, unused), (0, 0)]) for b in blocks])[np.newaxis],
             "random_state": np.stack([b.end.random_state for b in blocks])[np.newaxis],
         }
-        with _told(self.path):
+        with _write_errors(self.path):
             reserve(self._file, sum(values.nbytes for values in rows.values()))
         number = len(self.history(phase))
         for name, values in rows.items():
@@ -231,17 +232,20 @@ class ChainFile(Chain):
 
     def _write(self, name: str, proposal: StudentMixture) -> None:
         group = self._file[f"proposal/{name}"]
-        group["weights"][:] = proposal.weights
-        group["centres"][:] = np.stack([c.centre for c in proposal.components])
-        group["factors"][:] = np.stack([c.factor for c in proposal.components])
+        count = len(proposal.components)
+        if count > group["weights"].shape[1]:
+            raise InputError(
+                f"{self.path}: begun by an earlier version, whose files have no room for the "
+                f"{count} components of today's proposals; start a new run"
+            )
+        group["weights"][:] = 0.0
+        group["weights"][:, :count] = proposal.weights
+        group["centres"][:, :count] = np.stack([c.center for c in proposal.components])
+        group["factors"][:, :count] = np.stack([c.factor for c in proposal.components])
         group["bend"][:] = 0.0 if proposal.bend is None else proposal.bend.numbers
 
-    def _open(self) -> None:
-        self._file = h5py.File(self.path, "r+", libver="latest", locking=False)
-        self._file.swmr_mode = True
-
     @contextmanager
-    def _or_nothing(self, path: Path) -> Iterator[None]:
+    def _delete_on_failure(self, path: Path) -> Iterator[None]:
         """Leave nothing of a file that could not be written to its end."""
         try:
             yield
@@ -250,10 +254,10 @@ class ChainFile(Chain):
             path.unlink(missing_ok=True)
             raise
 
-    def _commit(self, place: int, count: int) -> None:
+    def _commit(self, column: int, count: int) -> None:
         """Let ``count`` count, once everything before has reached the file."""
         self._file.flush()
-        self._file["committed"][:, place] = count
+        self._file["committed"][:, column] = count
         self._file.flush()
 
     @classmethod
@@ -263,28 +267,28 @@ class ChainFile(Chain):
         with Image(path) as image:
             try:
                 with h5py.File(image, "r") as file:
-                    loaded = cls._begun(path, file)
+                    loaded = cls._read_header(path, file)
                     committed = either(file["committed"])
                     # Files of versions that fitted no second one say nothing of it.
                     set_aside, refitted = [*committed[SET_ASIDE:].tolist(), 0][:2]
                     if refitted:
                         loaded.second = _proposal(file["proposal/second"])
-                    for place, phase in enumerate(PHASES):
-                        if committed[len(PHASES) + place]:
+                    for column, phase in enumerate(PHASES):
+                        if committed[len(PHASES) + column]:
                             loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
-                        for number in range(committed[place]):
+                        for number in range(committed[column]):
                             Chain.append(loaded, phase, _blocks(file[phase], number, loaded.block))
             except DAMAGE as error:
                 damage = " ".join(str(error.args[-1] if error.args else error).split())
         if loaded is not None:
-            whole = len(loaded.history("sampling"))
-            loaded.refitted = refitted if refitted <= whole else 0
+            n_blocks = len(loaded.history("sampling"))
+            loaded.refitted = refitted if refitted <= n_blocks else 0
             # Blocks are lost from the end: then the second proposal's, or all, count again.
-            loaded.set_aside = set_aside if set_aside <= whole else loaded.refitted
+            loaded.set_aside = set_aside if set_aside <= n_blocks else loaded.refitted
         return loaded, damage
 
     @classmethod
-    def _begun(cls, path: Path, file: Any) -> ChainFile:
+    def _read_header(cls, path: Path, file: Any) -> ChainFile:
         """Return the chain of a file without its blocks."""
         attributes = {n: v if isinstance(v, str) else int(v) for n, v in file.attrs.items()}
         number = attributes.pop("format")
@@ -309,20 +313,20 @@ def _digest(path: Path) -> bytes:
 _POINT = ("mode", "covariance", "optima", "prior_covariance", "log_density")
 
 
-def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block: int) -> None:
+def _create_all(file: Any, point: PointFit, starts: Sequence[EnsembleState], block: int) -> None:
     """Create every dataset, so that none has to be later."""
     ensembles = len(starts)
     walkers, free = starts[0].coordinates.shape
-    whole: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
+    layout: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
     for name in ("coordinates", "log_density", "random_state"):
-        whole[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
+        layout[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
     for name in (*PHASES, "second"):
-        whole[f"proposal/{name}/weights"] = np.zeros(COMPONENTS)
-        whole[f"proposal/{name}/centres"] = np.zeros((COMPONENTS, free))
-        whole[f"proposal/{name}/factors"] = np.zeros((COMPONENTS, free, free))
-        whole[f"proposal/{name}/bend"] = np.zeros((rows_of(free), free))
-    whole["committed"] = np.zeros(REFITTED + 1, dtype=np.int64)
-    for name, values in whole.items():
+        layout[f"proposal/{name}/weights"] = np.zeros(COMPONENTS)
+        layout[f"proposal/{name}/centres"] = np.zeros((COMPONENTS, free))
+        layout[f"proposal/{name}/factors"] = np.zeros((COMPONENTS, free, free))
+        layout[f"proposal/{name}/bend"] = np.zeros((rows_of(free), free))
+    layout["committed"] = np.zeros(REFITTED + 1, dtype=np.int64)
+    for name, values in layout.items():
         # Twice, since nothing else could stand in for it; only chunks carry checksums.
         data = np.stack([values, values])
         file.create_dataset(name, data=data, chunks=(1, *np.shape(values)), fletcher32=True)
@@ -345,19 +349,15 @@ def _lay_out(file: Any, point: PointFit, starts: Sequence[EnsembleState], block:
             )
 
 
-def _padded(counts: IntArray) -> IntArray:
-    """Return the counts of a block's moves with a row for each of MOVES."""
-    padded = np.zeros((len(MOVES), 2), dtype=np.int64)
-    padded[: len(counts)] = counts
-    return padded
-
-
 def _proposal(group: Any) -> StudentMixture:
     """Read a frozen proposal."""
-    pairs = zip(either(group["centres"]), either(group["factors"]), strict=True)
+    weights = either(group["weights"])
+    used = weights > 0
+    pairs = zip(either(group["centres"])[used], either(group["factors"])[used], strict=True)
     parts = tuple(StudentProposal(*pair) for pair in pairs)
-    bend = Bend.of(either(group["bend"])) if "bend" in group else None  # older files have none
-    return StudentMixture(either(group["weights"]), parts, bend)
+    # Older files have none.
+    bend = QuadraticMap.of(either(group["bend"])) if "bend" in group else None
+    return StudentMixture(weights[used], parts, bend)
 
 
 def _blocks(group: Any, number: int, block: int) -> list[Block]:
@@ -367,7 +367,7 @@ def _blocks(group: Any, number: int, block: int) -> list[Block]:
     accepted, states = group["accepted"][number], group["random_state"][number]
     moves = group["moves"][number]
     # Where a disk lost what it was given there are zeros, which pass the checksum.
-    if not all(part.any() for part in (coordinates, log_density, states)):
+    if not all(values.any() for values in (coordinates, log_density, states)):
         raise ValueError("a block is empty")
     return [
         Block(
@@ -382,7 +382,7 @@ def _blocks(group: Any, number: int, block: int) -> list[Block]:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _write_errors(path: Path) -> Iterator[None]:
     """Say in one line that a chain cannot be written."""
     try:
         yield

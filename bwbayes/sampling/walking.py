@@ -45,9 +45,11 @@ class Steps:
     moves: IntArray
     done: int = 0
 
-    def add(self, kind: int, place: FloatArray, density: FloatArray, accepted: BoolArray) -> None:
+    def add(
+        self, kind: int, coordinates: FloatArray, density: FloatArray, accepted: BoolArray
+    ) -> None:
         """Add the step after which the walkers are here."""
-        self.coordinates[self.done] = place
+        self.coordinates[self.done] = coordinates
         self.log_density[self.done] = density
         self.accepted += accepted
         self.moves[kind] += accepted.size, np.count_nonzero(accepted)
@@ -71,34 +73,34 @@ def walk(
         A move that is neither emcee's ``RedBlueMove`` nor its ``MHMove``.
     """
     walkers, free = coordinates.shape
-    made = Steps(
+    path = Steps(
         np.empty((steps, walkers, free)),
         np.empty((steps, walkers)),
         np.zeros(walkers, dtype=np.int64),
         np.zeros((len(moves), 2), dtype=np.int64),
     )
-    place, density = coordinates.copy(), log_density.copy()
-    chosen = _Choice([weight for _, weight in moves], random)
-    while made.done < steps:
+    here, density = coordinates.copy(), log_density.copy()
+    chosen = _MoveChooser([weight for _, weight in moves], random)
+    while path.done < steps:
         kind = chosen.next()
         move = moves[kind][0]
         if isinstance(move, RedBlueMove):
-            accepted = yield from _split_step(move, place, density, random)
-            made.add(kind, place, density, accepted)
+            accepted = yield from _split_step(move, here, density, random)
+            path.add(kind, here, density, accepted)
         elif not isinstance(move, MHMove):
             raise InputError(f"moves: {type(move).__name__} is neither a RedBlueMove nor an MHMove")
         elif isinstance(move.get_proposal, Proposal):
-            yield from _independent_steps(move, kind, chosen, place, density, made)
+            yield from _independent_steps(move, kind, chosen, here, density, path)
         else:
-            proposed, factor = move.get_proposal(place, random)
+            proposed, factor = move.get_proposal(here, random)
             offered = yield proposed
             accepted = np.log(random.rand(walkers)) < offered - density + factor
-            _go(place, density, accepted, proposed, offered)
-            made.add(kind, place, density, accepted)
-    return made
+            _move_accepted(here, density, accepted, proposed, offered)
+            path.add(kind, here, density, accepted)
+    return path
 
 
-class _Choice:
+class _MoveChooser:
     """Draws which kind of move comes next, as emcee does, and can look one step ahead."""
 
     def __init__(self, weights: Sequence[float], random: np.random.RandomState) -> None:
@@ -125,61 +127,68 @@ class _Choice:
 
 
 def _split_step(
-    move: RedBlueMove, place: FloatArray, density: FloatArray, random: np.random.RandomState
+    move: RedBlueMove, here: FloatArray, density: FloatArray, random: np.random.RandomState
 ) -> Generator[FloatArray, FloatArray, BoolArray]:
     """Move one split of the walkers after the other, in place; return who has moved."""
-    walkers = len(place)
-    move.setup(place)
+    walkers = len(here)
+    move.setup(here)
     splits = np.arange(walkers) % move.nsplits
     if move.randomize_split:
         random.shuffle(splits)
     rows = [np.flatnonzero(splits == split) for split in range(move.nsplits)]
     accepted = np.zeros(walkers, dtype=bool)
-    for split, mine in enumerate(rows):
-        others = [place[rows[other]] for other in range(move.nsplits) if other != split]
-        proposed, factor = move.get_proposal(place[mine], others, random)
+    for split, movers in enumerate(rows):
+        others = [here[rows[other]] for other in range(move.nsplits) if other != split]
+        proposed, factor = move.get_proposal(here[movers], others, random)
         offered = yield proposed
-        moved = factor + offered - density[mine] > np.log(random.rand(mine.size))
-        goers = mine[moved]
-        place[goers], density[goers] = proposed[moved], offered[moved]
+        moved = factor + offered - density[movers] > np.log(random.rand(movers.size))
+        goers = movers[moved]
+        here[goers], density[goers] = proposed[moved], offered[moved]
         accepted[goers] = True
     return accepted
 
 
 def _independent_steps(
-    move: MHMove, kind: int, chosen: _Choice, place: FloatArray, density: FloatArray, made: Steps
+    move: MHMove,
+    kind: int,
+    chosen: _MoveChooser,
+    coordinates: FloatArray,
+    density: FloatArray,
+    path: Steps,
 ) -> _Step:
     """Make a step of an independence proposal, and all further ones that follow at once."""
-    (walkers, free), random, proposal = place.shape, chosen.random, move.get_proposal
+    (walkers, free), random, proposal = coordinates.shape, chosen.random, move.get_proposal
     among = move if isinstance(move, AmongPlaces) else AmongPlaces(proposal)
     proposed, chances = [], []
     while True:
         proposed.append(proposal.draw(random, among.places * walkers))
         chances.append(random.rand(walkers))
-        if made.done + len(chances) == len(made.coordinates) or not chosen.is_next(kind):
+        if path.done + len(chances) == len(path.coordinates) or not chosen.is_next(kind):
             break
-    every = np.concatenate([place, *proposed])
-    weight = -proposal.log_density(every)
-    offered = yield every[walkers:]
+    places = np.concatenate([coordinates, *proposed])
+    weight = -proposal.log_density(places)
+    offered = yield places[walkers:]
     here = density + weight[:walkers]
     weight = (offered + weight[walkers:]).reshape(-1, among.places, walkers)
     offered = offered.reshape(weight.shape)
-    every = every[walkers:].reshape(*weight.shape, free)
+    places = places[walkers:].reshape(*weight.shape, free)
     rows = np.arange(walkers)
     for step, chance in enumerate(chances):
-        one, accepted, taken = among.choose(here, weight[step], chance)
-        _go(place, density, accepted, every[step, one, rows], offered[step, one, rows])
-        np.copyto(here, taken, where=accepted)
-        made.add(kind, place, density, accepted)
+        which, accepted, log_weight = among.choose(here, weight[step], chance)
+        _move_accepted(
+            coordinates, density, accepted, places[step, which, rows], offered[step, which, rows]
+        )
+        np.copyto(here, log_weight, where=accepted)
+        path.add(kind, coordinates, density, accepted)
 
 
-def _go(
-    place: FloatArray,
+def _move_accepted(
+    here: FloatArray,
     density: FloatArray,
     accepted: BoolArray | NDArray[np.bool_],
     proposed: FloatArray,
     offered: FloatArray,
 ) -> None:
     """Let those who accepted go where it was proposed."""
-    np.copyto(place, proposed, where=accepted[:, np.newaxis])
+    np.copyto(here, proposed, where=accepted[:, np.newaxis])
     np.copyto(density, offered, where=accepted)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
+from bwbayes.report.figures import drawings, drawn, interactive
+from bwbayes.report.page import render
+from bwbayes.report.run import run_report
 from bwbayes.results.bands import KINDS, LEVELS, Bands
-from bwbayes.results.result import Result
+from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.sampler import Outcome
@@ -135,3 +141,18 @@ def run(
         remarks=("the sensor was clipped",),
         truth={"d": 0.7, "lag": 2e-3},
     )
+
+
+def page(
+    run: Result,
+    numbers: Mapping[str, Any] | None = None,
+    pictures: Mapping[str, bytes] | None = None,
+) -> str:
+    """Return the page of a run, by default with its own numbers, and of those pictures."""
+    report = run_report(run, summary(run) if numbers is None else numbers)
+    return render(report, pictures or {}, interactive.made(run))
+
+
+def figures(run: Result) -> dict[str, Figure]:
+    """Draw all figures of a run, by name."""
+    return {name: drawn(draw) for name, draw in drawings(run).items()}

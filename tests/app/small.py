@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import h5py
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ __all__ = [
     "lowest_ess",
     "numbers",
     "quiet",
+    "typed",
 ]
 
 TEXT = """\
@@ -74,6 +76,12 @@ def config(*changes: tuple[str, str]) -> Config:
 def begun(path: Path, *changes: tuple[str, str]) -> RunFolder:
     """Return the folder of a run before its first step."""
     return start(config(*changes), path.parent, path)
+
+
+def typed(command: click.Command, *words: object) -> int:
+    """Return the exit status of a command with these words behind its name."""
+    status: int = command.main([str(word) for word in words], standalone_mode=False)
+    return status
 
 
 def quiet() -> Console:

@@ -8,6 +8,7 @@ import numpy as np
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import resolve
 
 __all__ = ["CONFIG", "POPULATION", "record", "specimens", "truths"]
 
@@ -73,7 +74,7 @@ def truths(number: int) -> dict[str, float]:
 def record(number: int) -> bw.Record:
     """Return the record of a specimen."""
     config = parse(STAND.format(seed=number + 1, **truths(number)), "stand")
-    return bw.resolve(config, Path()).record
+    return resolve(config, Path()).record
 
 
 def specimens(folder: Path, count: int) -> None:

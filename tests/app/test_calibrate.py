@@ -18,9 +18,9 @@ from rich.console import Console
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import calibrate as module
-from bwbayes.app.jobs.calibrate import carry_on, start
+from bwbayes.app.jobs.calibrate import resume, start
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
-from bwbayes.app.running.progress import ReplicateProgress
+from bwbayes.app.running.progress import CountProgress
 from bwbayes.errors import InputError
 from bwbayes.results.bands import KINDS, LEVELS
 from tests.app import small
@@ -99,7 +99,7 @@ def assert_same_end(expected: Path, got: Path) -> None:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a calibration of three replicates, made in one piece by one worker; for reading."""
     path = tmp_path_factory.mktemp("whole") / "a"
-    assert carry_on(begun(path), small.quiet(), workers=1).passed
+    assert resume(begun(path), small.quiet(), workers=1).passed
     return path
 
 
@@ -177,7 +177,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
 def test_interrupted_it_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path) -> None:
     """Whole lines are kept, and half a line is made again."""
     folder = cut(whole, tmp_path / "a", line_ends(whole)[1] + 70)
-    carry_on(folder, small.quiet(), workers=1)
+    resume(folder, small.quiet(), workers=1)
     assert_same_end(whole, folder.path)
 
 
@@ -186,14 +186,14 @@ def test_replicates_that_are_there_are_not_made_again(
 ) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
     monkeypatch.setattr(module, "_make", None)
-    carry_on(folder, small.quiet())
+    resume(folder, small.quiet())
     assert_same_end(whole, folder.path)
 
 
 def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
     folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's":3', b's":2'))
-    assert 3 == carry_on(folder, small.quiet(), workers=1, count=3).replicates
+    assert 3 == resume(folder, small.quiet(), workers=1, count=3).replicates
     lines = [line for line in folder.replicates.read_bytes().splitlines() if b"number" in line]
     assert (whole / "replicates.jsonl").read_bytes().splitlines()[1:] == lines
     assert (whole / "replicates.jsonl").read_bytes().splitlines()[0] in (
@@ -218,7 +218,7 @@ def test_request_to_stop_is_answered_with_how_to_go_on(whole: Path, tmp_path: Pa
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=120)
     assert (130, "") == (process.returncode, out)
-    assert "interrupted; go on with `bwbayes calibrate --resume a`\n" == err
+    assert "interrupted; resume with `bwbayes calibrate --resume a`\n" == err
     assert not (tmp_path / "a/calibration.json").exists()
     done = said("--resume", "a", "--quiet", "--workers", "1", where=tmp_path)
     assert (0, "", "") == (done.returncode, done.stdout, done.stderr)
@@ -255,7 +255,7 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
         (("--resume", "a", "--seed", "1"), "goes on as begun"),
         (("small.toml", "--replicates", "0"), "0 is not in the range x>=1"),
         (("none.toml",), "none.toml: No such file"),
-        (("small.toml", "--out", "a"), "a: exists; go on with `bwbayes calibrate --resume a`"),
+        (("small.toml", "--out", "a"), "a: exists; resume with `bwbayes calibrate --resume a`"),
         (("small.toml", "--out", "b", "--overwrite"), "b: is not a calibration's folder"),
     ],
 )
@@ -330,7 +330,7 @@ def assert_refused(
     assert changed != lines
     folder.replicates.write_bytes(b"".join(line + b"\n" for line in changed))
     with pytest.raises(InputError, match=part):
-        carry_on(folder, small.quiet())
+        resume(folder, small.quiet())
 
 
 @pytest.mark.parametrize("damage", [b"", b'{"replic'])
@@ -338,7 +338,7 @@ def test_folder_without_a_number_of_replicates_is_refused(tmp_path: Path, damage
     folder = begun(tmp_path / "a")
     folder.replicates.write_bytes(damage)
     with pytest.raises(InputError, match="does not say how many"):
-        carry_on(folder, small.quiet())
+        resume(folder, small.quiet())
 
 
 def test_replicates_of_another_config_are_refused(whole: Path, tmp_path: Path) -> None:
@@ -347,14 +347,14 @@ def test_replicates_of_another_config_are_refused(whole: Path, tmp_path: Path) -
     assert "mean = 0.7" in text
     folder.config.write_text(text.replace("mean = 0.7", "mean = 0.8"), encoding="utf-8")
     with pytest.raises(InputError, match="another config or record"):
-        carry_on(folder, small.quiet())
+        resume(folder, small.quiet())
 
 
 def test_lines_may_come_in_any_order(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
     first, zero, one, two = folder.replicates.read_bytes().splitlines(keepends=True)
     folder.replicates.write_bytes(first + two + zero)
-    carry_on(folder, small.quiet(), workers=1)
+    resume(folder, small.quiet(), workers=1)
     assert_same_end(whole, folder.path)
     assert one == folder.replicates.read_bytes().splitlines(keepends=True)[-1]
 
@@ -368,7 +368,7 @@ def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
     shutil.copytree(whole, tmp_path / "a")
     monkeypatch.setattr(module, "_make", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        carry_on(CalibrationFolder.open(tmp_path / "a"), small.quiet(), count=4)
+        resume(CalibrationFolder.open(tmp_path / "a"), small.quiet(), count=4)
     assert {"config.toml", "records", "replicates.jsonl"} == {
         path.name for path in (tmp_path / "a").iterdir() if path.name != ".lock"
     }
@@ -396,11 +396,11 @@ def test_progress_tells_rate_and_remaining_time(monkeypatch: pytest.MonkeyPatch)
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     console = Console(record=True, width=200, file=StringIO())
-    with ReplicateProgress(console, 10, 20, 3) as progress:
+    with CountProgress(console, "replicate", 10, 20, {"not converged": 3}) as progress:
         now[0] += 30
-        progress(converged=True)
+        progress()
         now[0] += 30
-        progress(converged=False)
+        progress("not converged")
     assert [
         "replicate 11 of 30   2.0 a minute   ETA 9:30   not converged 3",
         "replicate 12 of 30   2.0 a minute   ETA 9:00   not converged 4",

@@ -18,13 +18,14 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
-from bwbayes.app.jobs.campaign import carry_on, config_text, start
-from bwbayes.app.report.campaign_report import render
+from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult, Row
-from bwbayes.app.running.run import go_on
+from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.run import start as begin
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.report.page import render
+from bwbayes.results.outputs import write_summary
 from bwbayes.results.result import summary
 from tests.app import small
 from tests.app.specimens import CONFIG, POPULATION, record, specimens
@@ -51,7 +52,7 @@ def begun(given: Path, path: Path, **options: bool) -> CampaignFolder:
 
 
 def ended(folder: CampaignFolder, **options: Any) -> CampaignResult:
-    return carry_on(folder, small.quiet(), **{"workers": 1, **options})
+    return resume(folder, small.quiet(), **{"workers": 1, **options})
 
 
 @pytest.fixture(scope="module")
@@ -98,14 +99,15 @@ def test_a_records_run_is_what_the_run_command_makes(
 ) -> None:
     file = given / "records/s000.csv"
     text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
-    alone = go_on(
+    alone = resume_run(
         begin(parse(text, "alone"), given, tmp_path / "alone"),
         small.quiet(),
         workers=1,
         files=False,
     )
     own = json.loads((whole / "records/s000/summary.json").read_text())
-    for key, value in json.loads(json.dumps(summary(alone.result))).items():
+    write_summary(tmp_path / "alone.json", summary(alone.result))
+    for key, value in json.loads((tmp_path / "alone.json").read_text()).items():
         assert value == own[key], key
 
 
@@ -144,14 +146,17 @@ def test_a_finished_campaign_fits_nothing_again(
     assert_same_end(whole, tmp_path / "batch")
 
 
-def test_half_a_line_of_the_journal_is_done_again(whole: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_not_seen_to_end_is_done_again(
+    given: Path, whole: Path, tmp_path: Path
+) -> None:
     folder = CampaignFolder(tmp_path / "batch")
     shutil.copytree(whole, folder.path)
-    content = folder.journal.read_bytes()
-    folder.journal.write_bytes(content[: content.rfind(b"\n", 0, -1) + 30])
-    assert COUNT - 1 == len(folder.finished())
+    content = (folder.run("s002") / "ended.json").read_bytes()
+    (folder.run("s002") / "ended.json").write_bytes(content[:30])
+    file = given / "records/s002.csv"
+    assert not folder.is_done(file)
     ended(folder)
-    assert COUNT == len(folder.finished())
+    assert folder.is_done(file)
     assert_same_end(whole, folder.path)
 
 
@@ -257,7 +262,7 @@ def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     for text in ("broken.csv:2", "1 refused", '<th scope="row">alpha</th>', "Taken for normal"):
         assert text in page
     row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
-    assert "<b>x" not in render("x", CampaignResult((row,), None, "few"), {})
+    assert "<b>x" not in render(CampaignResult((row,), None, "few").report("x"), {})
 
 
 def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> None:

@@ -5,16 +5,13 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any
 
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from pydantic import BaseModel, TypeAdapter
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.config.keys import ANY, keys
 from bwbayes.app.config.keywords import config_of
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
@@ -42,17 +39,6 @@ def test_two_lines_are_a_config() -> None:
         result.model.hold,
         result.model.noise,
     )
-
-
-def test_five_lines_are_a_config() -> None:
-    result = parse(RECORD + '[model]\ndynamics = "none"\n[parameters]\n', "my.toml")
-    assert result.model.dynamics == "none"
-
-
-@pytest.mark.parametrize("named", ["ring_bender.toml", "measured_stack.toml"])
-def test_runs_of_this_project_are_configs(named: str) -> None:
-    runs = Path(__file__).parents[2] / "runs"
-    assert load(runs / named).sampling.ess >= 2000
 
 
 @pytest.mark.parametrize(
@@ -94,6 +80,25 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
         (RECORD + "[parameters.d]\nprior = 3", "prior: write a table like { distribution"),
         ("record = 3", "record: is not a table; known keys are file, signal"),
         ("", "record: is missing"),
+        ("[record]", "record: give either file or signal; correct the config"),
+        (
+            '[record]\nfile = "a.csv"\nsignal = "identification"\n',
+            "record: give either file or signal; correct the config",
+        ),
+        (RECORD + "[validation.a]", "validation.a: give one of window, file and signal; correct"),
+        (
+            RECORD + "[validation.a]\nfile = 'a.csv'\nsignal = 'step10'",
+            "validation.a: give one of window, file and signal; correct",
+        ),
+        (
+            RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in_from = 0.5",
+            "validation.a: lead_in_from is for another record; give file or signal",
+        ),
+        (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
+        (RECORD + "[validation.training]\nsignal = 'step10'", "'training' is taken"),
+        (RECORD + "[validation.training-2]\nsignal = 'step10'", "'training-2' is taken"),
+        ("seed = 9223372036854775808\n" + RECORD, "seed"),
+        (f"seed = 0x{5000 * 'f'}\n{RECORD}", "seed: "),
     ],
 )
 def test_hints_are_near_in_meaning_or_all_keys(text: str, hint: str) -> None:
@@ -129,30 +134,6 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
         record = Record(np.arange(20.0), np.arange(20.0), 0.1)
         by_keyword, by_list = (config_of(record, {key: one})[0] for one in (text, [text]))
         assert by_keyword == by_list
-
-
-def test_every_list_of_texts_takes_a_text_alone() -> None:
-    """Whatever keys there will be."""
-    found = [key.path for key in keys(Config) if "list of texts" in key.kind]
-    assert len(found) >= 7
-    for path in found:
-        model: type[BaseModel] = Config
-        names = path.split(".")
-        for name in names[:-1]:
-            if name != ANY:
-                (inner,) = {k.table for k in keys(model) if k.path in (name, f"{name}.{ANY}")}
-                assert inner is not None
-                model = inner
-        field = model.model_fields[names[-1]]
-        annotation: Any = field.annotation
-        if field.metadata:
-            annotation = Annotated[annotation, *field.metadata]
-        assert ["a"] == TypeAdapter[Any](annotation).validate_python("a")
-
-
-def test_a_config_is_loaded_from_a_path_or_its_text(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text(RECORD)
-    assert load(tmp_path / "a.toml") == load(str(tmp_path / "a.toml"))
 
 
 @pytest.mark.parametrize(
@@ -233,41 +214,12 @@ def test_number_that_is_not_finite_is_refused(text: str, value: str) -> None:
     assert "finite" in refused(text.format(value))
 
 
-@pytest.mark.parametrize("source", ["", 'file = "a.csv"\nsignal = "identification"\n'])
-def test_record_has_one_source(source: str) -> None:
-    assert "record: give either file or signal; correct the config" == refused(
-        f"[record]\n{source}"
-    )
-
-
-@pytest.mark.parametrize("source", ["", 'file = "a.csv"\nsignal = "step10"'])
-def test_validation_has_one_source(source: str) -> None:
-    said = refused(f"{RECORD}[validation.a]\n{source}")
-    assert "validation.a: give one of window, file and signal; correct the config" == said
-
-
 def test_a_window_of_another_record_is_what_is_judged() -> None:
     text = f'{RECORD}[validation.a]\nfile = "a.csv"\nwindow = [1.0, 2.0]\nlead_in_from = 0.5'
     result = parse(text, "").validation["a"]
     assert result.another
     assert [[1.0, 2.0]] == result.window
     assert 0.5 == result.lead_in_from
-
-
-def test_a_window_of_the_training_record_has_no_lead_in() -> None:
-    said = refused(f"{RECORD}[validation.a]\nwindow = [1.0, 2.0]\nlead_in_from = 0.5")
-    assert "validation.a: lead_in_from is for another record; give file or signal" in said
-
-
-@pytest.mark.parametrize("name", ["record", "training", "training-2"])
-def test_validation_cannot_take_the_names_of_the_training_record(name: str) -> None:
-    """Its file would be the training record's, or its bands the training windows'."""
-    assert f"{name!r} is taken" in refused(f"{RECORD}[validation.{name}]\nsignal = 'step10'")
-
-
-@pytest.mark.parametrize("seed", ["100000000000000000000", "9223372036854775808"])
-def test_seed_is_a_number_that_files_can_hold(seed: str) -> None:
-    assert "seed" in refused(f"seed = {seed}\n{RECORD}")
 
 
 @pytest.mark.parametrize(
@@ -291,19 +243,13 @@ def test_text_that_is_no_toml_is_refused(text: str) -> None:
     assert refused(text).startswith("invalid TOML")
 
 
-def test_number_too_long_to_be_written_is_refused_by_its_place() -> None:
-    assert "seed: " in refused(f"seed = 0x{5000 * 'f'}\n{RECORD}")
-
-
 def test_unknown_key_of_any_length_is_one_short_line() -> None:
+    """And many windows in one line are not taken for one."""
+    windows = ", ".join(f"[{i}.0, {i}.5]" for i in range(1000))
+    assert 1000 == len(parse(f"{RECORD}train = [{windows}]\n", "").records["record"].train or [])
     text = refused(f"{RECORD}{'x' * 100_000} = 1\n")
     assert "unknown key; known are " in text
     assert len(text) < 700
-
-
-def test_many_windows_in_one_line_are_no_long_key() -> None:
-    windows = ", ".join(f"[{i}.0, {i}.5]" for i in range(1000))
-    assert 1000 == len(parse(f"{RECORD}train = [{windows}]\n", "").records["record"].train or [])
 
 
 @settings(deadline=None)
@@ -339,19 +285,15 @@ def test_unusable_file_is_named(tmp_path: Path, content: bytes, why: str) -> Non
 def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "large.toml").write_text(RECORD + 1_000_000 * "#")
-    with pytest.raises(InputError, match="not a regular file"):
-        load(tmp_path / "pipe")
-    with pytest.raises(InputError, match="not a regular file"):
-        load(Path("/dev/zero"))
-    with pytest.raises(InputError, match="larger than 1 MB"):
-        load(tmp_path / "large.toml")
-
-
-def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.toml: No such file"):
-        load(tmp_path / "none.toml")
-    with pytest.raises(InputError, match=re.escape(f"{tmp_path}: Is a directory")):
-        load(tmp_path)
+    for path, why in (
+        (tmp_path / "pipe", "not a regular file"),
+        (Path("/dev/zero"), "not a regular file"),
+        (tmp_path / "large.toml", "larger than 1 MB"),
+        (tmp_path / "none.toml", r"none\.toml: No such file"),
+        (tmp_path, re.escape(f"{tmp_path}: Is a directory")),
+    ):
+        with pytest.raises(InputError, match=why):
+            load(path)
 
 
 @pytest.mark.parametrize(

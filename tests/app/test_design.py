@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from bwbayes.app.commands import cli
+from bwbayes.app.jobs.at_work import opened
 from bwbayes.app.jobs.design import design
-from bwbayes.app.report.design_report import alike, render
-from bwbayes.comparison.design import Asked, Promise
+from bwbayes.comparison.designed import Design, Promise
 from bwbayes.data import read_record
 from bwbayes.model.inverse.limits import Limits
+from bwbayes.report.page import render
 from bwbayes.results.standing import Standing
 
 CANDIDATES = """\
@@ -70,21 +70,19 @@ def test_the_best_of_a_file_is_written_for_the_generator(
     assert "best.csv: exists" in capsys.readouterr().err
 
 
-def test_the_preset_keeps_to_the_amplifiers_limits(run: Path, tmp_path: Path) -> None:
+def test_the_preset_keeps_to_the_amplifiers_limits(run: Path) -> None:
     made = design(
-        run,
-        tmp_path,
-        Console(quiet=True),
-        drive="verification",
+        opened(run),
+        Path("verification"),
         voltage=(0.0, 150.0),
         current=2e-3,
         capacitance=5e-6,
     )
     assert not any(one.refused for one in made if "sine" in one.name)
-    best = read_record(tmp_path / "best.csv", need_displacement=False)
-    assert best.voltage.min() >= -1e-6
-    assert best.voltage.max() <= 150 + 1e-6
-    assert np.max(np.abs(np.diff(best.voltage))) / best.interval <= 400 * (1 + 1e-6)
+    best = made.signals[made.best.name]
+    assert best.min() >= -1e-6
+    assert best.max() <= 150 + 1e-6
+    assert np.max(np.abs(np.diff(best))) / made.interval <= 400 * (1 + 1e-6)
     lefts = [one.left for one in made if not one.refused]
     assert lefts == sorted(lefts)
     assert 0 < lefts[0] < 1
@@ -99,14 +97,14 @@ def test_a_page_names_what_cannot_be_told_apart_and_what_is_refused() -> None:
         Promise("c", 0.60, 0.01),
         Promise("d", np.nan, np.nan, "is too fast"),
     ]
-    assert ["b"] == alike(made)
-    asked = Asked(
-        "run", None, "x", Limits(-100, 100, 50.0), dict.fromkeys("abcd", wave), 0.01, Standing()
-    )
-    page = render(asked, made, {})
-    assert "Not to be told apart from it: b." in page
+    limits = Limits(-100, 100, 50.0)
+    waves = dict.fromkeys("abcd", wave)
+    ranking = Design("run", None, "x", limits, waves, 0.01, Standing(), made)
+    assert ["b"] == ranking.alike
+    page = render(ranking.report(), {})
+    assert "not to be told apart from it: b" in page
     assert "<li>d is too fast</li>" in page
-    assert "Width left of the band along x after one more record of it: 50.0 ± 1.0 %." in page
+    assert "width left of the band along x after one more record of it: 50.0% ± 1.0%" in page
     assert "at most 50 V/s" in page
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from bwbayes.app.figures import draw_all, interactive, save
 from bwbayes.app.running.drawing import Beside, beside
+from bwbayes.report.figures import drawings, interactive, picture_of, save_pictures
 from tests.app import example
 
 
@@ -26,7 +26,7 @@ class Broken(Executor):
 
 def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
     run = example.run()
-    with beside(2, asked=True) as artist:
+    with beside(2, enabled=True) as artist:
         if artist is None:
             pytest.skip("this machine has one core")
         artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
@@ -34,7 +34,8 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
         drawn = artist.pictures(run, tmp_path / "apart")
         plots = artist.plots(run)
     assert interactive.made(run) == plots
-    here = save(draw_all(run), tmp_path / "here")
+    here = {name: picture_of(draw) for name, draw in drawings(run).items()}
+    save_pictures(here, tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
     assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
         path.name: path.read_bytes() for path in (tmp_path / "apart").iterdir()
@@ -53,11 +54,11 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
 def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
     artist, run = Beside(Broken()), example.run()
     artist.draw(run)
-    assert list(draw_all(run)) == list(artist.pictures(run, tmp_path))
+    assert list(drawings(run)) == list(artist.pictures(run, tmp_path))
     assert interactive.made(run) == artist.plots(run)
 
 
 @pytest.mark.parametrize(("workers", "asked"), [(1, True), (2, False)])
 def test_one_worker_draws_by_itself(workers: int, asked: bool) -> None:
-    with beside(workers, asked=asked) as artist:
+    with beside(workers, enabled=asked) as artist:
         assert artist is None

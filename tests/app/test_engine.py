@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from io import StringIO
 from pathlib import Path
 
@@ -13,16 +12,11 @@ from rich.console import Console
 
 from bwbayes.app.config.config import load
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import carry_on
+from bwbayes.app.running.run import resume
 from bwbayes.errors import InputError
 from bwbayes.inference import engine
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
-
-
-def copied(run: Path, tmp_path: Path) -> RunFolder:
-    shutil.copytree(run, tmp_path / "small")
-    return RunFolder(tmp_path / "small")
 
 
 def test_chain_file_and_summary_name_the_engine(run: Path) -> None:
@@ -33,40 +27,38 @@ def test_chain_file_and_summary_name_the_engine(run: Path) -> None:
     assert "numba" in small.numbers(run)["versions"]
 
 
-def test_another_engine_is_refused_unless_asked_for(run: Path, tmp_path: Path) -> None:
-    folder = copied(run, tmp_path)
-    text = folder.config.read_text().replace('engine = "numba"', 'engine = "numpy"')
-    folder.config.write_text(text)
-    before = ChainFile.read(folder.chain).steps("sampling")
+def test_another_engine_is_refused_unless_asked_for(copy: RunFolder) -> None:
+    text = copy.config.read_text().replace('engine = "numba"', 'engine = "numpy"')
+    copy.config.write_text(text)
+    before = ChainFile.read(copy.chain).steps("sampling")
     with pytest.raises(InputError, match=r'sampled with the numba engine, not numpy.*`engine="num'):
-        carry_on(folder, small.quiet(), workers=1)
-    assert before == ChainFile.read(folder.chain).steps("sampling")
+        resume(copy, small.quiet(), workers=1)
+    assert before == ChainFile.read(copy.chain).steps("sampling")
 
 
 def test_machine_without_the_engine_says_what_to_do(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = copied(run, tmp_path)
     monkeypatch.setattr(engine, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"numba is not installed; pip install .* numpy engine"):
-        carry_on(folder, small.quiet(), workers=1)
+        resume(copy, small.quiet(), workers=1)
 
 
 @pytest.mark.slow
-def test_asked_for_another_engine_goes_on_and_is_said(run: Path, tmp_path: Path) -> None:
-    folder, said = copied(run, tmp_path), StringIO()
+def test_asked_for_another_engine_goes_on_and_is_said(run: Path, copy: RunFolder) -> None:
+    said = StringIO()
     ess = 2 * small.lowest_ess(run)
-    result = carry_on(folder, Console(file=said, width=200), workers=1, ess=ess, engine="numpy")
+    result = resume(copy, Console(file=said, width=200), workers=1, ess=ess, engine="numpy")
     assert result.outcome.converged
-    assert "going on with the numpy engine a chain begun with numba" in said.getvalue()
-    assert "numpy" == load(folder.config).sampling.engine
+    assert "resuming with the numpy engine a chain begun with numba" in said.getvalue()
+    assert "numpy" == load(copy.config).sampling.engine
 
 
 @pytest.mark.slow
 def test_engines_agree_on_the_posterior(run: Path, tmp_path: Path) -> None:
     """Within five Monte Carlo errors of the difference: a false alarm in 10^5 runs."""
     made = small.begun(tmp_path / "small", ("block = 25", 'block = 25\nengine = "numpy"'))
-    carry_on(made, small.quiet(), workers=1)
+    resume(made, small.quiet(), workers=1)
     one, two = (small.numbers(path)["parameters"] for path in (run, made.path))
     for name in one:
         error = (one[name]["mcse_mean"] ** 2 + two[name]["mcse_mean"] ** 2) ** 0.5

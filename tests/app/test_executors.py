@@ -26,8 +26,8 @@ import pytest
 from bwbayes.app.jobs import calibrate
 from bwbayes.app.running import cluster as cluster_module
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import go_on
-from bwbayes.app.running.workers import Processes, executor, side_by_side
+from bwbayes.app.running.run import resume
+from bwbayes.app.running.workers import executor, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.sampling.chain import Chain
@@ -115,15 +115,12 @@ def cluster() -> Iterator[tuple[str, Any, list[Any]]]:
         yield running
 
 
-def test_a_cluster_gives_the_same_bits_and_gets_the_posterior_once(
-    here: Any, cluster: tuple[str, Any, list[Any]]
-) -> None:
-    with executor(how=f"dask://{cluster[0]}") as pool:
-        pool.client.wait_for_workers(2, timeout=PATIENCE)  # type: ignore[attr-defined]
+def test_a_cluster_gives_the_same_bits(here: Any, cluster: tuple[str, Any, list[Any]]) -> None:
+    with executor(backend=f"dask://{cluster[0]}") as pool:
         np.testing.assert_array_equal(here, sampled(pool))
-        assert 1 == len(pool.sent)  # type: ignore[attr-defined]
-        assert 4 == side_by_side(pool, None, 10)
-        assert 3 == side_by_side(pool, None, 3)
+        pool.submit(pow, 2, 2).result(PATIENCE)
+        assert side_by_side(pool, None, 10) in (2, 4)  # of one worker or of both
+        assert 1 == side_by_side(pool, None, 1)
 
 
 def test_a_client_that_somebody_made_is_an_executor_and_stays_open(
@@ -131,7 +128,7 @@ def test_a_client_that_somebody_made_is_an_executor_and_stays_open(
 ) -> None:
     client = distributed.Client(f"tcp://{cluster[0]}")
     try:
-        with executor(how=client) as pool:
+        with executor(backend=client) as pool:
             assert [4] == [pool.submit(pow, 2, 2).result()]
             error = pool.submit(int, "x").exception()
             assert isinstance(error, ValueError)
@@ -152,7 +149,7 @@ def test_a_worker_killed_within_a_block_costs_no_bit(
             killed.append(workers[0].pid)
             workers[0].kill()
 
-    with executor(how=f"dask://{cluster[0]}") as pool:
+    with executor(backend=f"dask://{cluster[0]}") as pool:
         np.testing.assert_array_equal(here, sampled(pool, watcher))
     assert killed
 
@@ -168,7 +165,7 @@ def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
                 main.kill()
 
         with (
-            executor(how=f"dask://{address}") as pool,
+            executor(backend=f"dask://{address}") as pool,
             pytest.raises(BrokenExecutor, match="the scheduler is gone"),
         ):
             sample(one, PLAN, begun, pool, watcher)
@@ -181,13 +178,13 @@ def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
 
 @pytest.mark.slow
 def test_with_the_scheduler_lost_a_run_is_resumed_here(tmp_path: Path) -> None:
-    expected = go_on(small.begun(tmp_path / "here"), small.quiet(), workers=1, files=False)
+    expected = resume(small.begun(tmp_path / "here"), small.quiet(), workers=1, files=False)
     folder = small.begun(tmp_path / "there")
     with scheduler(1) as (address, main, _):
         threading.Thread(target=_kill_at_first_block, args=(folder, main), daemon=True).start()
         with pytest.raises(BrokenExecutor, match="the scheduler is gone"):
-            go_on(folder, small.quiet(), how=f"dask://{address}", files=False)
-    resumed = go_on(RunFolder.open(folder.path), small.quiet(), workers=1, files=False)
+            resume(folder, small.quiet(), backend=f"dask://{address}", files=False)
+    resumed = resume(RunFolder.open(folder.path), small.quiet(), workers=1, files=False)
     np.testing.assert_array_equal(expected.result.draws, resumed.result.draws)
 
 
@@ -235,7 +232,7 @@ def test_the_readmes_commands_for_a_cluster_work_together(
 def test_a_calibration_on_a_cluster_is_the_same(tmp_path: Path) -> None:
     for how in ("threads", "dask"):
         folder = begun_calibration(tmp_path / how)
-        calibrate.carry_on(folder, small.quiet(), workers=2, how=how)
+        calibrate.resume(folder, small.quiet(), workers=2, backend=how)
     assert_same_calibration(tmp_path / "threads", tmp_path / "dask")
 
 
@@ -244,11 +241,11 @@ def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
 ) -> None:
     monkeypatch.setattr(cluster_module, "PATIENCE", 0.2)
     with pytest.raises(InputError, match="no scheduler there; start one with `dask scheduler`"):
-        executor(how="dask://127.0.0.1:9").__enter__()
+        executor(backend="dask://127.0.0.1:9").__enter__()
     with pytest.raises(InputError, match="'ray' is unknown; write one of local, threads"):
-        executor(how="ray").__enter__()
+        executor(backend="ray").__enter__()
     with pytest.raises(InputError, match="object has no submit"):
-        executor(how=object()).__enter__()  # type: ignore[arg-type]
+        executor(backend=object()).__enter__()  # type: ignore[arg-type]
 
 
 class Foreign(Executor):
@@ -266,43 +263,19 @@ class Foreign(Executor):
 
 def test_any_executor_with_a_submit_gives_the_same_bits(here: Any) -> None:
     foreign = Foreign()
-    with executor(how=foreign) as pool:
+    with executor(backend=foreign) as pool:
         np.testing.assert_array_equal(here, sampled(pool))
     assert foreign.sent > 8
-
-
-def die_once(mark: Path) -> int:
-    """End this process, but not a second time."""
-    if not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid()
 
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_process_that_dies_is_replaced_and_its_call_made_again(tmp_path: Path) -> None:
-    pool = Processes(1)
-    try:
-        (before,) = pool.processes
-        after = pool.submit(die_once, tmp_path / "mark").result(PATIENCE)
-        assert [after] == pool.processes
-        assert before != after
-    finally:
-        pool.shutdown()
-
-
-@pytest.mark.slow
-def test_one_call_that_ends_its_processes_does_not_end_all() -> None:
-    pool = Processes(1)
-    try:
-        with pytest.raises(BrokenProcessPool):
-            pool.submit(die).result(PATIENCE)
-        assert 4 == pool.submit(pow, 2, 2).result(PATIENCE)
-    finally:
-        pool.shutdown()
+def test_a_process_that_dies_ends_the_work_at_once() -> None:
+    """What is on disk can be resumed; the command line says so (`cli.main`)."""
+    with executor(1, backend="processes") as pool, pytest.raises(BrokenProcessPool):
+        pool.submit(die).result(PATIENCE)
 
 
 def test_whoever_is_interrupted_does_not_wait_for_processes() -> None:
@@ -313,7 +286,7 @@ def test_whoever_is_interrupted_does_not_wait_for_processes() -> None:
 
 
 def _interrupted() -> None:
-    with executor(1, how="processes") as pool:
+    with executor(1, backend="processes") as pool:
         pool.submit(time.sleep, PATIENCE)
         raise KeyboardInterrupt
 

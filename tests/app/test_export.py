@@ -12,16 +12,14 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.export import export as command
-from bwbayes.app.commands.shared import finish
-from bwbayes.app.jobs.export import export
-from bwbayes.app.jobs.track import Setup, track_run
-from bwbayes.errors import InputError, NotConvergedError
-from tests.app import small
+from bwbayes.app.jobs.at_work import opened
+from bwbayes.app.jobs.export import FILES, export
+from bwbayes.errors import InputError
 
 
 def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
-    made, files = export(run, tmp_path / "new" / "here")
-    assert ["model.json", "actuator.c"] == [path.name for path in files]
+    made = export(opened(run), tmp_path / "new" / "here")
+    files = [tmp_path / "new" / "here" / name for name in FILES]
     numbers = json.loads(files[0].read_text())
     posterior = json.loads((run / "summary.json").read_text())["parameters"]
     for name, known in numbers["parameters"].items():
@@ -45,7 +43,7 @@ def test_the_controllers_pace_is_an_option(run: Path, tmp_path: Path) -> None:
         numbers[name] for name in ("interval_s", "hold", "limits_V")
     )
     assert 1e-4 == made.linear.dt
-    with pytest.raises(InputError, match=r"model\.json: exists; choose another folder, or give"):
+    with pytest.raises(InputError, match=r"model\.json: exists; choose another name, or give"):
         fit.export(tmp_path)
     fit.export(tmp_path, overwrite=True)
     assert 0.02 == json.loads((tmp_path / "model.json").read_text())["interval_s"]
@@ -65,30 +63,11 @@ def test_options_that_make_no_sense_are_one_line(
     run: Path, tmp_path: Path, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line):
-        export(run, tmp_path / "out", **options)
+        export(opened(run), tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_file_in_the_way_is_one_line(run: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="choose another folder"):
-        export(run, tmp_path / "file")
-
-
-def test_a_run_that_has_not_converged_is_refused(tmp_path: Path) -> None:
-    made = small.begun(tmp_path / "run", ("block = 25", "block = 25\nsteps = 25"))
-    assert 4 == finish(made.path, 1, quiet=True)
-    with pytest.raises(NotConvergedError, match=r"run: budget of .* go on with `bwbayes resume"):
-        export(made.path)
-    with pytest.raises(NotConvergedError, match=r"run: budget of .* go on with `bwb"):
-        track_run(made.path, None, Setup())
-    fit = bw.open_run(made.path)
-    with pytest.raises(NotConvergedError, match="not converged"):
-        fit.track()
-    with pytest.raises(NotConvergedError, match="not converged"):
-        fit.export(tmp_path / "out")
-    left = (made.path / "export", made.path / "track", tmp_path / "out")
-    assert not any(path.exists() for path in left)
+        export(opened(run), tmp_path / "file")
 
 
 def test_the_command_says_what_it_wrote(

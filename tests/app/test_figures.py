@@ -23,38 +23,31 @@ from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 from PIL import Image
 
-from bwbayes.app.figures import draw_all, interactive, save
-from bwbayes.app.figures.chain import _rank_heights, draw_corner, draw_ranks, draw_trace
-from bwbayes.app.figures.coverage import draw_coverage
-from bwbayes.app.figures.loop import along, draw_loop
-from bwbayes.app.figures.series import _around_largest_error, draw_bands
-from bwbayes.app.figures.style import MEAN_COLOUR, STYLE, envelope, zigzag
 from bwbayes.inference.parameters import Parameter
+from bwbayes.report.figures import interactive, picture_of, save_pictures
+from bwbayes.report.figures.chain import _rank_heights, draw_corner, draw_trace
+from bwbayes.report.figures.coverage import draw_coverage
+from bwbayes.report.figures.loop import along, draw_loop
+from bwbayes.report.figures.series import _around_largest_error, draw_bands
+from bwbayes.report.figures.style import MEAN_COLOUR, STYLE, envelope, zigzag
 from tests.app import example
-
-# What has no unit, and says so by its nature.
-PURE = {"step", "$n$"}
 
 
 @pytest.fixture(scope="module")
 def figures() -> dict[str, Figure]:
-    return draw_all(example.run())
+    return example.figures(example.run())
 
 
 def test_converged_run_shows_everything_in_order(figures: Mapping[str, Figure]) -> None:
-    assert [
-        "loop",
-        "bands_training",
-        "bands_held-out",
-        "coverage",
-        "corner",
-        "trace",
-        "ranks",
-    ] == list(figures)
-
-
-def test_run_without_convergence_shows_only_its_chains() -> None:
-    assert ["trace", "ranks"] == list(draw_all(example.run(converged=False)))
+    """And a chain that has not converged itself alone; no global setting is left behind."""
+    chains = ["trace", "ranks"]
+    assert ["loop", "bands_training", "bands_held-out", "coverage", "corner", *chains] == list(
+        figures
+    )
+    before = dict(mpl.rcParams)
+    assert chains == list(example.figures(example.run(converged=False)))
+    assert [] == plt.get_fignums()
+    assert before == dict(mpl.rcParams)
 
 
 def visible(figure: Figure) -> list[Axes]:
@@ -67,63 +60,30 @@ def places(panel: Axes) -> tuple[int, int]:
     return spec.rowspan.start, spec.colspan.start
 
 
-def test_lowest_panel_of_each_column_names_its_x_axis(figures: Mapping[str, Figure]) -> None:
+def test_outer_axes_are_named_with_their_units(figures: Mapping[str, Figure]) -> None:
     for name, figure in figures.items():
-        lowest = {places(p)[1]: p for p in sorted(visible(figure), key=places)}
+        panels = sorted(visible(figure), key=places)
+        lowest = {places(panel)[1]: panel for panel in panels}
+        leftmost = [p for p in panels if places(p)[1] == 0 and len(p.get_yticks())]
+        assert leftmost, name
         assert all(panel.get_xlabel() for panel in lowest.values()), name
-
-
-def test_first_panel_of_each_row_names_its_y_axis(figures: Mapping[str, Figure]) -> None:
-    for name, figure in figures.items():
-        first = [p for p in visible(figure) if places(p)[1] == 0 and len(p.get_yticks())]
-        assert first, name
-        assert all(panel.get_ylabel() for panel in first), name
-
-
-def test_every_label_has_its_unit(figures: Mapping[str, Figure]) -> None:
-    for figure in figures.values():
+        assert all(panel.get_ylabel() for panel in leftmost), name
         labels = {p.get_xlabel() for p in figure.axes} | {p.get_ylabel() for p in figure.axes}
-        for label in labels - {""} - PURE:
+        for label in labels - {"", "step", "$n$"}:
             assert re.search(r"\((.+)\)$", label), label
             assert "um" not in re.findall(r"\w+", label), label
-
-
-def test_rank_panels_are_titled_with_symbol_and_unit(figures: Mapping[str, Figure]) -> None:
     titles = [panel.get_title() for panel in visible(figures["ranks"])]
     assert [r"$d$ (µm/V)", r"$\alpha$ (µm/V)", r"$\tau_\mathrm{lag}$ (s)", "$k$ (N/m)"] == titles
 
 
-def test_saved_files_are_the_returned_pictures(tmp_path: Path) -> None:
-    folder = tmp_path / "new" / "figures"
-    pictures = save({"trace": Figure((1, 1)), "bands_a/b": Figure((2, 1))}, folder)
-    assert ["trace", "bands_a/b"] == list(pictures)
-    for name, file in (("trace", "trace.png"), ("bands_a/b", "bands_a%2Fb.png")):
-        assert pictures[name] == (folder / file).read_bytes()
-        assert b"\x89PNG\r\n" == pictures[name][:6]
-
-
-def test_every_figure_can_be_saved(
-    figures: Mapping[str, Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(STYLE, "savefig.dpi", 30)
-    assert set(figures) == set(save(figures, tmp_path))
-
-
-def test_no_global_figure_or_setting_is_left_behind() -> None:
-    before = dict(mpl.rcParams)
-    draw_all(example.run(parameters=example.PARAMETERS[:2], values=example.draws()[..., :2]))
-    assert [] == plt.get_fignums()
-    assert before == dict(mpl.rcParams)
-
-
-def test_label_that_is_no_mathtext_becomes_the_name() -> None:
+def test_names_are_read_as_mathematics_only_if_they_are() -> None:
     odd = dataclasses.replace(example.PARAMETERS[0], label=r"\nonsense{", unit="$")
-    figure = draw_trace(example.run(parameters=(odd, *example.PARAMETERS[1:])))
-    figure.draw_without_rendering()
-    assert r"d (\$)" == figure.axes[0].get_ylabel()
-
-
-def test_band_names_are_not_read_as_mathematics() -> None:
+    exponent = Parameter("exponent", "-", "n", "s", example.PARAMETERS[0].prior)
+    for parameter, label in ((odd, r"d (\$)"), (exponent, "$n$")):
+        run = example.run(False, example.draws()[..., :1], (parameter,))
+        figure = draw_trace(run)
+        figure.draw_without_rendering()
+        assert label == figure.axes[0].get_ylabel()
     figure = draw_loop([example.bands(r"$\nonsense{$")])
     figure.draw_without_rendering()
     assert r"\$\nonsense{\$ (held out)" == figure.axes[0].get_title()
@@ -134,23 +94,80 @@ def test_chains_without_a_spread_can_be_drawn(value: float) -> None:
     run = example.run(False, np.full((60, 4, 10, 1), value), example.PARAMETERS[:1])
     unknown = dataclasses.replace(run.outcome.check, autocorrelation=np.full(4, np.nan))
     run = dataclasses.replace(run, outcome=dataclasses.replace(run.outcome, check=unknown))
-    figures = draw_all(run)
-    assert ["trace", "ranks"] == list(figures)
-    for figure in figures.values():
+    for figure in example.figures(run).values():
         figure.draw_without_rendering()
 
 
-def test_one_free_parameter_can_be_drawn() -> None:
-    run = example.run(parameters=example.PARAMETERS[:1], values=example.draws()[..., :1])
-    for draw in (draw_corner, draw_trace, draw_ranks):
-        draw(run).draw_without_rendering()
-    assert "$d$ (µm/V)" == draw_corner(run).axes[0].get_xlabel()
+def test_one_parameter_and_bands_at_rest_without_a_measurement_can_be_drawn() -> None:
+    """A held-out window may hold a constant voltage; a truth may lie far from the draws."""
+    samples = 200
+    level = np.full(samples, 1.0)
+    bands = example.bands(samples=samples, lead_in=0, measured=False)
+    rest = dataclasses.replace(
+        bands,
+        name="rest",
+        voltage=0 * level,
+        mean=0 * level,
+        lower=dict.fromkeys(bands.lower, -level),
+        upper=dict.fromkeys(bands.upper, level),
+    )
+    run = example.run(
+        values=example.draws()[..., :1], parameters=example.PARAMETERS[:1], every=(bands, rest)
+    )
+    figures = example.figures(dataclasses.replace(run, truth={"d": 0.8}))
+    for figure in figures.values():
+        figure.draw_without_rendering()
+    assert "coverage" not in figures
+    assert "band − mean (µm)" == figures["bands_held-out"].axes[4].get_ylabel()
+    assert "$d$ (µm/V)" == figures["corner"].axes[0].get_xlabel()
+    low, high = figures["corner"].axes[0].get_xlim()
+    assert low < 0.8 < high
 
 
-def test_bands_without_a_measurement_can_be_drawn() -> None:
-    figure = draw_bands(example.bands(measured=False))
-    figure.draw_without_rendering()
-    assert "band − mean (µm)" == figure.axes[4].get_ylabel()
+def test_legend_names_the_bands_widest_first_and_the_lead_in(
+    figures: Mapping[str, Figure],
+) -> None:
+    labels = figures["bands_held-out"].axes[4].get_legend_handles_labels()[1]
+    kinds = ["95 % sensor reading", "95 % displacement", "95 % parameters alone"]
+    assert kinds == [label for label in labels if label.startswith("95 %")]
+    assert "lead-in, not judged" in labels
+    assert (
+        "lead-in, not judged"
+        not in figures["bands_training"].axes[4].get_legend_handles_labels()[1]
+    )
+
+
+def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
+    """The sensor band takes at least a tenth of the zoomed displacement."""
+    bands = example.bands(samples=50_000, lead_in=300)
+    assert bands.measured is not None
+    bands.measured[100] += 100
+    bands.measured[2000] += 50
+    shown = _around_largest_error(bands)
+    assert shown.start <= 2000 < shown.stop
+    assert not shown.start <= 100 < shown.stop
+    width = bands.upper["sensor", 95][0] - bands.lower["sensor", 95][0]
+    assert 10 * width > np.ptp(bands.mean[shown])
+
+
+def test_loop_keeps_a_fast_signals_samples_few_of_a_slow_ones_and_both_ends() -> None:
+    time = np.arange(20_000) / 1000
+    fast, slow = (along(*[np.sin(2 * np.pi * hertz * time)] * 2) for hertz in (97.3, 0.05))
+    assert 19_900 < fast.size
+    assert 600 < slow.size < 1_200
+    for indices in (fast, slow):
+        assert (0, 19_999) == (indices[0], indices[-1])
+
+
+def test_saved_files_are_the_returned_pictures(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "figures"
+    drawings = {"trace": lambda: Figure((1, 1)), "bands_a/b": lambda: Figure((2, 1))}
+    pictures = {name: picture_of(draw) for name, draw in drawings.items()}
+    save_pictures(pictures, folder)
+    assert ["trace", "bands_a/b"] == list(pictures)
+    for name, file in (("trace", "trace.png"), ("bands_a/b", "bands_a%2Fb.png")):
+        assert pictures[name] == (folder / file).read_bytes()
+        assert b"\x89PNG\r\n" == pictures[name][:6]
 
 
 @pytest.mark.parametrize("wider", [1.0, 30.0])
@@ -168,68 +185,6 @@ def test_frame_of_the_tip_lies_within_the_loop(wider: float) -> None:
     whole, tip = visible(figure)
     assert np.ptp(tip.get_ylim()) <= 0.55 * np.ptp(whole.get_ylim())
     assert np.ptp(tip.get_xlim()) <= 0.55 * np.ptp(whole.get_xlim())
-
-
-def test_loop_without_a_measurement_can_be_drawn() -> None:
-    draw_loop([example.bands(measured=False)]).draw_without_rendering()
-
-
-def test_coverage_needs_a_measurement() -> None:
-    run = example.run(
-        parameters=example.PARAMETERS[:1],
-        values=example.draws()[..., :1],
-        every=(example.bands(measured=False),),
-    )
-    assert "coverage" not in draw_all(run)
-
-
-def test_bands_at_rest_can_be_drawn() -> None:
-    """A held-out window may hold a constant voltage."""
-    moving = example.bands(samples=200, lead_in=0)
-    still = {key: np.full(200, -1.0) for key in moving.lower}
-    rest = dataclasses.replace(
-        moving,
-        voltage=np.zeros(200),
-        mean=np.zeros(200),
-        lower=still,
-        upper={key: -edge for key, edge in still.items()},
-    )
-    draw_bands(rest).draw_without_rendering()
-    draw_loop([rest]).draw_without_rendering()
-
-
-def test_lead_in_is_marked_where_there_is_one(figures: Mapping[str, Figure]) -> None:
-    def named(name: str) -> list[str]:
-        return figures[name].axes[4].get_legend_handles_labels()[1]
-
-    assert "lead-in, not judged" in named("bands_held-out")
-    assert "lead-in, not judged" not in named("bands_training")
-
-
-def test_zoom_is_at_the_largest_judged_error() -> None:
-    bands = example.bands(lead_in=300)
-    assert bands.measured is not None
-    bands.measured[100] += 100
-    bands.measured[2000] += 50
-    shown = _around_largest_error(bands)
-    assert shown.start <= 2000 < shown.stop
-    assert not shown.start <= 100 < shown.stop
-
-
-def test_zoom_makes_the_bands_tall() -> None:
-    """The sensor band takes at least a tenth of the zoomed displacement."""
-    bands = example.bands(samples=50_000)
-    shown = _around_largest_error(bands)
-    width = bands.upper["sensor", 95][0] - bands.lower["sensor", 95][0]
-    assert 10 * width > np.ptp(bands.mean[shown])
-
-
-def test_three_kinds_of_bands_are_drawn_with_the_widest_first(
-    figures: Mapping[str, Figure],
-) -> None:
-    labels = figures["bands_held-out"].axes[4].get_legend_handles_labels()[1]
-    kinds = ["95 % sensor reading", "95 % displacement", "95 % parameters alone"]
-    assert kinds == [label for label in labels if label.startswith("95 %")]
 
 
 def test_coverage_is_drawn_in_percent_with_its_error(figures: Mapping[str, Figure]) -> None:
@@ -298,13 +253,6 @@ def test_corner_marks_the_known_truth_alone(figures: Mapping[str, Figure]) -> No
     assert [2e-3] == upright(panels[3, 2])
 
 
-def test_corner_shows_a_truth_far_from_the_draws() -> None:
-    run = example.run(parameters=example.PARAMETERS[:1], values=example.draws()[..., :1])
-    run = dataclasses.replace(run, truth={"d": 0.8})
-    low, high = draw_corner(run).axes[0].get_xlim()
-    assert low < 0.8 < high
-
-
 def test_ranks_of_independent_draws_keep_inside_the_grey_band() -> None:
     """Ninety-five percent of them, whatever the distribution."""
     ensembles, bins = 4, 20
@@ -334,39 +282,13 @@ def test_thinned_series_keep_their_extremes(values: list[float], most: int) -> N
     time = np.arange(y.size, dtype=np.float64)
     at, low, high = envelope(time, y, y, most)
     assert at.size <= most
+    segment = np.searchsorted(at, time, side="right") - 1
+    assert (low[segment] <= y).all()
+    assert (y <= high[segment]).all()
     assert (y.min(), y.max()) == (low.min(), high.max())
     thin_time, thin = zigzag(time, y, most)
     assert thin_time.size == thin.size <= max(2 * most, 1)
     assert (y.min(), y.max()) == (thin.min(), thin.max())
-
-
-def test_thinned_band_holds_the_band_everywhere() -> None:
-    time = np.arange(997.0)
-    lower = np.sin(time)
-    upper = lower + 1
-    at, low, high = envelope(time, lower, upper, 40)
-    stretch = np.searchsorted(at, time, side="right") - 1
-    assert (low[stretch] <= lower).all()
-    assert (upper <= high[stretch]).all()
-
-
-def test_loop_keeps_the_samples_of_a_fast_signal_and_few_of_a_slow_one() -> None:
-    time = np.arange(20_000) / 1000
-    fast, slow = (np.sin(2 * np.pi * f * time) for f in (97.3, 0.05))
-    assert 19_900 < along(fast, fast).size
-    assert 1_200 > along(slow, slow).size > 600
-
-
-def test_loop_is_drawn_to_its_last_sample() -> None:
-    voltage = np.linspace(0, 1, 777)
-    kept = along(voltage, voltage)
-    assert (0, 776) == (kept[0], kept[-1])
-
-
-def test_dimensionless_parameter_has_no_empty_brackets() -> None:
-    free = Parameter("exponent", "-", "n", "s", example.PARAMETERS[0].prior)
-    run = example.run(converged=False, parameters=(free,), values=example.draws()[..., :1])
-    assert "$n$" == draw_trace(run).axes[0].get_ylabel()
 
 
 def test_tick_labels_of_the_corner_picture_do_not_collide() -> None:
@@ -417,10 +339,10 @@ def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None
     assert {} == interactive.draw(example.run(converged=False))
 
 
-def test_pictures_have_few_colours_and_look_the_same(tmp_path: Path) -> None:
+def test_pictures_have_few_colours_and_look_the_same() -> None:
     """Half the size, all but one pixel in a thousand within 12 of 255, and white is white."""
     figure = draw_loop(example.run().bands)
-    small = save({"loop": figure}, tmp_path)["loop"]
+    small = picture_of(lambda: figure)
     figure.set_layout_engine("none")  # it stays where it is
     canvas = FigureCanvasAgg(figure)
     plain = BytesIO()

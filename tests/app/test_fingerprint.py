@@ -9,24 +9,23 @@ from pathlib import Path
 import h5py
 import pytest
 
-from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.jobs.predict import predict
+from bwbayes.app.commands.predict import predict
+from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running import assembling
+from bwbayes.app.running import assembling, cache
 from bwbayes.app.running import run as module
-from bwbayes.app.running.fingerprint import UNSAID, fingerprint, require_same, version_remarks
+from bwbayes.app.running.fingerprint import (
+    UNSAID,
+    fingerprint,
+    require_same,
+    version_remarks,
+    versions,
+)
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import carry_on, redraw
+from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
-from bwbayes.results.prediction import Start
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
-
-
-def edit(folder: RunFolder, old: str, new: str) -> None:
-    text = folder.config.read_text()
-    assert old in text
-    folder.config.write_text(text.replace(old, new))
 
 
 def wider(folder: RunFolder) -> None:
@@ -40,20 +39,16 @@ def wider(folder: RunFolder) -> None:
     folder.config.write_text(dump(config.model_copy(update={"parameters": parameters})))
 
 
-def report(folder: RunFolder) -> None:
-    redraw(folder)
-
-
-def resume(folder: RunFolder) -> None:
-    carry_on(folder, small.quiet(), workers=1)
+def resumed(folder: RunFolder) -> None:
+    resume(folder, small.quiet(), workers=1)
 
 
 def predicted(folder: RunFolder) -> None:
-    predict(folder.path, None, "sine", Start(), None, small.quiet())
+    small.typed(predict, folder.path, "--signal", "sine")
 
 
-@pytest.mark.parametrize("use", [report, resume, predicted])
-def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], None]) -> None:
+@pytest.mark.parametrize("use", [redraw, resumed, predicted])
+def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], object]) -> None:
     """It once moved the means of a finished chain: 0.693 +- 0.008 became 0.675 +- 0.010."""
     wider(copy)
     with pytest.raises(InputError) as caught:
@@ -61,17 +56,6 @@ def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], Non
     text = str(caught.value)
     assert "chain.h5: parameters.d.prior was lognormal (" in text
     assert text.endswith("; undo the edit or start a new run")
-
-
-@pytest.mark.parametrize("use", [report, resume])
-def test_edited_block_is_refused(copy: RunFolder, use: Callable[[RunFolder], None]) -> None:
-    """It once wrote rows of zeros into the chain, and said converged."""
-    edit(copy, "block = 25", "block = 30")
-    before = ChainFile.read(copy.chain).steps("sampling")
-    with pytest.raises(InputError, match=r"sampling.block was 25 .* is 30; undo the edit"):
-        use(copy)
-    assert before == ChainFile.read(copy.chain).steps("sampling")
-    assert copy.summary.exists()
 
 
 @pytest.mark.parametrize(
@@ -94,71 +78,17 @@ def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key:
         require_same(fingerprint(load(run / "config.toml")), changed, Path("x"))
 
 
-def test_a_priors_numbers_are_part_of_it() -> None:
-    text = """
-    [record]
-    file = "record.csv"
-    [parameters.d]
-    prior = { distribution = "lognormal", median = 0.7, sigma = 0.3 }
-    """
-    before, after = parse(text, ""), parse(text.replace("0.3", "0.4"), "")
-    with pytest.raises(InputError, match=r"parameters\.d\.prior was .*0\.3.* is .*0\.4"):
-        require_same(fingerprint(before), after, Path("x"))
-    require_same(fingerprint(before), before, Path("x"))
-
-
-def test_a_bound_that_was_not_set_is_named(run: Path) -> None:
-    config = load(run / "config.toml")
-    d = config.parameters["d"].model_copy(update={"lower": 0.5})
-    changed = config.model_copy(update={"parameters": config.parameters | {"d": d}})
-    with pytest.raises(InputError, match=r"parameters.d.lower was not set when .* is 0\.5; undo"):
-        require_same(fingerprint(config), changed, Path("x"))
-
-
-def test_all_that_differs_is_named(run: Path) -> None:
-    config = load(run / "config.toml")
-    changed = config.model_copy(
-        update={"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
-    )
-    with pytest.raises(InputError, match=r"seed was 3 .*, is 5 \(also model.noise\); undo"):
-        require_same(fingerprint(config), changed, Path("x"))
-
-
-def allowed(config: Config) -> Config:
-    sampling = config.sampling.model_copy(update={"ess": 9.0, "steps": 7, "pilot_steps": 9})
-    d = config.parameters["d"].model_copy(update={"label": "D", "description": "gain"})
-    changes = {
-        "name": "other",
-        "sampling": sampling.model_copy(update={"engine": "auto"}),
-        "validation": {},
-        "truth": {},
-        "parameters": config.parameters | {"d": d},
-    }
-    return config.model_copy(update=changes)
-
-
-def test_what_leaves_the_posterior_may_change(run: Path) -> None:
-    config = load(run / "config.toml")
-    assert config != allowed(config)
-    require_same(fingerprint(config), allowed(config), Path("x"))
-
-
-def test_a_resolved_config_is_its_own(run: Path) -> None:
-    config = load(run / "config.toml")
-    require_same(fingerprint(config), resolve(config, run).config, Path("x"))
-
-
 @pytest.mark.usefixtures("_without_pictures")
 def test_a_validation_may_be_taken_out(copy: RunFolder) -> None:
     config = load(copy.config)
-    kept = {"held-out": config.validation["held-out"]}
-    copy.config.write_text(dump(config.model_copy(update={"validation": kept})))
-    assert ["training", "held-out"] == [bands.name for bands in redraw(copy).bands]
+    others = {"held-out": config.validation["held-out"]}
+    copy.config.write_text(dump(config.model_copy(update={"validation": others})))
+    assert ["training", "held-out"] == [bands.name for bands in redraw(copy).result.bands]
 
 
-@pytest.mark.parametrize("use", [report, resume])
+@pytest.mark.parametrize("use", [redraw, resumed])
 def test_chain_without_a_fingerprint_is_refused(
-    copy: RunFolder, use: Callable[[RunFolder], None]
+    copy: RunFolder, use: Callable[[RunFolder], object]
 ) -> None:
     with h5py.File(copy.chain, "r+") as file:
         del file.attrs["posterior"]
@@ -166,23 +96,18 @@ def test_chain_without_a_fingerprint_is_refused(
         use(copy)
 
 
-def test_other_versions_are_said(run: Path) -> None:
+def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted = json.dumps({"numpy": "1.0", "scipy": "1.1", "gone": "3"})
     now = {"numpy": "1.0", "scipy": "1.2", "new": "1"}
     expected = "the chain was begun with other versions: scipy 1.1, now 1.2"
     assert (expected,) == version_remarks(noted, now)
     assert () == version_remarks(noted, {"numpy": "1.0"})
-    problem, chain, outcome = module.finished(RunFolder(run))
-    assert not any("other versions" in r for r in module.assemble(problem, chain, outcome).remarks)
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_other_versions_do_not_stop_a_report(
-    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    installed = module.versions("numpy")
-    monkeypatch.setattr(assembling, "versions", lambda _: installed | {"numpy": "99"})
-    (remark,) = [text for text in redraw(copy).remarks if "other versions" in text]
+    assert not any("other versions" in r for r in module.finished(RunFolder(run)).result.remarks)
+    installed = versions("numpy")
+    for room in (assembling, cache):
+        monkeypatch.setattr(room, "versions", lambda _: installed | {"numpy": "99"})
+    remarks = module.finished(RunFolder(run)).result.remarks
+    (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
 
 
@@ -195,3 +120,44 @@ def test_a_chain_from_before_models_had_parts_goes_on_with_todays_default(copy: 
     model = config.model.model_copy(update={"gain": ["quadratic"]})
     with pytest.raises(InputError, match=r"model\.gain was \[\] when the chain was sampled"):
         require_same(json.dumps(earlier), config.model_copy(update={"model": model}), copy.chain)
+
+
+@pytest.mark.parametrize("use", [redraw, resumed])
+def test_edited_block_is_refused(copy: RunFolder, use: Callable[[RunFolder], object]) -> None:
+    """It once wrote rows of zeros into the chain, and said converged."""
+    text = copy.config.read_text()
+    assert "block = 25" in text
+    copy.config.write_text(text.replace("block = 25", "block = 30"))
+    before = ChainFile.read(copy.chain).steps("sampling")
+    with pytest.raises(InputError, match=r"sampling.block was 25 .* is 30; undo the edit"):
+        use(copy)
+    assert before == ChainFile.read(copy.chain).steps("sampling")
+    assert copy.summary.exists()
+
+
+def test_a_bound_and_all_else_that_differs_are_named(run: Path) -> None:
+    config = load(run / "config.toml")
+    d = config.parameters["d"].model_copy(update={"lower": 0.5})
+    bounded = config.model_copy(update={"parameters": config.parameters | {"d": d}})
+    white = {"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
+    for changed, said in (
+        (bounded, r"parameters.d.lower was not set when .* is 0\.5; undo"),
+        (config.model_copy(update=white), r"seed was 3 .*, is 5 \(also model.noise\); undo"),
+    ):
+        with pytest.raises(InputError, match=said):
+            require_same(fingerprint(config), changed, Path("x"))
+
+
+def test_what_leaves_the_posterior_may_change(run: Path) -> None:
+    config = load(run / "config.toml")
+    sampling = {"ess": 9.0, "steps": 7, "pilot_steps": 9, "engine": "auto"}
+    d = config.parameters["d"].model_copy(update={"label": "D", "description": "gain"})
+    changes = {
+        "name": "other",
+        "sampling": config.sampling.model_copy(update=sampling),
+        "validation": {},
+        "truth": {},
+        "parameters": config.parameters | {"d": d},
+    }
+    require_same(fingerprint(config), config.model_copy(update=changes), Path("x"))
+    require_same(fingerprint(config), resolve(config, run).config, Path("x"))

@@ -12,17 +12,15 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
+from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import load
-from bwbayes.app.config.model_settings import StandConfig
-from bwbayes.app.fit import fitted
+from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
-from bwbayes.app.jobs.predict import predict
-from bwbayes.app.report.words import digits
-from bwbayes.app.running import run
+from bwbayes.app.running import predictions, run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
+from bwbayes.report.words import digits
 from bwbayes.results.outputs import write_bands
-from bwbayes.results.prediction import Start
 from bwbayes.results.result import summary
 from tests.app import small
 
@@ -75,14 +73,14 @@ def fit(record: Record, keys: dict[str, Any]) -> Fit:
 
 @pytest.fixture
 def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "draw_all", lambda _: {})
+    monkeypatch.setattr(run, "draw_pictures", lambda _: {})
 
 
 def stopped(folder: Path, steps: int = 25) -> Fit:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
     outcome = replace(made.outcome, converged=False, stop_reason=f"budget of {steps} steps used up")
-    return replace(made, outcome=outcome)
+    return made.knowing(outcome=outcome, _loaded=None)
 
 
 # Arrays to bands
@@ -145,7 +143,7 @@ def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
             assert text in page
     assert said.startswith("small: converged, ")
     assert said.startswith(repr(fit).splitlines()[0])
-    assert page.count("<table>") == 2
+    assert page.count("<table>") == 3
     assert '<th scope="col">Mean</th>' in page
 
 
@@ -211,7 +209,7 @@ def test_a_prediction_is_the_command_lines(folder: Path, opened: Fit, tmp_path: 
     copy = tmp_path / "sine.h5"
     shutil.copyfile(folder / "records/sine.h5", copy)
     out = tmp_path / "theirs.csv"
-    predict(folder, copy, None, Start(from_rest=True), out, small.quiet())
+    small.typed(predict, folder, "--record", copy, "--from-rest", "--out", out)
     write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True)])
     assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
 
@@ -231,9 +229,9 @@ def test_ctrl_c_leaves_a_folder_to_go_on_from(
         patched.setattr("bwbayes.app.running.progress.Progress.__call__", interrupt)
         with pytest.raises(KeyboardInterrupt):
             bw.fit(record, folder=tmp_path / "a", **keys)
-    with pytest.raises(bw.InputError, match=r"a: exists; go on with `bwbayes\.resume_run\('"):
+    with pytest.raises(bw.InputError, match=r"a: exists; resume with `bwbayes\.resume\('"):
         bw.fit(record, folder=tmp_path / "a", **keys)
-    assert bw.resume_run(tmp_path / "a", workers=1, progress=False).converged
+    assert bw.resume(tmp_path / "a", workers=1, progress=False).converged
     small.assert_same_end(folder, tmp_path / "a")
 
 
@@ -242,7 +240,7 @@ def test_ctrl_c_leaves_a_folder_to_go_on_from(
 
 def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path) -> None:
     made = stopped(folder)
-    line = r"not converged: budget of 25 steps used up; no interval is given. Go on with fit.resume"
+    line = "not converged: budget of 25 steps used up; intervals are withheld; resume with"
     for ask in (
         lambda: made.summary,
         lambda: made.bands,
@@ -296,7 +294,7 @@ def test_remarks_of_the_record_are_warnings(
     def none(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bwbayes.app.fit.calls.carried_on", none)
+    monkeypatch.setattr("bwbayes.app.running.run.resume", none)
     assert record.displacement is not None
     spoilt = record.displacement.copy()
     spoilt[120] += 60.0
@@ -331,6 +329,28 @@ def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
     assert np.isnan(bands.residuals).all()
 
 
+def test_a_hold_longer_than_the_record_has_a_wider_band_and_no_other_plan_has(
+    opened: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = opened.problem.record
+    ramp = np.linspace(0, np.max(made.voltage), 20)
+    hold = np.concatenate([ramp, np.full(10 * made.samples, ramp[-1])])
+    bands = {}
+    for name, voltage in (("hold", hold), ("same", made.voltage)):
+        plan = replace(made, voltage=voltage, displacement=None, truth=None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            bands[name] = opened.predict(plan, from_rest=True)
+            with monkeypatch.context() as patch:
+                patch.setattr(predictions, "with_creep", lambda *given: given[:2])
+                bands[f"{name}, still"] = opened.predict(plan, from_rest=True)
+    width = {
+        n: one.upper["displacement", 95] - one.lower["displacement", 95] for n, one in bands.items()
+    }
+    assert width["hold"][-1] > 1.02 * width["hold, still"][-1]
+    np.testing.assert_array_equal(width["same"], width["same, still"])
+
+
 def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -342,7 +362,7 @@ def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:
 
 @pytest.fixture
 def _no_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitted, "go_on", None)
+    monkeypatch.setattr(run, "resume", None)
 
 
 @pytest.mark.usefixtures("_no_run")

@@ -41,76 +41,16 @@ def assert_refused(path: Path, problem: Problem, *, overwrite: bool, why: str) -
     assert str(error.value).startswith(f"{path}: ")
 
 
-def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -> None:
-    made = RunFolder.create(tmp_path / "results" / "a", problem, overwrite=False)
-    assert {"config.toml", "records/record.h5", "records/sine.h5"} == set(content(made.path))
-    assert [made.path] == list((tmp_path / "results").iterdir())
-    assert problem.config == load(made.config)
-    assert made == RunFolder.open(made.path)
-
-
 def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Problem) -> None:
     path = tmp_path / "a"
     made = RunFolder.create(path, problem, overwrite=False)
     made.chain.write_bytes(b"draws")
     before = content(path)
-    assert_refused(path, problem, overwrite=False, why=rf"`bwbayes\.resume_run\('{path}'\)`")
+    assert_refused(path, problem, overwrite=False, why=rf"`bwbayes\.resume\('{path}'\)`")
     assert before == content(path)
     RunFolder.create(path, problem, overwrite=True)
     assert not made.chain.exists()
     assert made.config.is_file()
-
-
-@pytest.mark.parametrize("named", ["thesis.tex", "config.toml", "records/notes.txt"])
-def test_folder_that_is_no_runs_is_never_replaced(
-    tmp_path: Path, problem: Problem, named: str
-) -> None:
-    path = tmp_path / "mine"
-    (path / named).parent.mkdir(parents=True)
-    (path / named).write_text("years of work")
-    assert_refused(path, problem, overwrite=False, why="exists")
-    assert_refused(path, problem, overwrite=True, why="is not a run's folder")
-    assert {named: b"years of work"} == content(path)
-
-
-def test_file_is_never_replaced(tmp_path: Path, problem: Problem) -> None:
-    path = tmp_path / "mine"
-    path.write_text("years of work")
-    assert_refused(path, problem, overwrite=True, why="is not a run's folder")
-    assert "years of work" == path.read_text()
-    assert_refused(path / "below", problem, overwrite=False, why="Not a directory")
-
-
-def test_empty_folder_may_be_used_when_told(tmp_path: Path, problem: Problem) -> None:
-    path = tmp_path / "empty"
-    path.mkdir()
-    assert_refused(path, problem, overwrite=False, why="exists")
-    assert RunFolder.create(path, problem, overwrite=True).config.is_file()
-
-
-def test_what_an_interrupted_start_left_does_not_hurt(tmp_path: Path, problem: Problem) -> None:
-    left = tmp_path / ".a.partial"
-    (left / "records").mkdir(parents=True)
-    (left / "records/old.h5").write_bytes(b"half a record")
-    made = RunFolder.create(tmp_path / "a", problem, overwrite=False)
-    assert "records/old.h5" not in content(made.path)
-    assert [made.path] == list(tmp_path.iterdir())
-
-
-def test_folder_without_a_run_cannot_be_opened(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "none"):
-        with pytest.raises(InputError, match=f"{path}: no run here; start one with"):
-            RunFolder.open(path)
-
-
-def test_what_only_looks_like_a_run_cannot_be_opened(tmp_path: Path) -> None:
-    """A folder with a config alone is somebody's project, and a file is no folder."""
-    config = tmp_path / "config.toml"
-    config.write_text(small.TEXT)
-    with pytest.raises(InputError, match="no run here; start one with"):
-        RunFolder.open(tmp_path)
-    with pytest.raises(InputError, match=r"config.toml: no run here, but a file; give the folder"):
-        RunFolder.open(config)
 
 
 def hold(path: Path, held: Event, enough: Event) -> None:
@@ -198,3 +138,43 @@ def test_full_disk_leaves_no_folder(tmp_path: Path, size: int) -> None:
     assert "\n" not in text
     assert "File too large" in text
     assert not path.exists()
+
+
+def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -> None:
+    """And nothing of an interrupted start."""
+    partial = tmp_path / "results/.a.partial/records/old.h5"
+    partial.parent.mkdir(parents=True)
+    partial.write_bytes(b"half a record")
+    made = RunFolder.create(tmp_path / "results/a", problem, overwrite=False)
+    assert {"config.toml", "records/record.h5", "records/sine.h5"} == set(content(made.path))
+    assert [made.path] == list((tmp_path / "results").iterdir())
+    assert problem.config == load(made.config)
+    assert made == RunFolder.open(made.path)
+
+
+@pytest.mark.parametrize("named", ["thesis.tex", "config.toml", "records/notes.txt"])
+def test_what_is_no_runs_is_never_replaced(tmp_path: Path, problem: Problem, named: str) -> None:
+    path = tmp_path / "mine"
+    (path / named).parent.mkdir(parents=True)
+    (path / named).write_text("years of work")
+    assert_refused(path, problem, overwrite=False, why="exists")
+    for taken in (path, path / named):
+        assert_refused(taken, problem, overwrite=True, why="is not a run's folder")
+    assert_refused(path / named / "below", problem, overwrite=False, why="Not a directory")
+    assert {named: b"years of work"} == content(path)
+    (tmp_path / "empty").mkdir()
+    assert_refused(tmp_path / "empty", problem, overwrite=False, why="exists")
+    assert RunFolder.create(tmp_path / "empty", problem, overwrite=True).config.is_file()
+
+
+def test_what_is_no_run_cannot_be_opened(tmp_path: Path) -> None:
+    """A folder with a config alone is somebody's project, and a file is no folder."""
+    config = tmp_path / "config.toml"
+    for path in (tmp_path, tmp_path / "none"):
+        with pytest.raises(InputError, match=f"{path}: no run here; start one with"):
+            RunFolder.open(path)
+    config.write_text(small.TEXT)
+    with pytest.raises(InputError, match="no run here; start one with"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(InputError, match=r"config.toml: no run here, but a file; give the folder"):
+        RunFolder.open(config)

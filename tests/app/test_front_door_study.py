@@ -16,7 +16,7 @@ import pytest
 
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.running.run import carry_on, start
+from bwbayes.app.running.run import resume, start
 from bwbayes.errors import InputError, InputWarning
 from tests.app import small
 from tests.app.test_front_door import SEPARATORS, UNITS, drive, play, written
@@ -49,7 +49,7 @@ def ended(path: Path, folder: Path) -> str:
         warnings.simplefilter("ignore", InputWarning)
         config = propose(path, path.parent).config
         begun = start(config, path.parent, folder / path.stem)
-        result = carry_on(begun, small.quiet(), workers=1, ess=100, steps=300)
+        result = resume(begun, small.quiet(), workers=1, ess=100, steps=300)
     assert (begun.path / "report.html").is_file()
     return result.standing.status if result.outcome.converged else "not converged"
 

@@ -2,8 +2,8 @@
 
 Every case goes through ``bwbayes check`` in this process. What is used must give finite numbers,
 and make a run's folder that reads back the same, with nothing written beside it. The best of some
-prior draws stands in for the point fit, which takes longer than all the rest, and no page is drawn,
-but for a few cases.
+prior draws stands in for the point fit, no misfit is explained and no page is drawn, which take
+longer than all the rest, but for a few cases.
 
 The default run takes the first cases; ``-m slow`` takes all. A case is made again from its number:
 ``tests.app.mutations.case(SEED, number)``.
@@ -32,7 +32,6 @@ from bwbayes.app.config.config import load
 from bwbayes.app.jobs import check as app_check
 from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import load_run
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
@@ -71,7 +70,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pointfit, "fit", best_draw)
-    monkeypatch.setattr(app_check, "write_page", lambda out, *_: out / "check.html")
+    monkeypatch.setattr(app_check, "explained", lambda *_, **__: ())
+    monkeypatch.setattr(app_check, "save", lambda *_, **__: [])
 
 
 def best_draw(posterior: Posterior, generator: np.random.Generator) -> pointfit.PointFit:
@@ -130,7 +130,7 @@ def assert_used_or_refused(one: Case, said: Said, place: Path) -> None:
         assert "out of memory" not in said.err
     else:
         assert (0, "") == (said.status, said.err)
-        assert "point fit" in said.out
+        assert "Point fit" in said.out
         assert_becomes_a_run(place)
 
 
@@ -140,7 +140,7 @@ def assert_becomes_a_run(place: Path) -> None:
     before = {path.name for path in place.iterdir()}
     folder = RunFolder.create(place / "out", problem, overwrite=False)
     assert before | {"out"} == {path.name for path in place.iterdir()}
-    again = load_run(folder)
+    again = folder.problem()
     assert again.config == problem.config
     assert again.record.sha256 == problem.record.sha256
     prior = problem.posterior.prior

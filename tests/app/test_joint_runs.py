@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import bwbayes
 from bwbayes.app.config.config import Config, dump, parse
 from bwbayes.app.config.models import models_of
-from bwbayes.app.figures import draw_all
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.jobs.compare import compare_models, compare_runs
+from bwbayes.app.jobs.compare import compare
 from bwbayes.app.jobs.design import amplifier_of, candidates_of, liveliest
+from bwbayes.app.jobs.models import compare_models, open_runs
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import carry_on, load_run, start
-from bwbayes.app.screen import show_priors
+from bwbayes.app.running.run import resume, start
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.report.figures import drawings
+from bwbayes.report.priors import priors_table
+from bwbayes.report.report import Report
+from bwbayes.report.screen import as_text
 from bwbayes.results.replicates import replicate
 from tests.app import small
 
@@ -85,7 +86,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
     folder = start(config(), path.parent, path)
-    carry_on(folder, small.quiet(), workers=1)
+    resume(folder, small.quiet(), workers=1)
     return folder
 
 
@@ -123,7 +124,7 @@ def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
 def test_a_resolved_config_is_the_same_problem(tmp_path: Path) -> None:
     first = problem()
     folder = RunFolder.create(tmp_path / "run", first, overwrite=False)
-    again = load_run(folder)
+    again = folder.problem()
     assert fingerprint(first.config) == fingerprint(again.config)
     assert first.sha256 == again.sha256
     z = np.random.default_rng(0).standard_normal((3, len(first.posterior.names)))
@@ -141,7 +142,7 @@ def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
     made = bwbayes.open_run(finished.path)
     assert {"step"} <= made.result.steps.keys()
     pictures = {path.stem for path in (finished.path / "figures").glob("*.png")}
-    assert pictures == draw_all(made.result).keys()
+    assert pictures == drawings(made.result).keys()
     assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= pictures
     page = (finished.path / "report.html").read_text()
     assert "Do the records agree?" in page
@@ -162,16 +163,16 @@ def test_a_chain_of_several_records_goes_on_and_knows_its_own(
 
     copy = tmp_path / "run"
     shutil.copytree(finished.path, copy)
-    carry_on(RunFolder(copy), small.quiet(), workers=1)
+    resume(RunFolder(copy), small.quiet(), workers=1)
     small.assert_same_end(finished.path, copy)
     text = (copy / "config.toml").read_text()
     (copy / "config.toml").write_text(text.replace("train = [[0.0, 3.0]]", "train = [[0.0, 2.9]]"))
     with pytest.raises(InputError, match=r"record\.loops\.train was"):
-        carry_on(RunFolder(copy), small.quiet(), workers=1)
+        resume(RunFolder(copy), small.quiet(), workers=1)
     (copy / "config.toml").write_text(text)
     (copy / "records/step.h5").replace(copy / "records/loops.h5")
     with pytest.raises(InputError):
-        carry_on(RunFolder(copy), small.quiet(), workers=1)
+        resume(RunFolder(copy), small.quiet(), workers=1)
 
 
 def test_any_other_record_is_predicted(finished: RunFolder) -> None:
@@ -190,24 +191,23 @@ def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_pat
     scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))
     models = models_of("linear", scoped.model)
     out = tmp_path / "out"
-    made = compare_models(scoped, Path(), models, out, small.quiet(), workers=1, with_future=False)
+    made = compare_models(scoped, Path(), models, out, small.quiet(), future=False, workers=1)
     assert "linear is the only model that has converged" == made.lines[0]
     assert [] == parse((out / "linear/config.toml").read_text(), "").model.per_record
     both = [finished.path, out / "linear"]
-    made = compare_runs(both, tmp_path / "both", small.quiet(), workers=1)
+    made = compare(open_runs(both), workers=1)
     assert "run" == made.recommended
     for one in made.candidates:
-        assert one.future is not None
-        assert one.future.converged
-        assert {"loops", "step"} == one.future.rows.keys()
-        assert sum(rows.size for rows in one.future.rows.values()) == one.future.log_score.size
+        assert {"later training", "later", "sine"} == one.parts.keys()
+        half = sum(-(-d.readings.rows.size // 2) for d in finished.problem().posterior.datasets)
+        assert one.parts["later training"].readings == half
+        assert [True, False] == [one.parts[name].joint for name in ("later", "sine")]
     assert {"later", "sine"} == made["linear"].scores.keys() == made["run"].scores.keys()
-    assert (tmp_path / "both/comparison.html").is_file()
 
 
 def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: RunFolder) -> None:
     """Voltages are those of all records, the pattern that of the one that turns most."""
-    made = load_run(finished)
+    made = finished.problem()
     flipped = replace(made, records=dict(reversed(list(made.records.items()))))
     assert ["step", "loops"] == [*flipped.records]
     signals = []
@@ -231,10 +231,9 @@ def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: Ru
 
 def test_parameters_of_a_record_are_shown_by_their_whole_name() -> None:
     """Square brackets are no mark-up of the screen."""
-    text = StringIO()
-    show_priors(problem().posterior.prior, Console(file=text, width=120))
-    assert "offset[loops]" in text.getvalue()
-    assert "initial[step]" in text.getvalue()
+    text = as_text(Report(title="", blocks=[priors_table(problem().posterior.prior)]), width=120)
+    assert "offset[loops]" in text
+    assert "initial[step]" in text
 
 
 def test_replicates_make_all_records_anew() -> None:

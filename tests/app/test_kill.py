@@ -55,7 +55,7 @@ def follow(where: Path, arguments: list[str], last_write: int, last_step: str) -
         with (where / name).open("w") as file:
             os.dup2(file.fileno(), number)
     patched = pytest.MonkeyPatch()
-    patched.setattr(run_module, "draw_all", lambda _: {})
+    patched.setattr(run_module, "draw_pictures", lambda _: {})
     patched.setattr(storage, "put", mortal(hdf5.put, last_write))
     if last_step:
         patched.setattr(run_module, last_step, die)
@@ -226,7 +226,7 @@ def test_request_to_stop_ends_in_order(
         assert_alone(process.pid)
     assert 130 == process.exitcode
     assert "" == (tmp_path / "out").read_text()
-    assert "interrupted; go on with `bwbayes resume a`\n" == (tmp_path / "err").read_text()
+    assert "interrupted; resume with `bwbayes resume a`\n" == (tmp_path / "err").read_text()
     assert not (folder / "summary.json").exists()
 
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.figures import draw_all
-from bwbayes.app.report.report import render
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.results.loops import MEASURES, Loops, measure_loops
@@ -36,7 +34,7 @@ def with_loops(measured: Loops, *, converged: bool = True) -> Result:
 def test_table_is_the_summarys(measured: Loops) -> None:
     run = with_loops(measured)
     kept: Any = summary(run)["loops"]
-    table = rows(render(run, summary(run), {}), "loops")
+    table = rows(example.page(run), "loops")
     for name, (title, unit) in MEASURES.items():
         *texts, shown_unit = table[title]
         assert unit.replace("um", "µm") == shown_unit
@@ -52,7 +50,7 @@ def test_table_is_the_summarys(measured: Loops) -> None:
 
 
 def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
-    figures = draw_all(with_loops(measured))
+    figures = example.figures(with_loops(measured))
     assert ["loop", "loops"] == list(figures)[:2]
     whole, less = figures["loops"].axes
     assert ["major loop", "_nolegend_", "minor loop", "_nolegend_", "initial curve"] == [
@@ -66,8 +64,8 @@ def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
 def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
     run = with_loops(measured, converged=False)
     assert summary(run)["loops"] is None
-    assert 'id="loops"' not in render(run, summary(run), {"loops": b""})
-    assert "loops" not in draw_all(run)
+    assert 'id="loops"' not in example.page(run, pictures={"loops": b""})
+    assert "loops" not in example.figures(run)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +83,7 @@ def steps() -> dict[str, StepResponse]:
 def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:
     run = dataclasses.replace(example.run(), steps=steps)
     kept: Any = summary(run)["step_responses"]
-    table = rows(render(run, summary(run), {}), "steps")
+    table = rows(example.page(run), "steps")
     for name, (title, _) in STEP_MEASURES.items():
         *texts, _ = table[title]
         for step, cells in (("one", texts[:2]), ("two", texts[2:])):
@@ -99,18 +97,18 @@ def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:
 
 
 def test_steps_are_drawn_with_their_creep(steps: dict[str, StepResponse]) -> None:
-    figures = draw_all(dataclasses.replace(example.run(), steps=steps))
+    figures = example.figures(dataclasses.replace(example.run(), steps=steps))
     rise, creep = figures["steps"].axes
     assert ["one, 50 V", "two, 50 V"] == [line.get_label() for line in rise.lines]
     assert ["two, 50 V"] == [line.get_label() for line in creep.lines]
     assert ("log", "log") == (rise.get_xscale(), creep.get_xscale())
-    alone = draw_all(dataclasses.replace(example.run(), steps={"one": steps["one"]}))
+    alone = example.figures(dataclasses.replace(example.run(), steps={"one": steps["one"]}))
     assert 1 == len(alone["steps"].axes)
 
 
 def test_a_step_is_not_drawn_as_a_loop(steps: dict[str, StepResponse]) -> None:
     run = dataclasses.replace(example.run(), steps={"held-out": steps["one"]})
-    figures = draw_all(run)
+    figures = example.figures(run)
     assert ["training"] == [panel.get_title() for panel in figures["loop"].axes[:1]]
     assert 2 == len(figures["loop"].axes)
     assert "bands_held-out" in figures
@@ -119,5 +117,5 @@ def test_a_step_is_not_drawn_as_a_loop(steps: dict[str, StepResponse]) -> None:
 def test_without_convergence_no_step_is_shown(steps: dict[str, StepResponse]) -> None:
     run = dataclasses.replace(example.run(converged=False), steps=steps)
     assert summary(run)["step_responses"] is None
-    assert 'id="steps"' not in render(run, summary(run), {"steps": b""})
-    assert "steps" not in draw_all(run)
+    assert 'id="steps"' not in example.page(run, pictures={"steps": b""})
+    assert "steps" not in example.figures(run)

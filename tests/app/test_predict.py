@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from bwbayes.app.jobs.predict import predict
+from bwbayes.app.commands.predict import predict
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
-from bwbayes.results.prediction import Start
 from tests.app import small
 
 
@@ -27,8 +24,8 @@ def test_scores_and_a_picture_lie_beside_the_bands(
 ) -> None:
     write_record(record, tmp_path / "sine.h5")
     out = tmp_path / "new/bands.csv"
-    arguments = run, tmp_path / "sine.h5", None, Start(from_rest=True), out, small.quiet()
-    assert 0 == predict(*arguments, window=(2.0, 3.5))
+    arguments = run, "--record", tmp_path / "sine.h5", "--from-rest", "--out", out
+    assert 0 == small.typed(predict, *arguments, "--window", 2.0, 3.5)
     result = json.loads(out.with_suffix(".json").read_text())
     assert (2.0, 3.5) == pytest.approx((result["from_s"], result["to_s"]))
     assert 75 == result["samples"]
@@ -37,25 +34,25 @@ def test_scores_and_a_picture_lie_beside_the_bands(
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     out.unlink()
     with pytest.raises(InputError, match=r"bands.json: exists; choose .* give `overwrite=True`"):
-        predict(*arguments)
+        small.typed(predict, *arguments)
     assert not out.exists()
     with pytest.raises(InputError, match=r"give a name that ends in \.csv"):
-        predict(*arguments[:4], tmp_path / "bands.png", small.quiet())
+        small.typed(predict, *arguments[:-1], tmp_path / "bands.png")
 
 
 def test_record_that_goes_the_other_way_ends_with_status_3(
-    run: Path, record: Record, tmp_path: Path
+    run: Path, record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert record.displacement is not None
     write_record(replace(record, displacement=-record.displacement), tmp_path / "turned.h5")
-    said = StringIO()
     out = tmp_path / "bands.csv"
-    start = Start(from_rest=True)
-    assert 3 == predict(run, tmp_path / "turned.h5", None, start, out, Console(file=said))
-    assert said.getvalue().startswith(
+    record_options = "--record", tmp_path / "turned.h5", "--from-rest"
+    assert 3 == small.typed(predict, run, *record_options, "--out", out)
+    said = capsys.readouterr().out
+    assert said.startswith(
         "VALIDATION FAILED: turned (separate record): the readings fall where the voltage rises"
     )
-    assert "Likely cause: reversed sign of the displacement. Fix: change" in said.getvalue()
+    assert "Likely cause: reversed sign of the displacement. Fix: change" in said
     result = json.loads(out.with_suffix(".json").read_text())
     assert (False, "sign") == (result["holds"], result["cause"])
 
@@ -71,8 +68,8 @@ def test_a_files_own_columns_are_recognised(run: Path, record: Record, tmp_path:
     ]
     (tmp_path / "sine.csv").write_text("\n".join(lines) + "\n")
     out = tmp_path / "bands.csv"
-    start = Start(from_rest=True)
-    assert 0 == predict(run, tmp_path / "sine.csv", None, start, out, small.quiet())
+    record_options = "--record", tmp_path / "sine.csv", "--from-rest"
+    assert 0 == small.typed(predict, run, *record_options, "--out", out)
     result = json.loads(out.with_suffix(".json").read_text())
     assert record.samples == result["samples"]
     assert result["holds"] in (True, None)

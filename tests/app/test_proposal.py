@@ -15,7 +15,6 @@ from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import load_run
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.data.io.columns import Naming
@@ -129,9 +128,6 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
     assert "# No issues found." in text
     assert "# from_rest = true  # it starts at 0 V, moving; say so if" in text
     assert '# voltage_is = "command"' in text
-
-
-def test_a_start_in_motion_is_said(write: Write) -> None:
     text = proposed(write(rows=slice(20, None))).text
     assert re.search(r"# from_rest = false  # it starts at 9\d\.\d V, moving: its history is", text)
 
@@ -165,38 +161,30 @@ def test_nothing_is_held_out_where_the_rest_would_not_do(write: Write) -> None:
 # What is wrong
 
 
-def _spikes(displacement: FloatArray) -> None:
-    displacement[np.arange(30, 440, 41)] += 60.0
-
-
 def _turned(displacement: FloatArray) -> None:
     displacement *= -1
 
 
-def test_ten_outliers_are_set_aside(write: Write) -> None:
-    path = write(change=_spikes)
-    made = proposed(path)
-    assert made.config.model.outliers
-    assert "# spikes: 10 isolated outliers" in made.text
-    problem = resolve(made.config, path.parent)
-    held = made.config.records["record"].exclude or []
-    assert 0 < len(held) < 10
-    text = f"{10 - len(held)} readings set aside"
-    assert any(remark.startswith(text) for remark in problem.remarks)
-
-
-def test_outliers_that_are_held_out_are_left_out(write: Write) -> None:
+@pytest.mark.parametrize("rows", [np.arange(30, 440, 41), np.array([100, 365, 555])])
+def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
+    write: Write, rows: np.ndarray
+) -> None:
     """A fit sets aside those it is fitted to alone."""
-    spikes = [100, 365, 555]
 
     def spoil(displacement: FloatArray) -> None:
-        displacement[spikes] += 60.0
+        displacement[rows] += 60.0
 
     path = write(change=spoil)
-    made = proposed(path)
-    assert 2 == len(made.config.records["record"].exclude or [])
-    problem = resolve(made.config, path.parent)
-    assert spikes == np.flatnonzero(~problem.record.has_reading).tolist()
+    proposal = proposed(path)
+    assert proposal.config.model.outliers
+    assert f"# spikes: {rows.size} isolated outliers" in proposal.text
+    held = proposal.config.records["record"].exclude or []
+    assert 0 < len(held) < rows.size
+    problem = resolve(proposal.config, path.parent)
+    aside = rows.size - len(held)
+    said = f"{aside} reading{'s' * (aside > 1)} set aside"
+    assert any(remark.startswith(said) for remark in problem.remarks), problem.remarks
+    assert rows.tolist() == np.flatnonzero(~problem.record.has_reading).tolist()
 
 
 @pytest.mark.parametrize(
@@ -229,7 +217,12 @@ def test_what_makes_a_fit_pointless_is_one_line(
 
 
 def test_a_reversed_sign_is_turned_by_its_unit(write: Write, record: Record) -> None:
+    """Where `check` shows what a run refuses."""
     path = write(change=_turned)
+    done = command("check", path, "--out", path.parent / "page")
+    assert 0 == done.return_value
+    assert "reversed sign: the displacement falls" in done.output
+    assert (path.parent / "page/check.html").exists()
     assert 0 == command("init", path, "--unit", "displacement=-um").return_value
     problem = resolve(load(path.with_suffix(".toml")), path.parent)
     assert problem.record.displacement is not None
@@ -249,20 +242,13 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     again = command("init", path)
     assert isinstance(again.exception, InputError)
     assert "mine.toml: exists; edit it, or choose another name with --out" in str(again.exception)
-
-
-def test_init_elsewhere_finds_the_record(write: Write) -> None:
-    path = write()
     (path.parent / "configs").mkdir()
-    out = path.parent / "configs/a.toml"
-    assert 0 == command("init", path, "--out", out).return_value
-    assert "../mine.csv" == load(out).records["record"].file
-    assert 600 == resolve(load(out), out.parent).record.samples
-
-
-@pytest.mark.parametrize("unit", ["displacement", "length=nm", "displacement=furlong", "time=-s"])
-def test_a_unit_that_does_not_exist_is_one_line(write: Write, unit: str) -> None:
-    assert isinstance(command("init", write(), "--unit", unit).exception, InputError)
+    elsewhere = path.parent / "configs/a.toml"
+    assert 0 == command("init", path, "--out", elsewhere).return_value
+    assert "../mine.csv" == load(elsewhere).records["record"].file
+    assert 600 == resolve(load(elsewhere), elsewhere.parent).record.samples
+    for unit in ("displacement", "length=nm", "displacement=furlong", "time=-s"):
+        assert isinstance(command("init", path, "--unit", unit).exception, InputError)
 
 
 def test_run_without_a_config_runs_the_proposed_one(
@@ -295,7 +281,7 @@ def shown_alone(
 ) -> int:
     """Show what a run shows before it samples, and leave the rest."""
     if show is not None:
-        show(load_run(RunFolder(path)))
+        show(RunFolder(path).problem())
     return 0
 
 
@@ -318,14 +304,6 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     assert 0 == done.return_value
     assert 1 == done.output.count(remark), done.output
     if name == "run":
-        kept = load_run(RunFolder(tmp_path / "out"))
+        kept = RunFolder(tmp_path / "out").problem()
         assert [remark] == [one.removeprefix(f"{tmp_path}/") for one in kept.remarks]
         assert resolve(kept.config, tmp_path / "out").config == kept.config
-
-
-def test_check_takes_a_record_and_shows_what_a_run_refuses(write: Write, tmp_path: Path) -> None:
-    path = write(change=_turned)
-    done = command("check", path, "--out", tmp_path / "page")
-    assert 0 == done.return_value
-    assert "reversed sign: the displacement falls" in done.output
-    assert (tmp_path / "page/check.html").exists()

@@ -15,12 +15,11 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 
-from bwbayes.app.figures import interactive
-from bwbayes.app.report.report import render
-from bwbayes.app.report.words import digits, symbol
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
-from bwbayes.results.causes import Cause
+from bwbayes.report.figures import interactive
+from bwbayes.report.words import digits, symbol
 from bwbayes.results.result import Result, summary
 from bwbayes.results.verdict import Verdict
 from tests.app import example
@@ -32,7 +31,7 @@ PICTURES = {
 
 
 def page(run: Result) -> str:
-    return render(run, summary(run), PICTURES)
+    return example.page(run, pictures=PICTURES)
 
 
 def rows(text: str, table: str) -> dict[str, list[str]]:
@@ -57,7 +56,7 @@ def test_numbers_of_the_parameters_are_the_summarys() -> None:
     table, of_sampling = (rows(page(run), name) for name in ("parameters", "sampling"))
     for parameter in run.free:
         expected = numbers[parameter.name]
-        mean_and_sd, unit, interval, _ = table[words(parameter)]
+        mean_and_sd, interval, unit, _ = table[words(parameter)]
         bulk, tail, rhat, mcse, median, _ = of_sampling[words(parameter)]
         shown = [
             float(text) for text in (*mean_and_sd.split(" ± "), median, *interval.split(" to "))
@@ -70,53 +69,13 @@ def test_numbers_of_the_parameters_are_the_summarys() -> None:
         assert parameter.unit.replace("um", "µm") == unit
 
 
-def test_summary_alone_decides_the_estimates() -> None:
-    """A page made anew from a stored summary says what was stored."""
-    run = example.run()
-    stored: Any = summary(run)
-    stored["parameters"]["d"] |= {"mean": 0.12345, "sd": 0.001}
-    shown = rows(render(run, stored, {}), "parameters")["coefficient, d"]
-    assert shown[0].startswith("0.1235 ± 0.0010")
-
-
-def test_truth_is_shown_where_it_is_known() -> None:
-    table = rows(page(example.run()), "parameters")
-    assert ("0.7", "–") == (table["coefficient, d"][3], table["part, α"][3])
-    unknown = dataclasses.replace(example.run(), truth={})
-    assert "Truth" not in page(unknown)
-
-
-def test_priors_and_fixed_values_are_listed() -> None:
-    bounded = dataclasses.replace(example.PARAMETERS[0], lower=0.1, upper=2.0)
-    table = rows(page(example.run(parameters=(bounded, *example.PARAMETERS[1:]))), "priors")
-    assert "normal(mean = 0.7, sd = 0.1), at least 0.1, at most 2" == table["coefficient, d"][0]
-    assert ["fixed at 1", ""] == table["smoothness, n"][:2]
-    assert len(example.PARAMETERS) == len(table)
-
-
-def test_priors_are_listed_as_the_constraints_leave_them() -> None:
-    """The bound d takes the upper part of a prior of alpha that reaches beyond it."""
-    close = dataclasses.replace(
-        example.PARAMETERS[1], prior=Distribution("normal", {"mean": 0.7, "sd": 0.1})
-    )
-    parameters = (example.PARAMETERS[0], close, *example.PARAMETERS[2:])
-    table = rows(page(example.run(parameters=parameters)), "priors")
-    median, upper = (float(part) for part in re.findall(r"[\d.]+", table["part, α"][1])[::2])
-    assert 0.62 < median < 0.67
-    assert upper < 0.83
-
-
 def test_scores_are_shown_for_each_of_the_bands() -> None:
     run = example.run()
     run = dataclasses.replace(run, scores={**run.scores, "held-out": example.scores(truth=False)})
     text = page(run)
-    table = rows(text, "validation")
-    assert re.search(r"held-out \(held out\)</th><th[^>]*>training</th>", text)
-    assert {
-        "NRMSE": ["1.23%"] * 2,
-        "Max error": ["5.52 µm"] * 2,
-        "Coverage of the 50, 90, 95% sensor bands": ["48.1 ± 4.1, 89.2 ± 2.2, 94.3 ± 1.3%"] * 2,
-    } == table
+    coverage = "48.1 ± 4.1, 89.2 ± 2.2, 94.3 ± 1.3%"
+    expected = ["–", "1.23%", "5.52 µm", "6.13 µm", coverage]
+    assert {"held-out (held out)": expected, "training": expected} == rows(text, "validation")
     table = rows(text, "scores")
     assert ["0.817 µm"] * 2 == table["CRPS"]
     assert ["–", "91.5 ± 2.5 %"] == table["90 % displacement band covers displacement"]
@@ -133,22 +92,6 @@ def test_acceptance_of_each_move_and_pareto_k_are_shown(converged: bool) -> None
     assert "Pareto k of the mixture at the draws: 0.31;" in text
 
 
-def test_draws_without_a_proposal_have_no_pareto_k() -> None:
-    run = example.run()
-    outcome = dataclasses.replace(
-        run.outcome, check=dataclasses.replace(run.outcome.check, pareto_k=None)
-    )
-    text = page(dataclasses.replace(run, outcome=outcome))
-    assert "No mixture proposed these draws" in text
-    assert "Pareto k of" not in text
-
-
-def test_bands_without_a_measurement_have_no_validation() -> None:
-    text = page(example.run(every=(example.bands(measured=False),)))
-    assert 'id="validation"' not in text
-    assert "There are no readings to check the bands against." in text
-
-
 def test_answer_is_of_held_out_readings_if_there_are_any() -> None:
     """Coverage with its error, width, and how far the mean misses, before anything else."""
     text = page(example.run())
@@ -160,8 +103,8 @@ def test_answer_is_of_held_out_readings_if_there_are_any() -> None:
     assert "training, 0 to 2.499 s" in fitted
 
 
-def test_bands_that_do_not_hold_come_before_the_answer_with_the_remedy() -> None:
-    cause = Cause("noise", "the noise is not like that", "try another noise")
+def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
+    cause = Finding("noise", "the noise is not like that", "try another noise")
     failed = Verdict("held-out", False, False, ("covers 60 %",), cause)
     held = Verdict("training", True, True)
     run = dataclasses.replace(example.run(), verdicts={"training": held, "held-out": failed})
@@ -169,17 +112,10 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_remedy() -> None
     places = [text.index(said) for said in ("VALIDATION FAILED", "try another noise", "94.3 ± 1.3")]
     assert sorted(places) == places
     assert "Converged, and" not in text
-    assert ["failed", "passed"] == rows(text, "scores")["Validation"]
+    statuses = {row: cells[0] for row, cells in rows(text, "validation").items()}
+    assert {"held-out (held out)": "failed", "training": "passed"} == statuses
     for kind, status in (("bad", "failed"), ("good", "passed")):
         assert f'<span class="mark {kind}">{status}</span>' in text
-
-
-def test_scores_of_which_nothing_is_known_have_no_row() -> None:
-    run = example.run()
-    unknown = dict.fromkeys(run.scores, example.scores(truth=False))
-    table = rows(page(dataclasses.replace(run, scores=unknown)), "scores")
-    assert 10 == len(table)
-    assert not any("displacement" in row or {"–"} >= set(cells) for row, cells in table.items())
 
 
 @pytest.mark.parametrize("table", ["parameters", "validation"])
@@ -198,51 +134,6 @@ def test_csv_has_the_numbers_as_they_are(table: str) -> None:
         assert kept["held-out"]["nrmse"] == float(frame["held-out"]["nrmse"])
         error = float(frame["training"]["coverage_error sensor 90"])
         assert kept["training"]["coverage_error"]["sensor"]["90"] == error
-
-
-def test_constraints_are_those_of_the_model() -> None:
-    assert '<span id="constraints">0 &lt; alpha &lt; d</span>' in page(example.run())
-    without = tuple(p for p in example.PARAMETERS if p.name != "alpha")
-    run = example.run(parameters=without, values=example.draws()[..., :3])
-    assert 'id="constraints"' not in page(dataclasses.replace(run, truth={}))
-
-
-def test_verdict_of_a_converged_run() -> None:
-    text = page(example.run())
-    assert "<strong>Converged" in text
-    assert "NOT CONVERGED" not in text
-    assert "two good checks" in text
-
-
-def test_verdict_without_convergence_says_why_and_what_to_do() -> None:
-    run = example.run(converged=False)
-    go_on = {"go_on": "bwbayes resume results/a --steps 40000"}
-    text = render(run, summary(run) | go_on, PICTURES)
-    assert "<strong>NOT CONVERGED</strong>" in text
-    assert "budget of 120 steps used up: R-hat 1.2" in text
-    assert "<code>bwbayes resume results/a --steps 40000</code>" in text
-    for place in ("trace", "ranks"):
-        assert f'href="#{place}"' in text
-        assert f'id="{place}"' in text
-
-
-@pytest.mark.parametrize(
-    "word", ["95", "band", "median</th>", "coverage", "validation", "MCSE", "truth"]
-)
-def test_page_without_convergence_is_silent_on_parameters_and_displacement(word: str) -> None:
-    """Even if pictures of another time are handed in."""
-    text = re.sub(r'src="data:[^"]*"', "", page(example.run(converged=False)))
-    assert word.lower() not in text.lower()
-
-
-def test_page_without_convergence_has_no_picture_but_of_the_chains() -> None:
-    text = page(example.run(converged=False))
-    assert ["trace", "ranks"] == re.findall(r'<figure id="(.*?)">', text)
-
-
-def test_page_without_convergence_shows_which_parameter_lags() -> None:
-    table = rows(page(example.run(converged=False)), "sampling")
-    assert ["2103", "2203", "1.0040"] == table["stiff, k"]
 
 
 @pytest.mark.parametrize("value", [1.0, np.nan])
@@ -291,7 +182,7 @@ def test_texts_come_out_escaped(converged: bool) -> None:
         scores={evil: example.scores()} if renamed else {},
         outcome=dataclasses.replace(run.outcome, stop_reason=evil),
     )
-    text = render(run, summary(run), {f"bands_{evil}": b"", "trace": b""})
+    text = example.page(run, pictures={f"bands_{evil}": b"", "trace": b""})
     assert "<b onload" not in text
     assert "&lt;b onload=&#34;x&#34;&gt;&amp;" in text
 
@@ -299,7 +190,7 @@ def test_texts_come_out_escaped(converged: bool) -> None:
 def test_remarks_facts_and_circumstances_are_shown() -> None:
     run = example.run()
     more = {"seed": 7, "wall_s": 61.4, "data_sha256": "abc", "versions": {"numpy": "2.5"}}
-    text = render(run, {**summary(run), **more}, {})
+    text = example.page(run, {**summary(run), **more})
     assert "<li>the sensor was clipped</li>" in text
     facts = {"record": ["made up"], "seed": ["7"], "wall time": ["61 s"]}
     facts |= {"data, SHA-256": ["abc"], "versions": ["numpy 2.5"]}
@@ -324,10 +215,6 @@ def test_remarks_facts_and_circumstances_are_shown() -> None:
 def test_labels_become_readable_symbols(label: str, expected: tuple[str, str]) -> None:
     parameter = dataclasses.replace(example.PARAMETERS[0], name="some_name", label=label)
     assert expected == symbol(parameter)
-
-
-def test_greek_symbol_has_its_subscript_in_the_page() -> None:
-    assert "<i>τ</i><sub>lag</sub>" in page(example.run())
 
 
 @pytest.mark.parametrize(
@@ -356,3 +243,78 @@ def test_rounding_costs_at_most_a_twentieth_of_a_standard_deviation(
     value: float, sd: float
 ) -> None:
     assert abs(float(digits(value, sd)) - value) <= 0.0503 * sd + 1e-15 * abs(value)
+
+
+def test_a_stored_summary_and_the_truth_are_shown() -> None:
+    """Estimates are the stored ones, and there is no column of truths where none is known."""
+    run = example.run()
+    stored: Any = summary(run)
+    stored["parameters"]["d"] |= {"mean": 0.12345, "sd": 0.001}
+    text = example.page(run, stored)
+    table = rows(text, "parameters")
+    assert table["coefficient, d"][0].startswith("0.1235 ± 0.0010")
+    assert ("0.7", "–") == (table["coefficient, d"][3], table["part, α"][3])
+    assert "<i>τ</i><sub>lag</sub>" in text
+    assert "Truth" not in page(dataclasses.replace(run, truth={}))
+
+
+def test_priors_are_listed_with_what_the_constraints_leave_of_them() -> None:
+    """The bound d takes the upper part of a prior of alpha that reaches beyond it."""
+    bounded = dataclasses.replace(example.PARAMETERS[0], lower=0.1, upper=2.0)
+    close = dataclasses.replace(
+        example.PARAMETERS[1], prior=Distribution("normal", {"mean": 0.7, "sd": 0.1})
+    )
+    text = page(example.run(parameters=(bounded, close, *example.PARAMETERS[2:])))
+    table = rows(text, "priors")
+    assert len(example.PARAMETERS) == len(table)
+    assert "normal(mean = 0.7, sd = 0.1), at least 0.1, at most 2" == table["coefficient, d"][0]
+    assert ["fixed at 1", ""] == table["smoothness, n"][:2]
+    median, upper = (float(text) for text in re.findall(r"[\d.]+", table["part, α"][1])[::2])
+    assert 0.62 < median < 0.67
+    assert upper < 0.83
+    assert '<span id="constraints">0 &lt; alpha &lt; d</span>' in text
+    without = example.run(parameters=example.PARAMETERS[:1], values=example.draws()[..., :1])
+    assert 'id="constraints"' not in page(without)
+
+
+def test_what_is_not_known_has_no_row() -> None:
+    run = example.run()
+    unknown = dict.fromkeys(run.scores, example.scores(truth=False))
+    table = rows(page(dataclasses.replace(run, scores=unknown)), "scores")
+    assert 10 == len(table)
+    assert not any("displacement" in row or {"–"} >= set(cells) for row, cells in table.items())
+    without = dataclasses.replace(run.outcome.check, pareto_k=None)
+    text = example.page(
+        dataclasses.replace(
+            example.run(every=(example.bands(measured=False),)),
+            outcome=dataclasses.replace(run.outcome, check=without),
+        )
+    )
+    assert "No mixture proposed these draws" in text
+    assert "Pareto k of" not in text
+    assert 'id="validation"' not in text
+    assert "There are no readings to check the bands against." in text
+
+
+def test_verdict_says_why_and_what_to_do() -> None:
+    text = page(example.run())
+    assert "<strong>Converged" in text
+    assert "NOT CONVERGED" not in text
+    assert "two good checks" in text
+    run = example.run(converged=False)
+    resuming = {"go_on": "bwbayes resume results/a --steps 40000"}
+    text = example.page(run, summary(run) | resuming, PICTURES)
+    assert "<strong>NOT CONVERGED</strong>" in text
+    assert "budget of 120 steps used up: R-hat 1.2" in text
+    assert "<code>bwbayes resume results/a --steps 40000</code>" in text
+    assert {"#trace", "#ranks"} <= set(re.findall(r'href="(.*?)"', text))
+
+
+def test_page_without_convergence_speaks_of_the_chains_alone() -> None:
+    """Which parameter lags; nothing of the others, even if their pictures are handed in."""
+    text = page(example.run(converged=False))
+    assert ["2103", "2203", "1.0040"] == rows(text, "sampling")["stiff, k"]
+    assert ["trace", "ranks"] == re.findall(r'<figure id="(.*?)">', text)
+    text = re.sub(r'src="data:[^"]*"', "", text).lower()
+    for word in ("95", "band", "median</th>", "coverage", "validation", "mcse", "truth"):
+        assert word not in text

@@ -22,11 +22,13 @@ from bwbayes.app.config.config import load, parse
 from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
-from bwbayes.app.running.run import carry_on, redraw
-from bwbayes.app.screen import show_result
+from bwbayes.app.running.run import redraw, resume
 from bwbayes.data import read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.report.run import run_report
+from bwbayes.report.screen import as_text
+from bwbayes.results.result import summary
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import Check
@@ -47,6 +49,7 @@ def test_run_leaves_these_files(run: Path) -> None:
         "posterior.nc",
         "summary.json",
         "bands.csv",
+        "result.npz",
         "report.html",
         "figures",
         "records",
@@ -79,7 +82,7 @@ def test_summary_says_how_the_run_ended(run: Path) -> None:
         answer["versions"]
     )
     assert all(isinstance(text, str) for text in answer["versions"].values())
-    problem = module.load_run(RunFolder(run))
+    problem = RunFolder(run).problem()
     assert problem.record.sha256 == answer["data_sha256"]
 
 
@@ -104,12 +107,12 @@ def test_acceptance_of_each_phase_is_in_the_facts(run: Path) -> None:
 
 
 def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
-    said = StringIO()
-    show_result(example.run(), RunFolder(Path("made-up")), Console(file=said, width=200))
+    run = example.run()
+    said = as_text(run_report(run, summary(run)), width=200)
     expected = (
-        "sampling: 120 steps, accepted: differential evolution 12%, mixture 32%; Pareto k 0.31\n"
+        "sampling: 120 steps, accepted: differential evolution 12%, mixture 32%; Pareto k 0.31"
     )
-    assert expected in said.getvalue()
+    assert expected in said
 
 
 def test_summary_has_every_free_parameter(run: Path) -> None:
@@ -142,7 +145,7 @@ def test_summary_judges_every_prediction(run: Path) -> None:
 def test_coverage_of_the_displacement_needs_a_truth(copy: RunFolder) -> None:
     path = copy.path / "records/sine.h5"
     write_record(replace(read_record(path), truth=None), path)
-    carry_on(copy, small.quiet(), workers=1)
+    resume(copy, small.quiet(), workers=1)
     answer = small.numbers(copy.path)["validation"]
     assert answer["sine"]["coverage"]["displacement"] is None
     assert set(answer["sine"]["coverage"]["sensor"]) == LEVELS
@@ -162,7 +165,7 @@ def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
 
 
 def test_posterior_is_the_chain(run: Path) -> None:
-    problem = module.load_run(RunFolder(run))
+    problem = RunFolder(run).problem()
     chain = ChainFile.read(run / "chain.h5")
     draws = sampler.draws(problem.posterior, chain)
     density = chain.log_density("sampling")
@@ -190,7 +193,7 @@ def test_posterior_says_whether_it_has_converged_and_when_samples_were(run: Path
 
 def test_posterior_has_the_log_likelihood_of_each_draw(run: Path) -> None:
     """It is that of all readings together, and with the log prior it makes the log density."""
-    posterior = module.load_run(RunFolder(run)).posterior
+    posterior = RunFolder(run).problem().posterior
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
         answer = tree["log_likelihood"].to_dataset()["displacement"]
         drawn = tree["posterior"].to_dataset()
@@ -226,7 +229,7 @@ def test_report_needs_nothing_but_itself(run: Path) -> None:
 
 
 def test_resolved_config_runs_by_itself(run: Path) -> None:
-    problem = module.load_run(RunFolder(run))
+    problem = RunFolder(run).problem()
     assert problem.config == load(run / "config.toml")
 
 
@@ -245,7 +248,7 @@ def test_chain_says_what_was_run(run: Path) -> None:
 @pytest.mark.usefixtures("_without_pictures")
 def test_two_workers_give_the_same_bits_as_one(run: Path, tmp_path: Path) -> None:
     made = small.begun(tmp_path / "small")
-    carry_on(made, small.quiet(), workers=2)
+    resume(made, small.quiet(), workers=2)
     small.assert_same_end(run, made.path)
 
 
@@ -258,16 +261,16 @@ def test_interrupted_run_goes_on_to_the_same_bits(
     for phase, blocks in (("pilot", 1), ("tuning", 1), ("sampling", 1), ("sampling", 2)):
         watch_until(monkeypatch, phase, 4 * blocks + 1)  # in the middle of a block
         with pytest.raises(KeyboardInterrupt):
-            carry_on(made, small.quiet(), workers=1)
+            resume(made, small.quiet(), workers=1)
         assert not made.summary.exists()
     monkeypatch.undo()
     with monkeypatch.context() as patched:
         patched.setattr(module, "write_bands", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            carry_on(made, small.quiet(), workers=1)
+            resume(made, small.quiet(), workers=1)
     assert not made.summary.exists()
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
-    carry_on(made, small.quiet(), workers=1)
+    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
+    resume(made, small.quiet(), workers=1)
     small.assert_same_end(run, made.path)
 
 
@@ -290,7 +293,7 @@ def watch_until(monkeypatch: pytest.MonkeyPatch, last: str, count: int) -> None:
 
 @pytest.mark.usefixtures("_without_pictures")
 def test_finished_run_goes_on_to_itself(run: Path, copy: RunFolder) -> None:
-    carry_on(copy, small.quiet(), workers=1)
+    resume(copy, small.quiet(), workers=1)
     small.assert_same_end(run, copy.path)
 
 
@@ -301,7 +304,7 @@ def test_interrupted_command_says_how_to_go_on(
     watch_until(monkeypatch, "pilot", 5)
     assert 130 == finish(made.path, 1, quiet=True)
     printed = capsys.readouterr()
-    assert f"interrupted; go on with `bwbayes resume {made.path}`\n" == printed.err
+    assert f"interrupted; resume with `bwbayes resume {made.path}`\n" == printed.err
     assert "" == printed.out
     assert 1 == ChainFile.read(made.chain).blocks("pilot")
 
@@ -309,15 +312,15 @@ def test_interrupted_command_says_how_to_go_on(
 def test_posterior_that_presses_against_the_passive_bound_is_remarked_on(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, chain, outcome = module.finished(RunFolder(run))
+    fit = module.finished(RunFolder(run))
     monkeypatch.setattr(BoucWen, "remarks", lambda _, column, __: [f"pressed {column['d'].ndim}"])
-    unconverged = replace(outcome, converged=False)
-    assert "pressed 1" in module.assemble(problem, chain, unconverged).remarks
+    unconverged = replace(fit.outcome, converged=False)
+    assert "pressed 1" in fit.knowing(outcome=unconverged, _loaded=None).result.remarks
 
 
 def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
-    problem = module.load_run(RunFolder(run))
-    _, _, outcome = module.finished(RunFolder(run))
+    problem = RunFolder(run).problem()
+    outcome = module.finished(RunFolder(run)).outcome
     said = StringIO()
     progress = Progress(Console(file=said, width=40), problem.plan)
     progress.begun = progress.printed = time.monotonic() - 60
@@ -337,7 +340,7 @@ def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: Run
     before = small.numbers(run)["parameters"]
     fewest = min(min(row["ess_bulk"], row["ess_tail"]) for row in before.values())
     required = float(np.ceil(1.3 * fewest))
-    result = carry_on(copy, small.quiet(), workers=1, ess=required)
+    result = resume(copy, small.quiet(), workers=1, ess=required)
     assert result.outcome.converged
     first, longer = ChainFile.read(run / "chain.h5"), ChainFile.read(copy.chain)
     steps = first.steps("sampling")
@@ -358,14 +361,14 @@ def test_chain_of_another_record_is_refused(copy: RunFolder) -> None:
     write_record(replace(record, voltage=record.voltage + 1e-9), path)
     before = copy.chain.read_bytes()
     with pytest.raises(InputError, match="belongs to another record"):
-        carry_on(copy, small.quiet(), workers=1)
+        resume(copy, small.quiet(), workers=1)
     assert copy.summary.exists()
     assert len(before) == len(copy.chain.read_bytes())
 
 
 def test_running_run_has_one_writer(copy: RunFolder) -> None:
     with copy.locked(), pytest.raises(InputError, match="another process is writing this run"):
-        carry_on(copy, small.quiet(), workers=1)
+        resume(copy, small.quiet(), workers=1)
 
 
 # Drawing again
@@ -385,7 +388,7 @@ def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder)
 
 def test_unfinished_run_is_not_drawn(copy: RunFolder) -> None:
     copy.summary.unlink()
-    with pytest.raises(InputError, match=r"not finished; go on with `bwbayes\.resume_run"):
+    with pytest.raises(InputError, match=r"not finished; resume with `bwbayes\.resume"):
         redraw(copy)
 
 
@@ -397,8 +400,8 @@ def test_chain_without_draws_predicts_nothing(
         module.finished(made)
     watch_until(monkeypatch, "pilot", 5)
     with pytest.raises(KeyboardInterrupt):
-        carry_on(made, small.quiet(), workers=1)
-    with pytest.raises(InputError, match=r"no draws yet; go on with `bwbayes\.resume_run"):
+        resume(made, small.quiet(), workers=1)
+    with pytest.raises(InputError, match=r"no draws yet; resume with `bwbayes\.resume"):
         module.finished(made)
 
 
@@ -407,6 +410,7 @@ def test_fit_that_misses_its_own_readings_does_not_hold(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert () == redraw(copy).standing.lines
+    copy.result.unlink()  # or it would be read
     said = ["NRMSE 9% on the training readings"]
     monkeypatch.setattr("bwbayes.results.verdict.missed", lambda *_: said)
     again = redraw(copy)
@@ -416,7 +420,7 @@ def test_fit_that_misses_its_own_readings_does_not_hold(
     row = small.numbers(copy.path)["validation"]["training"]
     assert row["holds"] is False
     assert list(verdict.reasons) == row["reasons"]
-    assert row["remedy"]
+    assert row["fix"]
     page = (copy.path / "report.html").read_text(encoding="utf-8")
     assert 0 < page.index("VALIDATION FAILED") < page.index("Parameters")
     assert 3 == finish(copy.path, 1, quiet=True)
@@ -425,7 +429,7 @@ def test_fit_that_misses_its_own_readings_does_not_hold(
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:
     """A target that is missed takes back the intervals that a lower one had given."""
     steps = ChainFile.read(copy.chain).steps("sampling")
-    result = carry_on(copy, small.quiet(), workers=1, ess=1e6, steps=steps)
+    result = resume(copy, small.quiet(), workers=1, ess=1e6, steps=steps)
     assert not result.outcome.converged
     assert {"trace.png", "ranks.png"} == {p.name for p in (copy.path / "figures").iterdir()}
     assert small.numbers(copy.path)["validation"] is None

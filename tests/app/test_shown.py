@@ -17,11 +17,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bwbayes as bw
+from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.tracking import Tracking, Wishes, track
+from bwbayes.control.tracked import Tracking
+from bwbayes.control.tracking import track
+from bwbayes.inference import pointfit
+from bwbayes.inference.noise import noise_model
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
 from bwbayes.population.population import population
+from bwbayes.results.calibration import judge
+from bwbayes.results.loops import measure_loops
+from bwbayes.results.prediction import predict_record
+from bwbayes.results.replicates import Experiment, replicates
+from bwbayes.results.scores import score
+from bwbayes.results.start import Start
+from bwbayes.results.steps import Step, measure_step
+from bwbayes.results.verdict import Background, assess
+from bwbayes.sampling.sampler import first_chain
 from bwbayes.shown import LONGEST, MOST_LINES, brief, head
 from tests.app import small
 from tests.control import cases
@@ -40,12 +55,12 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     stand = bw.VirtualTestStand(sample_rate=50.0)
     record = stand.run(voltage, rng)
     problem, posterior, draws = fit.problem, fit.problem.posterior, fit.result.flat_draws
-    background = bw.Background.of(posterior, draws)
-    bands = bw.predict_record(posterior, draws, record, bw.Start(), rng)
-    point = bw.point_fit(posterior, rng)
-    experiment = bw.Experiment(posterior, problem.plan)
+    background = Background.of(posterior, draws)
+    bands = predict_record(posterior, draws, record, Start(), rng)
+    point = pointfit.fit(posterior, rng)
+    experiment = Experiment(posterior, problem.plan)
     with ThreadPoolExecutor(1) as executor:
-        (replicate,) = bw.replicates(experiment, 1, [0], executor)
+        (replicate,) = replicates(experiment, 1, [0], executor)
     many = population(drawn(rng).specimens, rng)
     rows = tuple(Row(f"s{i}", f"s{i}.csv", "refused", "because " * 40, {}) for i in range(200))
     return [
@@ -54,26 +69,26 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         stand,
         bw.Record.from_arrays(np.sin(np.arange(1000)), interval=1e-3),
         bw.signal("identification"),
-        bw.Actuator(),
-        bw.Start(),
-        bw.Step(10.0, 1.0),
-        bw.noise_model("discrepancy", 0.01),
+        Actuator(),
+        Start(),
+        Step(10.0, 1.0),
+        noise_model("discrepancy", 0.01),
         bw.InputError("a"),
         bw.InputWarning("a"),
         bw.NotConvergedError("a"),
         *bw.inspect(bw.Record(voltage, -voltage, 0.02)),
         point,
-        bw.first_chain(posterior, point, problem.plan, rng),
+        first_chain(posterior, point, problem.plan, rng),
         background,
         bands,
-        bw.score(bands, rng),
-        bw.assess(bands, background),
+        score(bands, rng),
+        assess(bands, background),
         fit.predict(record, lead_in=0.2),
-        bw.measure_loops(posterior, draws),
-        bw.measure_step(posterior, draws, bw.Step(10.0, 1.0)),
+        measure_loops(posterior, draws),
+        measure_step(posterior, draws, Step(10.0, 1.0)),
         experiment,
         replicate,
-        bw.judge([replicate.entry()], rng),
+        judge([replicate.entry()], rng),
         many,
         bw.Campaign(CampaignResult(rows, many), CampaignFolder(folder)),
         fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
@@ -81,8 +96,8 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         followed(rng),
         *fit.design("d", candidates={"fast": voltage, "slow": 0.5 * voltage}),
         bw.compare(fit, fit, future=False, workers=1),
-        bw.parse_config('[record]\nfile = "a.csv"\n', "a"),
-        bw.Distribution("normal", {"mean": 1.0, "sd": 0.1}),
+        parse('[record]\nfile = "a.csv"\n', "a"),
+        Distribution("normal", {"mean": 1.0, "sd": 0.1}),
     ]
 
 
@@ -90,8 +105,8 @@ def followed(generator: np.random.Generator) -> Tracking:
     """Return what ``fit.track`` does, of three draws: the margins of a thousand take a minute."""
     actuator = cases.actuator("bouc-wen, second-order", "zero")
     noise = LoopNoise(np.full(3, 0.5), np.full(3, 1.5), np.full(3, 0.5))
-    wishes = Wishes(frequencies=(5.0,))
-    return track(actuator, cases.theta(actuator, 3), noise, Stand(cases.SPAN), wishes, generator)
+    theta, stand = cases.theta(actuator, 3), Stand(cases.SPAN)
+    return track(actuator, theta, noise, stand, generator, frequencies=(5.0,))
 
 
 def reached(things: list[Any]) -> dict[type, Any]:
@@ -191,7 +206,7 @@ def documented() -> Iterator[tuple[str, str]]:
 
 def test_no_public_docstring_names_an_inner_module() -> None:
     named = {name: INNER.findall(text) for name, text in documented()}
-    assert len(named) > 200
+    assert len(named) > 100
     assert {} == {name: found for name, found in named.items() if found}
 
 

@@ -21,8 +21,8 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data import Record
-from bwbayes.data.inspection import inspect
 from bwbayes.data.teststand import VirtualTestStand
+from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import InputWarning
 
 # Sensor noise of 0.5 um and a discrepancy of 1.5 um.
@@ -143,7 +143,7 @@ def test_a_spike_of_a_small_record_is_seen_and_hides_nothing(row: int, size: flo
     found, expected = inspect(spoiled.record), [one.kind for one in inspect(good)]
     assert [*expected, "spikes"] == [one.kind for one in found]
     assert found[-1].start == good.time[row]
-    assert "outliers = true under [model]" == found[-1].remedy
+    assert "outliers = true under [model]" == found[-1].fix
 
 
 def test_the_resolved_config_is_the_same_problem(tmp_path: Path) -> None:

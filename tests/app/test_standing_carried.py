@@ -10,7 +10,6 @@ import re
 import shutil
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
-from bwbayes.results.causes import Cause
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
 
 OFF = "95 % bands cover 55 % of 50 readings"
@@ -41,7 +41,7 @@ IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
 
 
 def verdict(holds: bool | None) -> Verdict:
-    cause = Cause("loop", "the operator", "try another") if holds is False else None
+    cause = Finding("loop", "the operator", "try another") if holds is False else None
     return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
 
 
@@ -76,8 +76,8 @@ def test_each_command_says_it_first_and_ends_with_its_status(
     arguments = [name, str(judged), *COMMANDS[name], "--out", str(where)]
     assert cli.main(arguments, standalone_mode=False) == STATUS[holds]
     said = capsys.readouterr()
-    # Two of them show a table on the screen, and the verdict above it.
-    first = (said.out if name in {"design", "predict"} else said.err).partition("\n")[0]
+    # All but one show a report on the screen, and the verdict above it.
+    first = (said.err if name == "export" else said.out).partition("\n")[0]
     assert first.startswith(f"{HEADLINE[holds]}: held-out")
     assert OFF in first
     (numbers,) = out.glob("*.json")
@@ -101,8 +101,8 @@ def test_each_command_says_it_first_and_ends_with_its_status(
 def test_python_warns_of_it(
     name: str, fit: bw.Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    verdicts = dict(fit.result.verdicts) | {"held-out": verdict(False)}
-    monkeypatch.setitem(fit.__dict__, "result", replace(fit.result, verdicts=verdicts))
+    verdicts = fit.verdicts | {"held-out": verdict(False)}
+    monkeypatch.setitem(fit.__dict__, "standing", Standing.of(verdicts.values()))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         made = IN_PYTHON[name](fit, tmp_path / "out")

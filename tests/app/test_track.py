@@ -14,8 +14,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.track import track as command
-from bwbayes.app.jobs.track import Setup, track_run
-from bwbayes.control.tracking import CONTROLLERS
+from bwbayes.control.tracked import CONTROLLERS
 from bwbayes.errors import InputError
 
 FEW = ("--frequency", "2", "--frequency", "5", "--draws", "5")
@@ -28,7 +27,7 @@ def test_numbers_table_and_picture_agree(
     assert 0 == command.main([str(tmp_path / "run"), *FEW], standalone_mode=False)
     folder, said = tmp_path / "run/track", capsys.readouterr()
     assert "" == said.err
-    for kind in ("json", "csv", "png", "html"):
+    for kind in ("json", "csv", "html"):
         assert f"wrote {folder / f'track.{kind}'}\n" in said.out
     numbers = json.loads((folder / "track.json").read_text())
     with (folder / "track.csv").open(newline="") as file:
@@ -50,8 +49,8 @@ def test_numbers_table_and_picture_agree(
     again = fit.track(frequencies=(2.0, 5.0), draws=5)
     assert numbers["table"] == again.numbers()["table"]
     assert 4 == len(fit.plot.tracking(again).axes)
-    with pytest.raises(InputError, match=r"track\.json: exists; choose another folder, or give"):
-        track_run(tmp_path / "run", None, Setup(draws=5))
+    with pytest.raises(InputError, match=r"track\.json: exists; choose another name, or give"):
+        command.main([str(tmp_path / "run"), *FEW], standalone_mode=False)
 
 
 @pytest.mark.parametrize(

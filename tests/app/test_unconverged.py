@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
 from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import carry_on
+from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
@@ -39,6 +40,7 @@ def test_run_without_convergence_speaks_of_no_interval(
 ) -> None:
     made, status = cut_short
     assert 4 == status
+    assert 25 == ChainFile.read(made.chain).steps("sampling")
     seen = small.numbers(made.path)
     assert (False, None, None) == (seen["converged"], seen["parameters"], seen["validation"])
     assert seen["stop_reason"].startswith("budget of 25 steps used up: ")
@@ -48,11 +50,6 @@ def test_run_without_convergence_speaks_of_no_interval(
     assert "95 %" not in re.sub(r"<style.*?</style>|src=\"data:[^\"]*\"", "", page, flags=re.S)
     assert not list((made.path / "figures").glob("bands*"))
     assert not list((made.path / "figures").glob("co*"))  # corner, coverage
-
-
-def test_run_without_convergence_keeps_its_draws(cut_short: tuple[RunFolder, int]) -> None:
-    made, _ = cut_short
-    assert 25 == ChainFile.read(made.chain).steps("sampling")
 
 
 def test_line_on_the_screen_says_what_to_do(
@@ -103,10 +100,10 @@ def test_larger_budget_converges_to_what_it_would_have_been(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
+    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
     shutil.copytree(cut_short[0].path, tmp_path / "small")
     made = RunFolder.open(tmp_path / "small")
-    result = carry_on(made, small.quiet(), workers=1, steps=20_000)
+    result = resume(made, small.quiet(), workers=1, steps=20_000)
     assert result.outcome.converged
     assert 20_000 == load(made.config).sampling.steps
     small.assert_same_end(run, made.path)
@@ -148,11 +145,12 @@ def widened(state: EnsembleState, walkers: int) -> EnsembleState:
     return EnsembleState(coordinates, np.resize(state.log_density, walkers), state.random_state)
 
 
-@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("name", ["stuck ensemble", "heavy autocorrelation"])
 def test_hard_case_ends_with_status_4_and_without_parameters(
     run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
+    """Of each kind one, from the folder on; tests/sampling/test_hard_cases.py has them all."""
+    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
     folder = run_with(run, tmp_path / "a", HARD[name](np.random.default_rng(1), 8))
     assert 4 == finish(folder.path, 1, quiet=True, ess=1)
     seen = small.numbers(folder.path)
@@ -163,7 +161,7 @@ def test_hard_case_ends_with_status_4_and_without_parameters(
 def test_twin_good_draws_end_with_status_0_and_parameters(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
+    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
     folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8))
     # The draws are not this record's, so that its bands may be off.
     assert finish(folder.path, 1, quiet=True, ess=1) != 4
@@ -179,7 +177,7 @@ def test_likelihood_that_turns_into_nan_ends_with_status_4(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the tuning on, when all ensembles agree already."""
-    monkeypatch.setattr(module, "draw_all", lambda _: {})
+    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
     folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8)[:BLOCK])
     monkeypatch.setattr(Posterior, "log_likelihood", not_a_number)
     assert 4 == finish(folder.path, 1, quiet=True, ess=1, steps=4 * BLOCK)
@@ -194,3 +192,16 @@ def test_likelihood_that_is_nan_everywhere_is_said(
     with pytest.raises(InputError, match="no draw has a finite posterior density"):
         finish(folder.path, 1, quiet=True)
     assert not folder.summary.exists()
+
+
+def test_python_refuses_it_too(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:
+    fit = bw.open_run(cut_short[0].path)
+    for call in (
+        fit.track,
+        lambda: fit.export(tmp_path / "out"),
+        lambda: fit.compensate("sine", amplitude=20, frequency=1),
+        lambda: fit.design("d"),
+    ):
+        with pytest.raises(bw.NotConvergedError, match=r"budget of .* steps used up"):
+            call()
+    assert not any(tmp_path.iterdir())

@@ -18,17 +18,17 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from rich.console import Console
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.report.report import render
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.screen import show_priors
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.results.result import Result, summary
+from bwbayes.report.priors import priors_table
+from bwbayes.report.report import Report
+from bwbayes.report.screen import as_text
+from bwbayes.results.result import Result
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
 from tests.app.odd_files import good_arrays
@@ -265,7 +265,7 @@ def page(text: str, converged: bool) -> str:
     run = dataclasses.replace(
         run, name=text, remarks=(text,), facts={"record": origin, "config": text}
     )
-    return render(run, summary(run), {"trace": b"png"})
+    return example.page(run, pictures={"trace": b"png"})
 
 
 def _toml(text: str) -> str:
@@ -285,10 +285,8 @@ def test_texts_add_no_tag_to_the_page(text: str, converged: bool) -> None:
 def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
     """Brackets are no markup there, and do not stop the command."""
     parameters = [dataclasses.replace(p, unit=text) for p in example.PARAMETERS]
-    console = Console(file=io.StringIO(), width=500)
-    show_priors(JointPrior(parameters), console)
-    assert isinstance(console.file, io.StringIO)
-    assert text.partition("\0")[0] in console.file.getvalue()
+    report = Report(title="", blocks=[priors_table(JointPrior(parameters))])
+    assert text.partition("\0")[0] in as_text(report, width=500)
 
 
 # Names and paths

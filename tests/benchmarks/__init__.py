@@ -1,11 +1,10 @@
 """Benchmarks: what a sample costs, how fast effective draws come, how long a start takes.
 
     python -m tests.benchmarks              # all of it: tables on the screen, and benchmarks.json
-    python -m tests.benchmarks --quick      # fewer rounds, shorter records, no NumPy run
+    python -m tests.benchmarks --quick      # fewer rounds, no NumPy run
+    python -m tests.benchmarks waits --against ../before    # what a person waits for
     python -m tests.benchmarks.replicates --against ../before      # short records, two checkouts
     python -m tests.benchmarks.campaigns        # a campaign of a thousand short records
-    python -m tests.benchmarks.cluster --replicates 100      # what a scheduler costs
-    pytest tests/benchmarks -m benchmark --benchmark-enable --dist=no    # with pytest-benchmark
 
 Timings depend on the machine and on what else it does; no test passes or fails by them.
 """

@@ -10,11 +10,12 @@ from rich.console import Console
 
 from bwbayes.app.running.workers import one_thread
 from tests.benchmarks import effective, likelihood
-from tests.benchmarks.cases import CREEPING, FULL, MODELS, QUICK, Effort, problem
-from tests.benchmarks.control import controller, inversion
+from tests.benchmarks.cases import CREEPING, FULL, QUICK, Effort, problem
+from tests.benchmarks.control import inversion
 from tests.benchmarks.replicates import replicates
 from tests.benchmarks.startup import startup
 from tests.benchmarks.tables import Cell, Table, machine, printed, written
+from tests.benchmarks.waits import waits
 from tests.measured import keep
 
 # Name, sign and number of each target; what each came to is in `_reached`.
@@ -38,8 +39,8 @@ COMPARED = ("plays", "preisach", "duhem", CREEPING)
 WIDTH = 110
 
 
-@click.command()
-@click.option("--quick", is_flag=True, help="Fewer rounds, shorter records, no NumPy run.")
+@click.group(invoke_without_command=True)
+@click.option("--quick", is_flag=True, help="Fewer rounds, no NumPy run.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -48,8 +49,11 @@ WIDTH = 110
     help="Where the figures go.",
 )
 @click.option("--keep", "kept", is_flag=True, help="Store what tests/README.md quotes.")
-def main(*, quick: bool, out: Path, kept: bool) -> None:
+@click.pass_context
+def main(context: click.Context, *, quick: bool, out: Path, kept: bool) -> None:
     """Measure what the likelihood, the sampling and a start cost on this machine."""
+    if context.invoked_subcommand is not None:
+        return
     console = Console()
     console.width = max(console.width, WIDTH)
     before, tables = machine(), []
@@ -63,19 +67,20 @@ def main(*, quick: bool, out: Path, kept: bool) -> None:
     if kept:
         quoted = {str(row["target"]): float(f"{row['measured']:.3g}") for row in tables[-1].rows}
         keep("benchmarks", quoted)
+        (inverse,) = (table for table in tables if table.name == "inversion")
+        keep("inverse over simulation", {str(row["model"]): row["ratio"] for row in inverse.rows})
     console.print(f"{out}: {before['processor']}, load {before['load']} before it began")
+
+
+main.add_command(waits)
 
 
 def _measured(effort: Effort) -> Iterator[Table]:
     posterior = problem("numba").posterior
-    yield likelihood.batches(posterior, effort)
-    yield likelihood.models(posterior, effort)
+    yield likelihood.engines(posterior, effort)
     yield likelihood.parts(posterior, effort)
-    yield likelihood.lengths(posterior, effort)
-    yield likelihood.hysteresis_alone(posterior, effort)
     yield likelihood.threads(posterior, effort)
     yield from effective.sampling(effort)
-    yield controller(effort)
     yield inversion(effort)
     yield startup(effort)
     yield replicates(effort)
@@ -93,14 +98,9 @@ def _targets(tables: dict[str, Table]) -> Table:
 
 def _reached(tables: dict[str, Table]) -> Iterator[float]:
     """Pick what the targets are about, in their order."""
-    rate = {
-        (r["moves"], r["engine"]): _number(r["draws/s"]) for r in _rows(tables, "effective_draws")
-    }
-    ours = rate["ours", "numba"]
-    yield ours / rate["stretch", "stock"]
-    yield ours / rate["stretch", "numpy"]
-    yield ours / rate["stretch", "numba"]
-    yield from (_number(r["numba"]) for r in _rows(tables, "batches") if r["models"] == MODELS)
+    rate = {row["moves"]: _number(row["draws/s"]) for row in _rows(tables, "effective_draws")}
+    yield from (rate["ours"] / rate[name] for name in ("stock", "numpy", "numba"))
+    yield _number(_rows(tables, "engines")[0]["numba"])
     cost = {str(row["model"]): _number(row["ns"]) for row in _rows(tables, "parts")}
     yield max(
         cost[f"{name}, {start}"] / cost[f"bouc-wen, {start}"]
@@ -109,7 +109,7 @@ def _reached(tables: dict[str, Table]) -> Iterator[float]:
     )
     yield _number(_rows(tables, "threads")[0]["speed-up"])
     yield _number(_rows(tables, "ensemble_threads")[0]["speed-up"])
-    run = next(row for row in _rows(tables, "runs") if row["engine"] == "numba")
+    (run,) = _rows(tables, "runs")
     yield _number(run["s"])
     yield _number(run["checks"]) / sum(_number(run[part]) for part in effective.PARTS)
     yield _number(_rows(tables, "replicates")[0]["core s"])

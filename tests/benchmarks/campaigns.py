@@ -3,14 +3,12 @@
 ``python -m tests.benchmarks.campaigns`` draws actuators from the priors of
 ``runs/calibration.toml``, writes a record of 300 samples of each into a folder, and lets
 ``bwbayes campaign`` do with it what it does without pictures, with as many workers as there are
-cores. Then a few of the records with one worker and with two, in turns, to see what the second core
-is worth.
+cores.
 """
 
 from __future__ import annotations
 
 import resource
-import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -21,21 +19,16 @@ from rich.console import Console
 
 import bwbayes as bw
 from bwbayes.app.config.config import load
-from bwbayes.app.jobs.campaign import carry_on, config_text, start
+from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.campaign_result import CampaignResult
 from tests.benchmarks.cases import ROOT
 from tests.measured import keep
 
-__all__ = ["campaign_of", "fitted"]
-
 CONFIG = ROOT / "runs" / "calibration.toml"
 
 # Medians and relative spreads of the population.
 POPULATION = {"d": (0.7, 0.05), "alpha": (0.35, 0.1), "beta": (0.03, 0.1), "lag": (0.03, 0.2)}
-
-# Records with which one worker is compared with two, and how often.
-COMPARED, TURNS = 40, 2
 
 
 def written(folder: Path, count: int) -> None:
@@ -61,7 +54,7 @@ def fitted(records: Path, out: Path, workers: int | None = None) -> tuple[Campai
     """Fit the records of a folder, and return what came of it and the seconds it took."""
     begun = time.perf_counter()
     folder = start(records, config_text(CONFIG), ROOT / "runs", out, pictures=False)
-    ended = carry_on(folder, Console(quiet=True), workers=workers)
+    ended = resume(folder, Console(quiet=True), workers=workers)
     return ended, time.perf_counter() - begun
 
 
@@ -90,27 +83,12 @@ def campaign_of(count: int, where: Path) -> dict[str, float]:
     }
 
 
-def second_core(where: Path) -> float:
-    """Return how many times faster two workers are than one, with a few of the records."""
-    few = where / "few"
-    few.mkdir()
-    for record in sorted((where / "records").glob("*.csv"))[:COMPARED]:
-        for file in record.parent.glob(f"{record.stem}.*"):
-            shutil.copy(file, few)
-    seconds = {1: 0.0, 2: 0.0}
-    for turn in range(TURNS):
-        for workers in seconds:
-            seconds[workers] += fitted(few, where / f"out{turn}{workers}", workers)[1]
-    return seconds[1] / seconds[2]
-
-
 @click.command()
 @click.option("--records", default=1000, show_default=True)
 def main(*, records: int) -> None:
     """Measure a campaign, print what it took, and keep it."""
     with tempfile.TemporaryDirectory() as folder:
         figures = campaign_of(records, Path(folder))
-        figures["speed-up by a second worker"] = second_core(Path(folder))
     for name, value in figures.items():
         click.echo(f"{name}: {value:.4g}")
     keep("benchmark of a campaign", figures)

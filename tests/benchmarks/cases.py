@@ -20,29 +20,8 @@ from bwbayes.model.registry import HYSTERESIS, made
 from tests.benchmarks.stock import stock
 from tests.inference.problems import posterior_of, truth
 
-__all__ = [
-    "BATCHES",
-    "CREEPING",
-    "ENGINES",
-    "ESS",
-    "FULL",
-    "LENGTHS",
-    "MODELS",
-    "QUICK",
-    "ROOT",
-    "Effort",
-    "config",
-    "on_engine",
-    "problem",
-    "trial",
-    "variant",
-    "with_parts",
-]
-
 ROOT = Path(__file__).resolve().parents[2]
 ENGINES: tuple[Engine, ...] = ("numba", "numpy")
-BATCHES = (1, 8, 16, 32, 64, 256)
-LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
 
 # The model whose exponent is not fixed at 1, and the times of four creep lags, s.
 FREE_EXPONENT = "bouc-wen, free exponent"
@@ -58,27 +37,26 @@ ESS = 4000.0
 
 @dataclass(frozen=True)
 class Effort:
-    """How much to measure: ``rounds``, the ``longest`` record, ``steps`` for an ESS, all runs."""
+    """How much to measure: ``rounds``, ``steps`` for an ESS, all runs."""
 
     rounds: int
-    longest: int
     steps: int
     everything: bool
 
 
-FULL = Effort(rounds=7, longest=LENGTHS[-1], steps=3000, everything=True)
-QUICK = Effort(rounds=2, longest=100_000, steps=400, everything=False)
+FULL = Effort(rounds=7, steps=3000, everything=True)
+QUICK = Effort(rounds=2, steps=400, everything=False)
 
 
-def config(ess: float = ESS) -> Config:
-    """Return the config of the paper's record, with that target."""
+def config() -> Config:
+    """Return the config of the paper's record, with the target."""
     read = load(ROOT / "runs" / "ring_bender.toml")
-    return read.model_copy(update={"sampling": read.sampling.model_copy(update={"ess": ess})})
+    return read.model_copy(update={"sampling": read.sampling.model_copy(update={"ess": ESS})})
 
 
-def problem(engine: Engine, ess: float = ESS) -> Problem:
+def problem(engine: Engine) -> Problem:
     """Return the paper's record as a run would see it on an engine."""
-    whole = config(ess)
+    whole = config()
     sampling = whole.sampling.model_copy(update={"engine": engine})
     return resolve(whole.model_copy(update={"sampling": sampling}), ROOT / "runs")
 
@@ -88,19 +66,6 @@ def on_engine(posterior: Posterior, name: str) -> Posterior:
     if name == "stock":
         return stock(posterior)
     return replace(posterior, engine=name)  # type: ignore[arg-type]  # one of the engines
-
-
-def variant(
-    posterior: Posterior, dynamics: str, noise: str, samples: int | None = None
-) -> Posterior:
-    """Return a posterior of the same record with another model, repeated to so many samples."""
-    voltage, displacement = posterior.only.voltage, posterior.only.displacement
-    if samples is not None:
-        voltage, displacement = np.resize(voltage, samples), np.resize(displacement, samples)
-    actuator = replace(posterior.only.actuator, dynamics=dynamics)
-    known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
-    other = posterior_of(voltage, displacement, actuator, noise, known)
-    return replace(other, engine=posterior.engine)
 
 
 def with_parts(posterior: Posterior, *, from_rest: bool) -> dict[str, Posterior]:

@@ -1,14 +1,14 @@
-"""How fast effective draws come: emcee's stretch move, differential evolution, and a whole run.
+"""How fast effective draws come: emcee's defaults, its stretch move, and a whole run of ours.
 
 A run of ours is timed as it is: point fit, pilot, tuning and sampling until it has converged with
-the effective draws asked for. The other moves are given a start that is finished, draws of our
-chain, and no burn-in. Their effective draws per step do not depend on what computes the density:
+the effective draws asked for. The stretch move is given a start that is finished, draws of our
+chain, and no burn-in. Its effective draws per step do not depend on what computes the density:
 they are counted once, on the compiled engine, and divided by what a step costs on each engine and
 on the stock path.
 
 Effective draws are the smaller of bulk and tail of the slowest parameter. Ours are what a run
-reports, never more than its ensembles' means are worth. For the others that cap is left out: it
-takes a long chain to be known, and without it they have more.
+reports, never more than its ensembles' means are worth. For the stretch move that cap is left out:
+it takes a long chain to be known, and without it there are more.
 """
 
 # mypy: allow-untyped-calls
@@ -17,14 +17,14 @@ takes a long chain to be known, and without it they have more.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
-from emcee.moves import Move, StretchMove
+from emcee.moves import StretchMove
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor
@@ -33,35 +33,19 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain, Phase
 from bwbayes.sampling.diagnostics import TAIL, Check, as_chains
 from bwbayes.sampling.ensemble import Block, EnsembleState, advance
-from bwbayes.sampling.moves import pilot_moves, sampling_moves
+from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.sampler import Outcome, first_chain, sample
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, problem
 from tests.benchmarks.likelihood import speed_up
 from tests.benchmarks.tables import Cell, Table
 from tests.benchmarks.timing import Cost, interleaved
 
-__all__ = ["MOVES", "PARTS", "WORKERS", "Run", "from_posterior", "our_run", "sampling", "step"]
-
-Moves = list[tuple[Move, float]]
-
-# What moves, and on what engine.
-Contestant = tuple[str, str]
-
 WORKERS = 2
 PARTS = ("point fit", "pilot", "tuning", "sampling", "checks")
 
-# Walkers of the moves that are not ours, and ensembles that their effective draws are counted in.
+# Walkers of the stretch move, and ensembles that its effective draws are counted in.
 WALKERS = MODELS
 ENSEMBLES = 2
-
-MOVES: dict[str, Callable[[], Moves]] = {
-    "stretch": lambda: [(StretchMove(), 1.0)],
-    "DE + snooker": pilot_moves,
-}
-
-# A longer run, over which point fit and pilot weigh less.
-MANY = 20_000.0
-LONGER = "ours, ESS 20,000"
 
 # Steps of ours that two threads are timed with.
 THREAD_STEPS = 20
@@ -118,116 +102,70 @@ def from_posterior(run: Run, walkers: int = WALKERS) -> list[EnsembleState]:
     ]
 
 
-def step(posterior: Posterior, name: str, state: EnsembleState) -> Callable[[], Block]:
-    """Return a call that makes one step of a move."""
-    return partial(advance, posterior, MOVES[name](), state, 1)
+def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
+    """Move an ensemble by emcee's default move."""
+    return advance(posterior, [(StretchMove(), 1.0)], state, steps)
 
 
 def sampling(effort: Effort) -> list[Table]:
-    """Measure moves, whole runs, and the ratios between them."""
-    problems = {("ours", "numba"): problem("numba")}
-    if effort.everything:
-        problems["ours", "numpy"] = problem("numpy")
-        problems[LONGER, "numba"] = problem("numba", MANY)
-    posterior = problems["ours", "numba"].posterior
+    """Measure whole runs and the stretch move, and the ratios between them."""
+    paper = problem("numba")
     # What is not timed: the first call on the compiled engine, and a first run to start from.
-    first = our_run(problems["ours", "numba"])
+    first = our_run(paper)
     states = from_posterior(first)
-    draws = {move: _draws_per_step(posterior, move, states, effort.steps) for move in MOVES}
-    steps = {
-        (move, engine): step(on_engine(posterior, engine), move, states[0])
-        for move in MOVES
+    stretch_draws = draws_per_step(paper.posterior, states, effort.steps)
+    runs: list[Run] = []
+    calls: dict[str, Callable[[], object]] = {
+        engine: partial(stretched, on_engine(paper.posterior, engine), states[0], 1)
         for engine in (*ENGINES, "stock")
-        if (move, engine) != ("DE + snooker", "stock")
     }
-    runs: dict[Contestant, Run] = {}
-
-    def again(key: Contestant) -> None:
-        runs[key] = our_run(problems[key])
-
-    calls: dict[Contestant, Callable[[], object]] = {key: partial(again, key) for key in problems}
-    cost = interleaved(steps | calls, max(effort.rounds // 2, 1))
-    rates = {key: _rates(draws[key[0]], cost[key]) for key in steps}
-    rates |= {key: _rates(run.ess, cost[key]) for key, run in runs.items()}
+    calls["ours"] = lambda: runs.append(our_run(paper))
+    cost = interleaved(calls, max(effort.rounds // 2, 1))
+    rates = {name: stretch_draws / cost[name].wall for name in (*ENGINES, "stock")}
+    rates["ours"] = runs[-1].ess / cost["ours"].wall
+    rows: list[dict[str, Cell]] = [
+        {"moves": name, "draws/s": rate, "x stock": rate / rates["stock"]}
+        for name, rate in rates.items()
+    ]
+    note = (
+        "effective draws, slowest parameter; ours with point fit, pilot and tuning, emcee's "
+        "stretch move from the posterior on, by engine; stock: a loop over the samples"
+    )
     return [
-        _effective(rates),
-        _steps(draws, {key: cost[key] for key in steps}),
-        _parts(runs, cost),
+        Table("effective_draws", "Effective draws per second, the paper's record", note, rows),
+        _run_table(runs[-1], cost["ours"]),
         _thread_table(first, effort.rounds),
     ]
 
 
-def _draws_per_step(
-    posterior: Posterior, name: str, states: Sequence[EnsembleState], steps: int
-) -> float:
+def draws_per_step(posterior: Posterior, states: Sequence[EnsembleState], steps: int) -> float:
     """Count the effective draws of a step of one ensemble, started from the posterior."""
     with ThreadPoolExecutor(WORKERS) as pool:
-        futures = [pool.submit(advance, posterior, MOVES[name](), s, steps) for s in states]
-        blocks = [future.result() for future in futures]
+        blocks = list(pool.map(lambda state: stretched(posterior, state, steps), states))
     coordinates = np.stack([block.coordinates for block in blocks], axis=1)
     flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
-    chains = as_chains(flat.reshape(coordinates.shape))
-    bulk = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="bulk")
-    tail = array_stats.ess(chains, chain_axis=0, draw_axis=1, method="tail", prob=TAIL)
-    return float(np.min([bulk, tail])) / (steps * len(states))
-
-
-def _rates(draws: float, cost: Cost) -> tuple[float, float]:
-    """Effective draws per second, and per second of a core."""
-    return draws / cost.wall, draws / cost.cpu
-
-
-def _effective(rates: Mapping[Contestant, tuple[float, float]]) -> Table:
-    stock, stock_core = rates["stretch", "stock"]
-    rows: list[dict[str, Cell]] = [
-        {
-            "moves": move,
-            "engine": engine,
-            "cores": 1 if move in MOVES else WORKERS,
-            "draws/s": rate,
-            "per core": core,
-            "x stock": rate / stock,
-            "per core x stock": core / stock_core,
-        }
-        for (move, engine), (rate, core) in rates.items()
+    columns = np.moveaxis(flat.reshape(coordinates.shape), -1, 0)
+    ess = [
+        min(
+            array_stats.ess(chains, method="bulk"),
+            array_stats.ess(chains, method="tail", prob=TAIL),
+        )
+        for chains in map(as_chains, columns)
     ]
-    note = (
-        "effective draws, slowest parameter; ours with point fit, pilot and tuning, the others "
-        "from the posterior on; stock: emcee's defaults, a loop over the samples"
-    )
-    return Table("effective_draws", "Effective draws per second, the paper's record", note, rows)
+    return float(min(ess)) / (steps * len(states))
 
 
-def _steps(draws: Mapping[str, float], cost: Mapping[Contestant, Cost]) -> Table:
-    rows: list[dict[str, Cell]] = [
-        {
-            "moves": move,
-            "engine": engine,
-            "draws per step": draws[move],
-            "ms per step": 1e3 * seen.wall,
-            "core ms per step": 1e3 * seen.cpu,
-        }
-        for (move, engine), seen in cost.items()
-    ]
-    return Table("steps", f"Moves of {WALKERS} walkers", "one ensemble on one core", rows)
-
-
-def _parts(runs: Mapping[Contestant, Run], cost: Mapping[Contestant, Cost]) -> Table:
-    rows: list[dict[str, Cell]] = []
-    for key, run in runs.items():
-        row: dict[str, Cell] = {
-            "run": key[0],
-            "engine": key[1],
-            "converged": run.outcome.converged,
-            "ESS": run.ess,
-            "steps": run.chain.steps("sampling"),
-            "s": cost[key].wall,
-            "core s": cost[key].cpu,
-        }
-        row.update(run.seconds)
-        rows.append(row)
+def _run_table(run: Run, cost: Cost) -> Table:
+    row: dict[str, Cell] = {
+        "converged": run.outcome.converged,
+        "ESS": run.ess,
+        "steps": run.chain.steps("sampling"),
+        "s": cost.wall,
+        "core s": cost.cpu,
+    }
     note = f"best of several, s, with {WORKERS} workers; the parts are those of the last run, s"
-    return Table("runs", "Our runs, from the point fit to convergence", note, rows)
+    title = "A run of ours, from the point fit to convergence"
+    return Table("runs", title, note, [row | dict[str, Cell](run.seconds)])
 
 
 def _thread_table(run: Run, rounds: int) -> Table:

@@ -23,8 +23,6 @@ from bwbayes.arrays import FloatArray
 from tests.benchmarks.cases import ROOT, Effort
 from tests.benchmarks.tables import Cell, Table
 
-__all__ = ["REPLICATES", "replicates", "seconds"]
-
 NOTE = "CPU s, one thread; median, and from the fifth to the ninety-fifth per cent"
 
 REPLICATES = {True: 100, False: 5}

@@ -15,8 +15,6 @@ from tests.benchmarks.cases import ROOT, Effort, config
 from tests.benchmarks.tables import Cell, Table
 from tests.benchmarks.timing import interleaved, timed
 
-__all__ = ["STARTS", "started", "startup"]
-
 MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bwbayes'; main()"
 
 # One model through all that is compiled.

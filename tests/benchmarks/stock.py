@@ -14,8 +14,6 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["StockPosterior", "hysteresis_loop", "stock"]
-
 
 def hysteresis_loop(
     voltage: FloatArray, alpha: FloatArray, beta: FloatArray, gamma: FloatArray, initial: FloatArray

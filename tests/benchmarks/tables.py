@@ -15,8 +15,6 @@ from rich.table import Table as Grid
 
 from bwbayes.app.running.fingerprint import versions
 
-__all__ = ["Cell", "Table", "machine", "printed", "written"]
-
 Cell = str | float | bool | None
 
 

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import NamedTuple
 
-__all__ = ["Cost", "interleaved", "timed"]
-
 # A contestant's turn lasts at least this long, s: cheap calls are repeated.
 TURN = 0.05
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.design import Promise, promises, ranked
+from bwbayes.comparison.design import promises
+from bwbayes.comparison.designed import Promise
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
@@ -48,7 +49,7 @@ def promised(
     target: str | FloatArray = "beta",
     amplifier: Limits = WIDE,
 ) -> list[Promise]:
-    return ranked(promises(*known, candidates, target, amplifier, np.random.default_rng(2)))
+    return promises(*known, candidates, target, amplifier, np.random.default_rng(2))
 
 
 def test_where_the_model_is_linear_it_is_the_closed_form() -> None:

@@ -7,16 +7,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
+from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
+from bwbayes.control.wished import Reference
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import LaserSensor, VirtualTestStand
 from bwbayes.data.waveforms import signal
@@ -25,14 +29,17 @@ from bwbayes.inference.noise import noise_model
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.prediction import thinned
+from bwbayes.results.standing import Standing
 from bwbayes.sampling.sampler import draws, first_chain, sample
 
 __all__ = [
     "CONFIG",
     "LIMITS",
     "about",
+    "compensated",
     "discrepancy",
     "drawn",
+    "fit_of",
     "inside",
     "measured_voltage",
     "off",
@@ -46,6 +53,12 @@ LIMITS = Limits(-100.0, 100.0)
 
 # Of the stand whose voltage is measured: sds, um, time, s, and the rate at which it moves, Hz.
 SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
+
+
+def fit_of(problem: Problem, flat: FloatArray) -> Fit:
+    """Return a fit with draws (draws, free) that come from no chain."""
+    fit = Fit(problem, cast(Any, None), RunFolder(Path()))
+    return fit.knowing(flat_draws=flat, standing=Standing())
 
 
 @cache
@@ -107,6 +120,12 @@ def about(of: Problem, spread: float, count: int, source: np.random.Generator) -
     known = np.array([truth.get(name, 0.5) for name in of.posterior.names])
     scale = np.where(known == 0.0, 1.0, known)
     return known + spread * scale * source.standard_normal((count, known.size))
+
+
+def compensated(of: Problem, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
+    """Return the command for a reference of an actuator that starts demagnetized."""
+    options = {"from_rest": True, "limits": LIMITS, **options}
+    return compensate(of.posterior, flat, asked, np.random.default_rng(7), **options)
 
 
 def promised(

@@ -10,26 +10,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from bwbayes.app.jobs.at_work import RunDraws
-from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.jobs.export import export
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
-from bwbayes.control.compensation import compensate
-from bwbayes.control.predicted import Compensation
 from bwbayes.control.wished import Reference, shaped
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.errors import InputError
 from bwbayes.model.linear import Hold, parse_hold
 from tests.control.commands import (
-    LIMITS,
     about,
+    compensated,
     discrepancy,
     drawn,
+    fit_of,
     inside,
     measured_voltage,
     off,
@@ -39,11 +36,6 @@ from tests.control.commands import (
 from tests.measured import keep
 
 RATE, SEEDS, PLAYS = 200.0, 40, 5
-
-
-def made(of: Problem, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
-    source = np.random.default_rng(7)
-    return compensate(of.posterior, flat, asked, source, from_rest=True, limits=LIMITS, **options)
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +64,14 @@ def test_by_default_a_command_is_for_a_dac(
     of = measured if fitted == "output" else problem()
     assert ("first" if fitted == "output" else "zero") == of.posterior.only.actuator.hold
     flat = about(of, 0.0, 2, np.random.default_rng(1))
-    command = made(of, asked, flat)
+    command = compensated(of, asked, flat)
     assert ("zero", "zoh", "command") == (
         command.hold,
         command.summary["hold"],
         command.record.voltage_is,
     )
     assert np.max(np.abs(played(asked, command.voltage) - command.smoothed)) < 0.1
-    straight = made(of, asked, flat, hold="first")
+    straight = compensated(of, asked, flat, hold="first")
     assert ("foh", "output") == (straight.summary["hold"], straight.record.voltage_is)
     assert np.max(np.abs(played(asked, straight.voltage) - straight.smoothed)) > 0.5
 
@@ -90,7 +82,7 @@ def test_between_samples_the_displacement_is_where_it_is_said_to_be(
 ) -> None:
     """Against the stand's actuator at a hundred times the rate."""
     flat = about(measured, 0.0, 2, np.random.default_rng(1))
-    command = made(measured, asked, flat, hold=hold)
+    command = compensated(measured, asked, flat, hold=hold)
     actuator = replace(measured.posterior.only.actuator, interval=asked.interval / 100, hold=hold)
     samples, fine = np.arange(asked.time.size), np.arange(100 * (asked.time.size - 1) + 1) / 100
     voltage = np.interp(fine, samples, command.voltage)
@@ -105,7 +97,7 @@ def test_between_samples_the_displacement_is_where_it_is_said_to_be(
     assert not any("shorter sampling interval" in remark for remark in command.remarks)
     flat[:, measured.posterior.names.index("discrepancy_sd")] = 1e-6
     smooth = Reference(asked.displacement, asked.interval)
-    command = made(measured, smooth, flat, hold=hold)
+    command = compensated(measured, smooth, flat, hold=hold)
     assert any("shorter sampling interval" in remark for remark in command.remarks)
 
 
@@ -113,9 +105,9 @@ def test_truths_are_where_a_command_for_a_dac_says(measured: Problem, asked: Ref
     """The twin goes in straight lines between samples as the measured voltage did; it is found."""
     source = np.random.default_rng(3)
     flat, truths = (about(measured, 0.005, count, source) for count in (2000, 400))
-    result = off(promised(measured, made(measured, asked, flat), truths, source), 400)
+    result = off(promised(measured, compensated(measured, asked, flat), truths, source), 400)
     assert max(abs(value) for value in result.values()) < 4.0, result
-    late = made(measured, asked, flat, hold="first")
+    late = compensated(measured, asked, flat, hold="first")
     result = off(promised(measured, late, truths, source), 400)
     assert max(result["band", 95], result["rms", 95]) < -4.0, result
 
@@ -123,8 +115,8 @@ def test_truths_are_where_a_command_for_a_dac_says(measured: Problem, asked: Ref
 def test_a_model_is_exported_for_a_dac(measured: Problem, tmp_path: Path) -> None:
     """Whatever the voltage did in the record, unless it is said."""
     flat = about(measured, 0.001, 3, np.random.default_rng(1))
-    held, _ = export_draws(RunDraws(measured, flat), tmp_path / "held")
-    straight, _ = export_draws(RunDraws(measured, flat), tmp_path / "straight", hold="foh")
+    held = export(fit_of(measured, flat), tmp_path / "held")
+    straight = export(fit_of(measured, flat), tmp_path / "straight", hold="foh")
     assert ["zero", "first"] == [one.model.actuator.hold for one in (held, straight)]
 
 
@@ -138,7 +130,7 @@ def parts(seed: int, hold: Hold) -> dict[tuple[str, int], float]:
     """Return what the bands held of a DAC's plays of a command for one fit."""
     of, source = measured_voltage(RATE, seed), np.random.default_rng(10_000 + seed)
     asked = shaped("triangle", 1 / RATE, 40.0, 2.0, periods=16)
-    command = made(of, asked, drawn(of, seed), hold=hold)
+    command = compensated(of, asked, drawn(of, seed), hold=hold)
     truth = played(asked, command.voltage)
     plays = [
         inside(command, truth + discrepancy(truth.size, asked.interval, source))

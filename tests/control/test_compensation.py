@@ -19,7 +19,6 @@ import pytest
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.wished import SHAPES, Reference, shaped
 from bwbayes.data.teststand import VirtualTestStand
@@ -27,7 +26,7 @@ from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.results.bands import LEVELS
-from tests.control.commands import LIMITS, about, drawn, inside, off, problem, promised, rms
+from tests.control.commands import about, compensated, drawn, inside, off, problem, promised, rms
 from tests.measured import keep
 
 # Displacement per volt of the paper's signals when they are asked for, and the sd of the smoothing
@@ -35,11 +34,6 @@ from tests.measured import keep
 PER_VOLT, SMOOTH = 0.45, 0.01
 
 PAPER = ("identification", "verification", "step10", "step50", "step100")
-
-
-def made(of: Problem, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
-    source = np.random.default_rng(7)
-    return compensate(of.posterior, flat, asked, source, from_rest=True, limits=LIMITS, **options)
 
 
 def reached(asked: Reference, voltage: FloatArray, discrepancy: Any, seed: int) -> FloatArray:
@@ -69,7 +63,7 @@ def test_errors_are_ten_times_smaller_on_the_stand_with_the_right_model() -> Non
     flat = of.posterior.prior.constrain(point.mode[np.newaxis])[0].repeat(2, axis=0)
     smaller = {}
     for name, asked in references(1e-3).items():
-        command = made(of, asked, flat)
+        command = compensated(of, asked, flat)
         after = rms(reached(asked, command.voltage, "none", 1))
         smaller[name] = rms(reached(asked, command.linear.voltage, "none", 1)) / after
     assert min(smaller.values()) > 10.0, smaller
@@ -92,7 +86,7 @@ def asked() -> Reference:
 
 def test_truths_are_where_the_command_says(asked: Reference) -> None:
     of, source = problem(), np.random.default_rng(3)
-    command = made(of, asked, about(of, 0.02, 2000, source))
+    command = compensated(of, asked, about(of, 0.02, 2000, source))
     result = off(promised(of, command, about(of, 0.02, 400, source), source), 400)
     assert max(abs(value) for value in result.values()) < 4.0, result
 
@@ -132,11 +126,9 @@ def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: R
     truths[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
 
     def anywhere(**options: Any) -> dict[Any, float]:
-        source = np.random.default_rng(7)
-        made = compensate(of.posterior, flat, asked, source, limits=LIMITS, **options)
-        return off(covered_early(of, made, truths), 400)
+        return off(covered_early(of, compensated(of, asked, flat, **options), truths), 400)
 
-    result = anywhere()
+    result = anywhere(from_rest=False)
     assert max(abs(value) for value in result.values()) < 4.0, result
     sure = anywhere(from_rest=True)
     assert sure["early", 95] < -4.0, sure
@@ -146,7 +138,9 @@ def test_twin_draws_that_are_too_sure_are_found(asked: Reference) -> None:
     of, source = problem(), np.random.default_rng(3)
     flat = about(of, 0.005, 400, source)
     flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.5
-    result = off(promised(of, made(of, asked, flat), about(of, 0.02, 400, source), source), 400)
+    result = off(
+        promised(of, compensated(of, asked, flat), about(of, 0.02, 400, source), source), 400
+    )
     assert min(result["band", 95], result["rms", 95]) < -4.0, result
 
 
@@ -154,7 +148,7 @@ def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: 
     """With draws far apart the two differ; the expected error is least for the one that says so."""
     of, source = problem(), np.random.default_rng(3)
     flat = about(of, 0.05, 200, source)
-    mean, expected = (made(of, asked, flat, command=one) for one in ("mean", "expected"))
+    mean, expected = (compensated(of, asked, flat, command=one) for one in ("mean", "expected"))
     of_mean, of_expected = (one.compensated.smoothed.expected for one in (mean, expected))
     assert of_expected < of_mean
     assert mean.other == pytest.approx(of_expected, rel=1e-9)
@@ -166,7 +160,7 @@ def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: 
 def test_the_mean_command_brings_the_mean_model_to_the_reference(asked: Reference) -> None:
     of = problem()
     flat = about(of, 0.0, 3, np.random.default_rng(1))
-    command = made(of, asked, flat)
+    command = compensated(of, asked, flat)
     np.testing.assert_allclose(command.compensated.bands.mean, command.smoothed, atol=1e-6)
     assert command.compensated.smoothed.expected < 1e-6
     assert command.difference < 1e-6
@@ -178,7 +172,7 @@ def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> Non
     flat = about(of, 0.0, 2, source)
     # Nearly: a discrepancy has a sd.
     flat[:, of.posterior.names.index("discrepancy_sd")] = 1e-9
-    command = made(of, asked, flat, limit=0.1)
+    command = compensated(of, asked, flat, limit=0.1)
     moved = asked.given - np.asarray(asked.displacement)
     assert np.max(np.abs(moved)) == asked.moved > 0.5
     errors = command.compensated
@@ -207,7 +201,7 @@ def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> Non
 
 def test_the_probability_of_a_limit_is_that_of_the_largest_error(asked: Reference) -> None:
     of, source = problem(), np.random.default_rng(3)
-    command = made(of, asked, about(of, 0.02, 200, source), limit=4.0)
+    command = compensated(of, asked, about(of, 0.02, 200, source), limit=4.0)
     numbers = command.summary["compensated"]
     assert numbers["probability_below_limit"] == np.mean(command.compensated.largest <= 4.0)
     assert command.compensated.probability(0.0) == 0.0
@@ -259,12 +253,12 @@ def test_what_is_out_of_reach_is_said_with_its_place_and_time() -> None:
     flat = about(of, 0.0, 2, np.random.default_rng(1))
     far = shaped("sine", 0.01, 100.0, 1.0)
     with pytest.raises(InputError, match=r"um at .* s needs .* V, and from .* s on it is beyond"):
-        made(of, far, flat)
-    near = made(of, far, flat, nearest=True)
+        compensated(of, far, flat)
+    near = compensated(of, far, flat, nearest=True)
     assert np.max(np.abs(near.voltage)) <= 100.0
     assert any("the command is the nearest one" in remark for remark in near.remarks)
     with pytest.raises(InputError, match="limit: 0 um; must be positive"):
-        made(of, far, flat, limit=0.0)
+        compensated(of, far, flat, limit=0.0)
 
 
 @pytest.mark.slow
@@ -274,7 +268,7 @@ def test_forty_seeds_of_the_stand_are_where_their_commands_say() -> None:
     for seed in range(40):
         of = problem.__wrapped__("process", 1000.0, seed)
         asked = shaped("triangle", 1e-3, 40.0, 0.5, periods=8)
-        command = made(of, asked, drawn(of, seed))
+        command = compensated(of, asked, drawn(of, seed))
         error = reached(asked, command.voltage, "process", 10_000 + seed)
         truth = error + np.asarray(asked.displacement)
         for key, part in inside(command, truth).items():

@@ -10,7 +10,8 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.references import SHAPES, reference
-from bwbayes.control.tracking import CONTROLLERS, Tracking, Wishes, track
+from bwbayes.control.tracked import CONTROLLERS, Tracking
+from bwbayes.control.tracking import track
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
@@ -35,8 +36,8 @@ def draws(count: int) -> tuple[Actuator, FloatArray, LoopNoise]:
 
 @pytest.fixture(scope="module")
 def tracking() -> Tracking:
-    wishes = Wishes(frequencies=(2.0, 10.0, 20.0))
-    return track(*draws(40), Stand(cases.SPAN), wishes, np.random.default_rng(2))
+    rng = np.random.default_rng(2)
+    return track(*draws(40), Stand(cases.SPAN), rng, frequencies=(2.0, 10.0, 20.0))
 
 
 def test_feed_forward_and_feedback_together_beat_either_alone(tracking: Tracking) -> None:
@@ -64,11 +65,10 @@ def test_the_table_says_what_the_arrays_say(tracking: Tracking) -> None:
 def test_by_default_it_goes_to_where_the_dynamics_matter() -> None:
     """Half of a sine's power is left at 41 Hz: from 0.1 Hz to the next of 1, 2 and 5."""
     actuator, theta, noise = draws(2)
-    wishes = Wishes(amplitude=1e-3)
     # Short, because a lag of the same cut-off is sampled ten times as slowly.
     slow = cases.actuator(NAME, "zero", 1e-2)
     theta[:, actuator.parameters.index("damping")] *= 10
-    made = track(slow, theta, noise, Stand(cases.SPAN), wishes, np.random.default_rng(2))
+    made = track(slow, theta, noise, Stand(cases.SPAN), np.random.default_rng(2), amplitude=1e-3)
     assert (0.1, 0.2, 0.5, 1.0, 2.0, 5.0) == made.frequencies
     assert 4 * 0.0385 == pytest.approx(made.rise, rel=0.1)
 
@@ -76,10 +76,9 @@ def test_by_default_it_goes_to_where_the_dynamics_matter() -> None:
 def test_a_range_on_one_side_of_zero_is_approached_first() -> None:
     actuator, theta, noise = draws(4)
     noise = noise._replace(discrepancy=np.zeros(4), sensor=np.zeros(4))
-    wishes = Wishes(frequencies=(5.0,))
     same = np.tile(theta.mean(axis=0), (4, 1))
     stand = Stand(Span(0.0, 100.0))
-    made = track(actuator, same, noise, stand, wishes, np.random.default_rng(2))
+    made = track(actuator, same, noise, stand, np.random.default_rng(2), frequencies=(5.0,))
     assert made.middle - made.amplitude > 0
     # The right model, but for the DAC's steps of 0.1 V: 0.02 um rms, at the most 0.07 um.
     sine = made.signals.index("sine")
@@ -103,7 +102,7 @@ def test_references_swing_by_their_amplitude_and_jump_in_time(frequency: float) 
 
 
 @pytest.mark.parametrize(
-    ("wishes", "line"),
+    ("requested", "line"),
     [
         ({"frequencies": (200.0,)}, "frequencies: 200 Hz; at this rate give some from"),
         ({"frequencies": (1e-9,)}, "frequencies: 1e-09 Hz; at this rate give some from"),
@@ -114,6 +113,6 @@ def test_references_swing_by_their_amplitude_and_jump_in_time(frequency: float) 
         ({"amplitude": float("nan")}, "amplitude: nan um"),
     ],
 )
-def test_what_cannot_be_followed_is_one_line(wishes: dict[str, Any], line: str) -> None:
+def test_what_cannot_be_followed_is_one_line(requested: dict[str, Any], line: str) -> None:
     with pytest.raises(InputError, match=line):
-        track(*draws(3), Stand(cases.SPAN), Wishes(**wishes), np.random.default_rng(2))
+        track(*draws(3), Stand(cases.SPAN), np.random.default_rng(2), **requested)

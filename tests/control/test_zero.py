@@ -10,23 +10,22 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.jobs.at_work import RunDraws, command_limits
-from bwbayes.app.jobs.export import export_draws
+from bwbayes.app.jobs.at_work import command_limits
+from bwbayes.app.jobs.export import export
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.exported import exported
-from bwbayes.control.predicted import Compensation
 from bwbayes.control.sampled import SampledModel
 from bwbayes.control.wished import Reference, shaped
 from bwbayes.data.record import Record
-from bwbayes.data.teststand import RingBender, VirtualTestStand
+from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.errors import InputError
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
 from tests.control import cases
+from tests.control.commands import compensated, fit_of
 from tests.control.compiled import Compiled
 from tests.programs import needs
 
@@ -42,29 +41,24 @@ VALUES = {
 
 def problem(**keys: Any) -> Problem:
     """Return that of a ring bender driven on one side, whose sensor has an offset."""
-    stand = VirtualTestStand("none", 1 / INTERVAL, RingBender(offset=OFFSET))
+    stand = VirtualTestStand("none", 1 / INTERVAL, true={"offset": OFFSET})
     run = stand.run(50 * (1 - np.cos(4 * np.pi * TIME)), np.random.default_rng(1))
     config, records = config_of(run, {"from_rest": True, **keys})
     return resolve(config, Path(), records)
-
-
-def made(of: Problem, flat: FloatArray, asked: Reference, **options: Any) -> Compensation:
-    source, limits = np.random.default_rng(7), Limits(-100.0, 100.0)
-    return compensate(of.posterior, flat, asked, source, limits=limits, **options)
 
 
 def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -> None:
     of = problem(gain=["quadratic"])
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
     asked = shaped("sine", INTERVAL, 10.0, 2.0, middle=15.0)
-    command = made(of, flat, asked, from_rest=True).voltage
+    command = compensated(of, asked, flat, from_rest=True).voltage
     assert command[0] == pytest.approx(0.0, abs=1e-9)
     at_zero = flat.copy()
     at_zero[:, of.posterior.names.index("offset")] = 0.0
-    same = made(of, at_zero, asked, from_rest=True)
+    same = compensated(of, asked, at_zero, from_rest=True)
     np.testing.assert_allclose(same.voltage, command, atol=1e-9)
 
-    model, _ = export_draws(RunDraws(of, flat), tmp_path, voltage=(-100.0, 100.0))
+    model = export(fit_of(of, flat), tmp_path, voltage=(-100.0, 100.0))
     state, stepped = model.model.begin(np.zeros(1)), []
     reference = np.asarray(asked.displacement)[1:]
     for target in reference:
@@ -88,7 +82,7 @@ def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool
     flat = of.posterior.prior.draw(np.random.default_rng(2), 1).repeat(2, axis=0)
     flat[:, of.posterior.names.index("offset")] = OFFSET
     asked = Reference(5 * (1 - np.cos(2 * np.pi * TIME[:20] / TIME[20])), INTERVAL)
-    command = made(of, flat, asked, from_rest=from_rest, nearest=True)
+    command = compensated(of, asked, flat, from_rest=from_rest, nearest=True)
     for played in (command.compensated, command.linear):
         assert played.voltage[0] == pytest.approx(0.0, abs=1e-6)
         for kind in ("parameter", "displacement"):
@@ -119,7 +113,7 @@ def test_a_reference_that_begins_elsewhere_gets_a_way_from_zero() -> None:
     of = problem(dynamics="lag")
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
     asked = Reference(25 + 10 * np.cos(2 * np.pi * TIME), INTERVAL, smoothed=0.01)
-    command = made(of, flat, asked)
+    command = compensated(of, asked, flat, from_rest=False)
     assert (1.0, 1.0) == (command.reference.approach, command.summary["approach_s"])
     way = round(1.0 / INTERVAL)
     np.testing.assert_array_equal(command.asked[way:], asked.given)

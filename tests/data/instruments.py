@@ -15,8 +15,6 @@ import numpy as np
 import pandas as pd
 import scipy.io
 
-__all__ = ["INSTRUMENTS", "INTERVAL", "SAMPLES", "Written", "signals"]
-
 SAMPLES, INTERVAL = 600, 0.005
 
 Array = Any

@@ -13,20 +13,8 @@ from scipy.signal import butter, sosfiltfilt
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Decay,
-    Multisine,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    identification_signal,
-    step_signal,
-    verification_signal,
-)
+from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.errors import InputWarning
-
-__all__ = ["SPOILT", "good", "looping"]
 
 Generator = np.random.Generator
 Discrepancy = Literal["none", "process", "structural"]
@@ -75,21 +63,29 @@ def _random(amplitude: float, rate: float, generator: Generator) -> FloatArray:
     return result
 
 
+def _multisine(amplitude: float, rate: float, generator: Generator) -> FloatArray:
+    """Return ten seconds of five equal sines with Schroeder's phases, (samples,), V."""
+    time = np.arange(round(10 * rate)) / rate
+    frequencies = generator.uniform(0.3, 4, 5)
+    i = np.arange(1, 6)[:, np.newaxis]
+    sines = np.sin(2 * np.pi * frequencies[:, np.newaxis] * time - np.pi * i * (i - 1) / 5)
+    voltage: FloatArray = amplitude / 5 * np.sum(sines, axis=0)
+    return voltage
+
+
 LOOPING: Mapping[str, Callable[[float, float, Generator], Waveform | FloatArray]] = {
     "decaying sine": lambda amplitude, _, g: Waveform(
         Sine(amplitude, float(g.choice([0.5, 1.0, 2.0, 5.0])), g.uniform(0, 2 * np.pi)),
         float(g.uniform(6, 16)),
         decay=Decay(1.0, float(g.uniform(0.03, 0.15))),
     ),
-    "identification": lambda *_: identification_signal(),
-    "verification": lambda *_: verification_signal(),
+    "identification": lambda *_: signal("identification"),
+    "verification": lambda *_: signal("verification"),
     "random": _random,
     "triangle": lambda amplitude, _, g: Waveform(
         Triangle(amplitude, float(g.choice([0.5, 1.0, 3.0]))), 8.0, decay=Decay(2.0, 0.1)
     ),
-    "multisine": lambda amplitude, _, g: Waveform(
-        Multisine.flat(amplitude, tuple(g.uniform(0.3, 4, 5).tolist())), 10.0
-    ),
+    "multisine": _multisine,
     "from motion": lambda amplitude, _, g: Waveform(
         Sine(amplitude, float(g.choice([1.0, 2.0])), g.uniform(0, 2 * np.pi)),
         14.0,
@@ -102,7 +98,7 @@ OTHERS: Mapping[str, Callable[[float, float, Generator], Waveform | FloatArray]]
         float(g.uniform(5, 15)),
     ),
     "slow": lambda amplitude, *_: Waveform(Sine(amplitude, 0.05), 60.0, decay=Decay(20.0, 0.02)),
-    "step": lambda _a, _r, g: step_signal(float(g.choice([10.0, 50.0, 100.0]))),
+    "step": lambda _a, _r, g: signal(f"step{float(g.choice([10.0, 50.0, 100.0])):.0f}"),
 }
 
 

@@ -52,19 +52,6 @@ def assert_same(record: Record, sign: float = 1.0) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".h5"])
-def test_a_files_own_columns_are_read(tmp_path: Path, suffix: str) -> None:
-    path = write(tmp_path / f"a{suffix}")
-    assert_same(read_record(path, columns=COLUMNS, units=UNIT))
-    assert_same(read_record(path, columns=COLUMNS, units={"displacement": "-nm"}), -1.0)
-
-
-def test_a_matlab_files_own_columns_are_read(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mat")
-    columns = COLUMNS | {"time": "t", "displacement": "x"}
-    assert_same(read_record(path, columns=columns, units={"time": "ms", "displacement": "nm"}))
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".h5"])
 @pytest.mark.parametrize(
     ("columns", "units", "line"),
     [
@@ -124,6 +111,26 @@ def test_the_packages_own_names_come_before_others(tmp_path: Path) -> None:
     assert_same(read_record(path))
 
 
+def test_a_file_with_one_number_a_column_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.update(a=np.ones(1), b=np.ones(1), c=np.ones(1))
+    with pytest.raises(InputError, match="no column has more than one number; give a row for each"):
+        read_record(path)
+
+
+def test_a_file_whose_cells_are_all_more_than_numbers_is_refused_in_one_line(
+    tmp_path: Path,
+) -> None:
+    """JSON lines have as many fields as a table, each with its name."""
+    path = tmp_path / "a.jsonl"
+    path.write_text(
+        "".join(f'{{"time_s": {t / 1000:.3f}, "voltage_V": 1.5}}\n' for t in range(300))
+    )
+    with pytest.raises(InputError, match="no column holds only numbers; export it as CSV"):
+        read_record(path, need_displacement=False)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".h5", ".mat"])
 def test_all_that_is_missing_is_said_at_once(tmp_path: Path, suffix: str) -> None:
     """With a guess that reads the file, in the words of Python, a config and the command line."""
@@ -159,14 +166,6 @@ def test_all_that_is_missing_is_said_at_once(tmp_path: Path, suffix: str) -> Non
     )
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".h5"])
-def test_a_column_goes_by_its_number_too(tmp_path: Path, suffix: str) -> None:
-    # HDF5 sorts by name.
-    numbers = ("3", "1", "2") if suffix == ".h5" else ("1", "2", "3")
-    columns = dict(zip(("time", "voltage", "displacement"), numbers, strict=True))
-    assert_same(read_record(write(tmp_path / f"a{suffix}"), columns=columns, units=UNIT))
-
-
 def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = [f"{v!r},{d!r}" for v, d in zip(VOLTAGE.tolist(), DISPLACEMENT.tolist(), strict=True)]
@@ -181,14 +180,6 @@ def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> Non
         read_record(path, fs=0.0)
 
 
-def test_a_column_that_is_mapped_counts_and_its_namesake_does_not(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    rows = [f"{t},{v},{2 * v},{d}" for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)]
-    path.write_text("\n".join(["time_s,u_V,voltage_V,displacement_um", *rows]) + "\n")
-    with pytest.warns(InputWarning, match="ignored columns: voltage_V"):
-        assert_same(read_record(path, columns={"voltage": "u_V"}))
-
-
 # Names and units
 
 
@@ -201,11 +192,6 @@ def test_a_column_that_is_mapped_counts_and_its_namesake_does_not(tmp_path: Path
 def test_a_unit_is_read_from_any_usual_name(one: tuple[str, str], form: str, word: str) -> None:
     quantity, unit = one
     assert unit == unit_in(form.format(word, unit), quantity)
-
-
-@pytest.mark.parametrize("name", ["pos", "t", "U_cmd", "V", "x [px]", "time_", ""])
-def test_a_name_without_a_unit_has_none(name: str) -> None:
-    assert [None] * 3 == [unit_in(name, q) for q in ("time", "voltage", "displacement")]
 
 
 @pytest.mark.parametrize(
@@ -239,11 +225,6 @@ def test_what_two_columns_may_be_is_left_open() -> None:
 # Arrays and tables
 
 
-def test_arrays_are_a_record() -> None:
-    assert_same(Record.from_arrays(VOLTAGE.tolist(), DISPLACEMENT, interval=0.01))
-    assert Record.from_arrays(VOLTAGE, interval=0.01).displacement is None
-
-
 @pytest.mark.parametrize("time_unit", ["s", "ms", "us"])
 @pytest.mark.parametrize(("length", "scale"), [("nm", 1e3), ("-nm", -1e3), ("mm", 1e-3)])
 def test_arrays_may_have_times_and_units(time_unit: str, length: str, scale: float) -> None:
@@ -257,21 +238,6 @@ def test_arrays_may_have_times_and_units(time_unit: str, length: str, scale: flo
     assert record.sha256 == Record.from_pandas(frame, units=units).sha256
     plan = Record.from_arrays(voltage, time=time, units=units)
     assert (plan.displacement, plan.interval) == (None, record.interval)
-
-
-def test_the_units_of_arrays_go_with_an_interval_too() -> None:
-    record = Record.from_arrays(
-        VOLTAGE, 1e3 * DISPLACEMENT, interval=0.01, start=2.0, units={"displacement": "nm"}
-    )
-    assert_same(record)
-    assert (2.0, "arrays") == (record.start, record.origin)
-
-
-def test_times_of_arrays_may_begin_anywhere_or_be_dates() -> None:
-    later = Record.from_arrays(VOLTAGE, DISPLACEMENT, time=TIME + 5.0)
-    assert later.start == 5.0
-    dates = np.datetime64("2024-01-01", "ns") + (TIME * 1e9).round().astype("timedelta64[ns]")
-    assert_same(Record.from_arrays(VOLTAGE, DISPLACEMENT, time=dates))
 
 
 @pytest.mark.parametrize(
@@ -296,17 +262,6 @@ def test_times_and_units_that_cannot_be_are_one_line(options: dict[str, Any], li
         Record.from_arrays(VOLTAGE, DISPLACEMENT, **options)
 
 
-def test_samples_missing_between_times_are_held_in_a_command() -> None:
-    kept = np.r_[:50, 60:200]
-    with pytest.raises(InputError, match=r"arrays:sample 50: time_s: gap of 0.11 s after 0.49 s"):
-        Record.from_arrays(VOLTAGE[kept], DISPLACEMENT[kept], time=TIME[kept])
-    with pytest.warns(InputWarning, match="10 samples are missing"):
-        held = Record.from_arrays(
-            VOLTAGE[kept], DISPLACEMENT[kept], time=TIME[kept], voltage_is="command"
-        )
-    assert (200, 190) == (held.samples, held.readings)
-
-
 @pytest.mark.parametrize(
     ("arrays", "line"),
     [
@@ -321,15 +276,6 @@ def test_samples_missing_between_times_are_held_in_a_command() -> None:
 def test_arrays_that_are_no_record_are_one_line(arrays: tuple[Any, Any], line: str) -> None:
     with pytest.raises(InputError, match=line):
         Record.from_arrays(*arrays, interval=0.01)
-
-
-def test_a_table_is_a_record() -> None:
-    frame = pd.DataFrame(VALUES)
-    assert_same(Record.from_pandas(frame, **COLUMNS, units=UNIT))
-    own = pd.DataFrame({"time_s": TIME, "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT})
-    assert_same(Record.from_pandas(own))
-    plan = Record.from_pandas(own.drop(columns="displacement_um"))
-    assert plan.displacement is None
 
 
 def test_a_tables_columns_and_index_are_recognised() -> None:
@@ -349,21 +295,6 @@ def test_a_table_may_have_dates_for_times(kind: str) -> None:
     frame = pd.DataFrame(VALUES).drop(columns="t [ms]").assign(when=dates.astype(kind))
     assert_same(Record.from_pandas(frame, **COLUMNS | {"time": "when"}, units=UNIT))
     assert_same(Record.from_pandas(frame, units=UNIT))
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        (
-            {"displacement": "poss"},
-            "DataFrame: no column 'poss' for the displacement; choose one of There are 200 values",
-        ),
-        ({"displacement": "U_mV"}, "columns: two quantities have the same column"),
-    ],
-)
-def test_a_tables_column_that_is_misspelt_is_one_line(change: dict[str, Any], line: str) -> None:
-    with pytest.raises(InputError, match=line):
-        Record.from_pandas(pd.DataFrame(VALUES), **COLUMNS | change, units=UNIT)
 
 
 def test_a_gap_in_a_table_is_one_line_or_held() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from bwbayes.data import Record, read_record
+from bwbayes.data import Record
 from bwbayes.errors import InputError
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
@@ -18,15 +18,6 @@ MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_l
 def ramp(samples: int = 100, interval: float = 0.01, start: float = 0.0) -> Record:
     voltage = np.arange(samples, dtype=np.float64)
     return Record(voltage, 2 * voltage, interval, start, truth=3 * voltage)
-
-
-def test_time_is_start_plus_whole_intervals() -> None:
-    np.testing.assert_allclose([1.0, 1.5, 2.0], ramp(3, 0.5, 1.0).time, rtol=1e-15)
-
-
-def test_samples_duration_and_range_are_those_of_the_voltage() -> None:
-    record = ramp(100, 0.01)
-    assert (100, 1.0, (0.0, 99.0)) == (record.samples, record.duration, record.range_voltage)
 
 
 def test_arrays_are_copies_that_cannot_be_written_to() -> None:
@@ -52,10 +43,6 @@ def test_sha256_names_the_data_and_not_the_origin() -> None:
     assert len({record.sha256, *(other.sha256 for other in others)}) == 6
 
 
-def test_origin_becomes_one_line() -> None:
-    assert "a b" == Record(np.arange(3.0), None, 1.0, origin=" a\n\0b").origin
-
-
 @pytest.mark.parametrize(
     ("arguments", "place"),
     [
@@ -75,7 +62,6 @@ def test_impossible_records_are_refused_by_name(arguments: dict[str, object], pl
         Record(**(good | arguments))  # type: ignore[arg-type]
 
 
-@settings(deadline=None)
 @given(
     interval=st.floats(1e-5, 10.0),
     start=st.floats(-100.0, 100.0),
@@ -96,24 +82,6 @@ def test_window_holds_the_samples_from_start_to_before_stop(
 
 
 @pytest.mark.parametrize(
-    ("border", "sample"),
-    [(2.0, 2), (2.49, 2), (2.5, 2), (2.51, 3), (3.5, 3), (4.5, 4), (5.0, 5)],
-)
-def test_times_within_half_an_interval_count_as_on_a_border(border: float, sample: int) -> None:
-    """Whole numbers of quarter seconds are exact, so a half is one too."""
-    record = ramp(10, 0.25, 1.0)
-    assert slice(0, sample) == record.window_slice(1.0, 1.0 + border / 4)
-    assert slice(sample, 10) == record.window_slice(1.0 + border / 4, 3.5)
-
-
-def test_windows_that_share_a_border_partition_the_record() -> None:
-    record = ramp(100, 0.01)
-    cut = 0.3333
-    assert slice(0, 33) == record.window_slice(0.0, cut)
-    assert slice(33, 100) == record.window_slice(cut, 1.0)
-
-
-@pytest.mark.parametrize(
     "window", [(-1.0, 0.5), (0.5, 1.2), (0.5, 0.5), (0.6, 0.5), (5.0, 6.0), (0.0, np.inf)]
 )
 def test_windows_outside_the_record_or_empty_name_its_span(window: tuple[float, float]) -> None:
@@ -131,26 +99,12 @@ def test_decimate_thins_readings_and_never_the_drive() -> None:
     assert [0.0, 6.0, 12.0, 18.0] == thinned.displacement[thinned.has_reading].tolist()
 
 
-def test_decimating_twice_is_decimating_by_the_product() -> None:
-    record = ramp(100)
-    assert record.decimate(6).sha256 == record.decimate(2).decimate(3).sha256
-    late = record.upto(1.0, first_reading=0.05).decimate(10)
-    assert [*range(5, 100, 10)] == np.flatnonzero(late.has_reading).tolist()
-
-
 def test_excluded_readings_are_missing_and_the_voltage_is_not() -> None:
     record = ramp(100, 0.01).exclude([(0.0, 0.1), (0.5, 0.52)])
     assert [*range(10), 50, 51] == np.flatnonzero(~record.has_reading).tolist()
     np.testing.assert_array_equal(ramp().voltage, record.voltage)
     with pytest.raises(InputError, match="reaches outside the record"):
         record.exclude([(0.5, 1.5)])
-
-
-def test_late_first_reading_keeps_the_history_of_the_voltage() -> None:
-    record = ramp(100, 0.01, 5.0).upto(5.8, first_reading=5.2)
-    assert (80, 5.0, 60) == (record.samples, record.start, record.readings)
-    assert 20 == np.flatnonzero(record.has_reading)[0]
-    assert ramp(100, 0.01, 5.0).window(5.0, 5.8).sha256 == ramp(100, 0.01, 5.0).upto(5.8).sha256
 
 
 def test_a_record_needs_one_reading_and_all_missing_ones_are_alike() -> None:
@@ -179,12 +133,6 @@ def test_split_gives_slices_of_the_whole_record() -> None:
     assert (slice(0, 20), slice(10, 50)) == split.held_out
 
 
-def test_split_puts_training_windows_in_order_of_time() -> None:
-    split = ramp(100, 0.01).split([(0.5, 1.0), (0.0, 0.3)], [(0.45, 0.5), (0.3, 0.4)])
-    assert (slice(0, 30), slice(50, 100)) == split.training
-    assert (slice(45, 50), slice(30, 40)) == split.held_out
-
-
 @pytest.mark.parametrize(
     ("training", "held_out", "kind"),
     [
@@ -197,12 +145,3 @@ def test_split_refuses_windows_that_overlap_training(
 ) -> None:
     with pytest.raises(InputError, match=f"overlaps the {kind}"):
         ramp(100, 0.01).split(training, held_out)
-
-
-def test_the_measured_record_is_read_without_a_warning() -> None:
-    if not MEASURED.exists():
-        pytest.skip("the measured record is not in the folder shared/data beside the repository")
-    record = read_record(MEASURED)
-    assert (7432, 0.005, "output") == (record.samples, record.interval, record.voltage_is)
-    assert (0.236332, 3.423674) == record.range_voltage
-    assert MEASURED.name == record.origin

@@ -56,17 +56,8 @@ def assert_same(expected: Record, got: Record) -> None:
         np.testing.assert_array_equal(expected.truth, got.truth)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-@settings(deadline=None, max_examples=25)
-@given(record=records)
-def test_writing_and_reading_gives_the_same_record(
-    tmp_path_factory: pytest.TempPathFactory, suffix: str, record: Record
-) -> None:
-    assert_same(record, through(record, tmp_path_factory.getbasetemp(), suffix))
-
-
-@settings(deadline=None, max_examples=25)
-@given(record=records, way=st.lists(st.sampled_from(SUFFIXES), min_size=2, max_size=6))
+@settings(max_examples=50)
+@given(record=records, way=st.lists(st.sampled_from(SUFFIXES), min_size=1, max_size=6))
 def test_a_record_survives_any_way_through_the_formats(
     tmp_path_factory: pytest.TempPathFactory, record: Record, way: list[str]
 ) -> None:
@@ -122,7 +113,7 @@ def store(path: Path, columns: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "h5", "mat"])
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     record=records,
     volt=st.sampled_from(sorted(VOLTS)),

@@ -19,11 +19,9 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import Amplifier, LaserSensor, VirtualTestStand
-from bwbayes.data.truths import true_values
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operators.prandtl_ishlinskii import PrandtlIshlinskii
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
 
 RATE = 100.0
@@ -90,14 +88,6 @@ def test_so_it_does_with_all_dynamics(dynamics: str, tmp_path: Path) -> None:
     assert_reproduced(of(parts, parts, tmp_path, more))
 
 
-def test_so_it_does_for_the_part_of_a_record_that_is_kept(tmp_path: Path) -> None:
-    """Gain and creep count from the range of the voltage that is fitted."""
-    parts = "dynamics = 'lag'\ngain = ['quadratic', 'cubic']\ncreep = true\ncreep_growth = true\n"
-    problem = of(parts, parts, tmp_path, record="stop = 0.5\n")
-    assert problem.posterior.only.voltage.min() > -1
-    assert_reproduced(problem)
-
-
 @pytest.mark.parametrize("name", ["duhem", "prandtl-ishlinskii", "jiles-atherton"])
 def test_so_it_does_from_a_state_that_is_stated(name: str, tmp_path: Path) -> None:
     parts = f"hysteresis = '{name}'\ndynamics = 'lag'\n"
@@ -150,43 +140,6 @@ def test_the_default_is_the_ring_bender_as_it_always_was(
     assert LEVELS[kind] == sha256(levels.tobytes()).hexdigest()[:16]
 
 
-def test_a_config_without_a_word_on_the_stand_makes_the_same_record(tmp_path: Path) -> None:
-    text = f"[record]\nsignal = {SIGNAL}\n[stand]\nsample_rate = {RATE}\n"
-    spelt = "[stand.model]\nhysteresis = 'bouc-wen'\ndynamics = 'second-order'\n"
-    one, other = (resolve(parse(t, "config"), tmp_path) for t in (text, text + spelt))
-    assert one.record.sha256 == other.record.sha256
-    assert one.config.truth == other.config.truth
-    assert one.config.truth["beta"] == 0.0272
-
-
-def test_a_record_from_rest_is_stated_to_be_in_no_state_that_a_parameter_can_be() -> None:
-    stand = VirtualTestStand(actuator=Actuator("lag", hysteresis=PrandtlIshlinskii()))
-    assert "initial" not in stand.parameters()
-    stated = VirtualTestStand(actuator=stand.actuator, true={"initial": -1.0})
-    assert stated.parameters()["initial"] == -1.0
-
-
-@pytest.mark.parametrize(
-    ("stand", "model", "shared"),
-    [
-        ("hysteresis = 'preisach'\n", "hysteresis = 'plays'\n", False),
-        ("hysteresis = 'plays'\nthresholds = 4\n", "hysteresis = 'plays'\nthresholds = 5\n", False),
-        ("", "passive = false\n", True),
-    ],
-)
-def test_a_true_value_of_another_operators_parameter_is_not_stated(
-    stand: str, model: str, shared: bool, tmp_path: Path
-) -> None:
-    truth = of(stand, model, tmp_path).config.truth
-    assert shared == ("d" in truth)
-    assert {"offset", "sensor_sd"} <= set(truth)
-
-
-def test_creep_with_other_times_has_other_strengths(tmp_path: Path) -> None:
-    assert "creep_1" in of("creep = [1.0]\n", "creep = [1.0]\n", tmp_path).config.truth
-    assert "creep_1" not in of("creep = [1.0]\n", "creep = [2.0]\n", tmp_path).config.truth
-
-
 @pytest.mark.parametrize(
     ("stand", "true", "said"),
     [
@@ -203,8 +156,3 @@ def test_what_the_stand_cannot_be_is_said_in_one_line(
 ) -> None:
     with pytest.raises(InputError, match=f"^{said}"):
         of(stand, "", tmp_path, f"[stand.parameters]\n{true}")
-
-
-def test_a_part_without_a_default_needs_a_true_value() -> None:
-    with pytest.raises(InputError, match="mass: has no default; give a true value"):
-        true_values(Actuator("second-order", "zero"), {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -63,86 +62,43 @@ def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None
     )
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\xef\xbb\xbf" + GOOD.encode(),
-        GOOD.replace("\n", "\r\n").encode(),
-        GOOD.replace("\n", "\r").encode(),
-        GOOD.rstrip("\n").encode(),
-        (GOOD + "\n  \n").encode(),
-        GOOD.replace(",", ";").encode(),
-        GOOD.replace(",", ";").replace(".", ",").encode(),
-        GOOD.replace(",", "\t").replace(".", ",").encode(),
-        GOOD.replace(",", " , ").encode(),
-        GOOD.replace(",", " ").encode(),
-        GOOD.replace(",", "  ").replace("\n", "\n  ").rstrip(" ").encode(),
-        GOOD.replace(",", "|").encode(),
-        "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]).encode(),
-        ("# " + GOOD).encode(),
-        GOOD.encode("utf-16"),
-        GOOD.encode("utf-16-le"),
-        GOOD.encode("utf-16-be"),
-        GOOD.replace("_um", "_µm").encode("cp1252"),
-        GOOD.replace("_um", " [µm]").replace("time_s", "Zeit / s").encode("cp1252"),
-        GOOD.replace(HEADER, "time,voltage,displacement\n(s),(V),(um)\n").encode(),
-        GOOD.replace(HEADER, "time,voltage,displacement\nsecond,Volt,micron").encode(),
-        GOOD.replace("_um", "_µm").encode(),
-        GOOD.replace("_um", "_\u03bcm").encode(),
-        GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
-        "\n".join(",".join(line.split(",")[::-1]) for line in LINES).encode(),
-        ("# anything\n# at all: yes\n\n" + GOOD).encode(),
-    ],
-    ids=[
-        "bom",
-        "crlf",
-        "cr",
-        "no-last-newline",
-        "blank-end",
-        "semicolons",
-        "decimal-commas",
-        "tabs",
-        "blanks beside commas",
-        "blanks",
-        "blanks and indented",
-        "bars",
-        "semicolons below",
-        "header in a comment",
-        "utf-16",
-        "utf-16-le",
-        "utf-16-be",
-        "cp1252",
-        "cp1252 and other names",
-        "units in a line",
-        "units in words",
-        "micro",
-        "mu",
-        "case",
-        "order",
-        "comments",
-    ],
-)
+HARMLESS = {
+    "bom": b"\xef\xbb\xbf" + GOOD.encode(),
+    "crlf": GOOD.replace("\n", "\r\n").encode(),
+    "cr": GOOD.replace("\n", "\r").encode(),
+    "no-last-newline": GOOD.rstrip("\n").encode(),
+    "blank-end": (GOOD + "\n  \n").encode(),
+    "semicolons": GOOD.replace(",", ";").encode(),
+    "decimal-commas": GOOD.replace(",", ";").replace(".", ",").encode(),
+    "tabs": GOOD.replace(",", "\t").replace(".", ",").encode(),
+    "blanks beside commas": GOOD.replace(",", " , ").encode(),
+    "blanks": GOOD.replace(",", " ").encode(),
+    "blanks and indented": GOOD.replace(",", "  ").replace("\n", "\n  ").rstrip(" ").encode(),
+    "bars": GOOD.replace(",", "|").encode(),
+    "semicolons below": "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]).encode(),
+    "header in a comment": ("# " + GOOD).encode(),
+    "utf-16": GOOD.encode("utf-16"),
+    "utf-16-le": GOOD.encode("utf-16-le"),
+    "utf-16-be": GOOD.encode("utf-16-be"),
+    "cp1252": GOOD.replace("_um", "_µm").encode("cp1252"),
+    "cp1252 and other names": GOOD.replace("_um", " [µm]")
+    .replace("time_s", "Zeit / s")
+    .encode("cp1252"),
+    "units in a line": GOOD.replace(HEADER, "time,voltage,displacement\n(s),(V),(um)\n").encode(),
+    "units in words": GOOD.replace(
+        HEADER, "time,voltage,displacement\nsecond,Volt,micron"
+    ).encode(),
+    "micro": GOOD.replace("_um", "_µm").encode(),
+    "mu": GOOD.replace("_um", "_\u03bcm").encode(),
+    "case": GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
+    "order": "\n".join(",".join(line.split(",")[::-1]) for line in LINES).encode(),
+    "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
+}
+
+
+@pytest.mark.parametrize("content", HARMLESS.values(), ids=HARMLESS)
 def test_harmless_differences_change_nothing(tmp_path: Path, content: bytes) -> None:
     assert read(tmp_path, GOOD).sha256 == read(tmp_path, content).sha256
-
-
-@pytest.mark.parametrize(
-    ("header", "scales"),
-    [
-        ("time_ms,voltage_mV,displacement_nm", (1e-3, 1e-3, 1e-3)),
-        ("time_us,voltage_kV,displacement_mm", (1e-6, 1e3, 1e3)),
-        ("time_µs,voltage_uV,displacement_m", (1e-6, 1e-6, 1e6)),
-    ],
-)
-def test_si_prefixes_are_converted(
-    tmp_path: Path, header: str, scales: tuple[float, float, float]
-) -> None:
-    plain, other = read(tmp_path, GOOD), read(tmp_path, GOOD.replace(HEADER, header))
-    assert other.interval == pytest.approx(plain.interval * scales[0], rel=1e-12)
-    np.testing.assert_allclose(plain.voltage * scales[1], other.voltage, rtol=1e-15)
-    assert plain.displacement is not None
-    assert other.displacement is not None
-    np.testing.assert_allclose(plain.displacement * scales[2], other.displacement, rtol=1e-15)
 
 
 def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path: Path) -> None:
@@ -226,13 +182,6 @@ def test_columns_of_other_quantities_are_ignored_with_a_remark(tmp_path: Path) -
     assert record.sha256 == read(tmp_path, GOOD).sha256
 
 
-@pytest.mark.parametrize("row", ["0.040,1,2,3,4", "0.040,1,2", "0.040,x,2,3"])
-def test_a_faulty_line_is_named_beside_columns_that_are_ignored(tmp_path: Path, row: str) -> None:
-    lines = [HEADER + ",temp_C", *(f"{row},x" for row in ROWS)]
-    lines[9] = row
-    assert fault(tmp_path, "\n".join(lines) + "\n").startswith("record.csv:10: ")
-
-
 def with_gaps() -> str:
     return "# voltage: command\n" + edited(lambda x: [*x[:9], *x[12:20], *x[21:]])
 
@@ -286,11 +235,6 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "\n".join([HEADER] + [row.replace(".", ",") for row in ROWS]),
         "record.csv:2: decimal commas, 6 fields for 3 columns; separate them by semicolons",
     ),
-    (
-        "two decimal commas",
-        cell(9, 1, "1.5.5").replace(",", ";").replace(".", ","),
-        "record.csv:9: voltage_V: '1,5,5' is not a number",
-    ),
     ("empty line", edited(lambda x: [*x[:8], "", *x[8:]]), "record.csv:9: empty line"),
     ("comment below", edited(lambda x: [*x[:8], "# x", *x[8:]]), "record.csv:9: comment"),
     (
@@ -305,24 +249,9 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "record.csv:9: time_s: gap of 0.025 s after 0.030 s, about 4 missing",
     ),
     (
-        "gap before the last sample",
-        edited(lambda x: x[:29] + x[30:]),
-        "record.csv:30: time_s: gap of 0.01 s after 0.135 s, about 1 missing",
-    ),
-    (
-        "gap after the first sample",
-        edited(lambda x: x[:2] + x[3:]),
-        "record.csv:3: time_s: gap of 0.01 s after 0.000 s, about 1 missing",
-    ),
-    (
         "irregular by the last decimal",
         cell(9, 0, "0.036"),
         "record.csv:9: time_s: irregular sampling: 0.006 s",
-    ),
-    (
-        "irregular by more decimals",
-        cell(9, 0, "0.0352"),
-        "record.csv:9: time_s: irregular sampling: 0.0052 s",
     ),
     (
         "header missing",
@@ -330,11 +259,6 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "record.csv: which column is the time, which the voltage, which the displacement? There "
         "are 30 values each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.8"
         "8 to 20); say columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
-    ),
-    (
-        "column unknown",
-        edited(lambda x: ["time_s,drift_V,displacement_um,mean_V", *(f"{r},1" for r in x[1:])]),
-        "record.csv:1: which column is the voltage? There are 30 values each: 'time_s' (0 to ",
     ),
     (
         "column without unit",
@@ -347,29 +271,15 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "record.csv:1: which unit has 'voltage_v' (voltage)? There are",
     ),
     (
-        "column without name",
-        GOOD.replace("voltage_V", ""),
-        "record.csv:1: which column is the voltage? There are 30 values each: 'time_s'",
-    ),
-    ("duplicate", GOOD.replace("_um", "_nm").replace("time_s", "displacement_um"), "record.csv:1"),
-    ("truth", GOOD.replace("displacement_um", "truth_um"), "record.csv:1: no column for the disp"),
-    (
         "column missing",
         "\n".join(line.partition(",")[2] for line in LINES),
         "record.csv:1: what is the sampling rate, Hz (no column can be the time)? There",
     ),
     ("empty file", "", "record.csv: the file is empty"),
-    ("blank file", " \n\n", "record.csv: the file is empty"),
     ("header alone", HEADER, "record.csv: no columns of numbers in it"),
-    ("header alone, ended", HEADER + "\n\n", "record.csv: no columns of numbers in it"),
     ("few samples", "\n".join(LINES[:6]), "record.csv: too short, samples: 5"),
-    ("one sample", "\n".join(LINES[:2]), "record.csv: too short, samples: 1"),
     ("cut in a field", GOOD[:-3], "record.csv:31: the last line is cut off"),
-    ("cut behind a sign", GOOD[:-8], "record.csv:31: the last line is cut off"),
-    ("cut to two fields", GOOD[:-12], "record.csv:31: the last line is cut off"),
-    ("cut and ended", GOOD[:-12] + "\n", "record.csv:31: the last line is cut off (2 fields"),
     ("NUL", cell(9, 1, "\0"), "record.csv:9: voltage_V: "),
-    ("Latin-1", cell(9, 1, "\xb5").encode("latin-1"), "record.csv:9: voltage_V: "),
     ("a picture", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "record.csv: neither text nor HDF5"),
     (
         "a workbook",
@@ -381,15 +291,8 @@ FAULTS: list[tuple[str, str | bytes, str]] = [
         "\n".join([HEADER] + [f"{i / 100},1.5,{i}" for i in range(20)]),
         "record.csv: voltage_V: constant at 1.5",
     ),
-    (
-        "constant displacement",
-        "\n".join([HEADER] + [f"{i / 100},{i},1.5" for i in range(20)]),
-        "record.csv: displacement_um: constant at 1.5",
-    ),
     ("voltage is what", "# voltage: comand\n" + GOOD, "record.csv: voltage_is: 'comand'"),
     ("wrong interval", "# interval_s: 0.004\n" + GOOD, "record.csv: interval_s '0.004'"),
-    ("no interval", "# interval_s: x\n" + GOOD, "record.csv: interval_s 'x' contradicts"),
-    ("late header", "# a\n\n# b\n" + cell(9, 1, "x"), "record.csv:12: voltage_V: 'x'"),
 ]
 
 
@@ -420,27 +323,11 @@ def test_files_that_cannot_be_opened_say_why(tmp_path: Path, name: str, problem:
         read_record(tmp_path / name)
 
 
-def test_a_file_without_permission_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read(tmp_path, GOOD)
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(InputError, match="Permission denied"):
-        read_record(tmp_path / "record.csv")
-
-
 @pytest.mark.parametrize(("rate", "decimals"), [(1024.0, 4), (3.0, 1), (300.0, 3), (44100.0, 6)])
 def test_times_rounded_in_print_are_uniform(tmp_path: Path, rate: float, decimals: int) -> None:
     rows = [f"{12.5 + i / rate:.{decimals}f},{i},{i}" for i in range(3000)]
     record = read(tmp_path, "\n".join([HEADER, *rows]))
     assert record.interval == pytest.approx(1 / rate, abs=10.0**-decimals / 2999)
-
-
-def test_times_of_a_clock_that_counts_from_1970_are_uniform(tmp_path: Path) -> None:
-    rows = [f"{1.7e9 + i / 1000:.4f},{i},{i}" for i in range(1000)]
-    assert read(tmp_path, "\n".join([HEADER, *rows])).interval == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_a_truth_on_other_times_is_refused(tmp_path: Path) -> None:
@@ -470,13 +357,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
         write_record(record, tmp_path / "record.csv")
     assert [tmp_path / "record.csv"] == list(tmp_path.iterdir())
     assert GOOD == (tmp_path / "record.csv").read_text()
-
-
-def test_a_hundred_thousand_lines_are_read_in_a_fraction_of_a_second(tmp_path: Path) -> None:
-    rows = "".join(f"{i / 1000:.3f},{i % 977:.6f},{i % 1009:.6f}\n" for i in range(100_000))
-    started = time.process_time()
-    read(tmp_path, f"{HEADER}\n{rows}")
-    assert time.process_time() - started < 1.0  # 0.15 s where this was written
 
 
 def mutated(good: bytes, rng: np.random.Generator) -> bytes:

@@ -19,7 +19,6 @@ from bwbayes.inference import engine
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.engine import choose
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.linear import Hold
 from tests.inference.problems import posterior_of, ring_bender, short_posterior, truth
 
 MASS = {"mass": 0.00134, "stiffness": 4.1e5}
@@ -51,13 +50,6 @@ def test_engines_agree_on_prior_draws(noise: str, dynamics: str) -> None:
     fixed = {} if dynamics != "second-order" else MASS
     posterior = short_posterior(noise, 700, dynamics, fixed)
     assert_engines_agree(posterior, prior_draws(posterior, 300))
-
-
-@pytest.mark.parametrize("hold", ["first", "zero"])
-def test_engines_agree_on_either_hold(hold: Hold) -> None:
-    posterior = short_posterior(dynamics="lag")
-    posterior = posterior.altered(actuator=replace(posterior.only.actuator, hold=hold))
-    assert_engines_agree(posterior, prior_draws(posterior, 40))
 
 
 @pytest.mark.parametrize("count", [1, LANES - 1, LANES, LANES + 1, 100])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,16 +9,13 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.inference.compiled.stages import STAGES, drive_of
-from bwbayes.model.actuator import Actuator
+from bwbayes.inference.compiled.stages import drive_of, prepared
 from bwbayes.model.operator import Operator, Span
-from tests.inference.problems import INTERVAL, decaying_sine, posterior_of
-from tests.model.operators.slow import Rows, rows, run, walk
+from tests.model.operators.slow import Rows, run, walk
 from tests.model.operators.test_memory import CASES, SPANS, Case
 
 PIECE = 64
-COMPILED = [name for name in CASES if type(CASES[name].operator) in STAGES]
-every_case = pytest.mark.parametrize("case", [CASES[n] for n in COMPILED], ids=COMPILED)
+every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 
 
 def compiled(
@@ -29,9 +24,10 @@ def compiled(
     """Run the compiled stage along a record; as many models as there are lanes."""
     start = span or Span(0.0, 0.0)
     memory = operator.begin(column, float(voltage[0]), start, from_rest=span is None)
-    stage = STAGES[type(operator)](operator, column, voltage, memory)
+    stage = prepared(operator, column, voltage, memory)
+    assert stage is not None
     assert stage.able.all()
-    own, out, parts = stage.own.T.ravel(), np.empty(PIECE * LANES), []
+    own, out, parts = stage.group.T.ravel(), np.empty(PIECE * LANES), []
     for first in range(0, voltage.size, PIECE):
         last = min(first + PIECE, voltage.size)
         drive_of(stage.kind, own, stage.plan, voltage, first, last, out)
@@ -71,37 +67,3 @@ def test_engines_agree_where_voltages_meet_exactly(
     case: Case, voltage: FloatArray, low: int, high: int
 ) -> None:
     assert_engines_agree(case, voltage, Span(10.0 * min(low, high), 10.0 * max(low, high)))
-
-
-@every_case
-@pytest.mark.parametrize("from_rest", [True, False])
-def test_log_densities_agree_on_prior_draws(case: Case, from_rest: bool) -> None:
-    voltage = decaying_sine(500)[0 if from_rest else 37 :]
-    one = {name: values[:1] for name, values in case.column.items()}
-    displacement = run(case.operator, one, voltage, Span(-100.0, 100.0))[0]
-    displacement += np.random.default_rng(1).normal(0, 0.3, voltage.size)
-    actuator = Actuator("lag", "first", INTERVAL, case.operator)
-    fixed = {"initial": 0.0} if from_rest else {}
-    posterior = posterior_of(
-        voltage, displacement, actuator, "discrepancy", fixed, from_rest=from_rest
-    )
-    prior = posterior.prior
-    theta = prior.theta(prior.draw(np.random.default_rng(2), 300))
-    expected = replace(posterior, engine="numpy").log_likelihood(theta)
-    got = replace(posterior, engine="numba").log_likelihood(theta)
-    assert np.isfinite(expected).all()
-    np.testing.assert_array_less(np.abs(got - expected), 1e-10 * (voltage.size + np.abs(expected)))
-
-
-def test_what_a_stage_cannot_do_is_left_to_numpy() -> None:
-    voltage = np.array([0.0, 50.0, -20.0, 80.0])
-    column = rows(d=0.7, rayleigh=0.004, saturation=[80.0, 1e-2, 1e6], initial=0.0)
-    operator = CASES["preisach"].operator
-    memory = operator.begin(column, 0.0, Span(-50, 80), from_rest=False)
-    stage = STAGES[type(operator)](operator, column, voltage, memory)
-    assert stage.able.tolist() == [True, False, False]
-    plays = CASES["plays evenly"]
-    column = plays.column | {"threshold": np.linspace(50.0, 60.0, 6)}
-    memory = plays.operator.begin(column, 0.0, Span(-50, 80), from_rest=False)
-    stage = STAGES[type(plays.operator)](plays.operator, column, voltage, memory)
-    assert not stage.able.any()

@@ -1,4 +1,4 @@
-"""Default priors: scales of the drive, not of its sampling, and wide enough for what is known."""
+"""Default priors: scales of the drive in its units, not of its sampling, and wide enough."""
 
 from __future__ import annotations
 
@@ -180,3 +180,39 @@ def test_windows_alone_give_the_ranges() -> None:
     ranges = ranges_of(voltage, reading, 1e-3, [window])
     assert ranges.voltage == pytest.approx(np.ptp(voltage[window]) / 2)
     assert ranges.displacement == pytest.approx(np.ptp(reading[window]) / 2)
+
+
+# Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.
+# With another exponent n, beta and gamma grow by k^(1 - n) / m.
+POWERS = {
+    "d": (1, -1),
+    "alpha": (1, -1),
+    "beta": (0, -1),
+    "gamma": (0, -1),
+    "initial": (1, 0),
+    "offset": (1, 0),
+    "lag": (0, 0),
+    "sensor_sd": (1, 0),
+    "discrepancy_sd": (1, 0),
+    "discrepancy_time": (0, 0),
+}
+
+
+def half_width(name: str, exponent: float, k: float = 1.0, m: float = 1.0) -> float:
+    """Return half of the central 68 % of a default prior, given k and m."""
+    voltage = drive()
+    ranges = ranges_of(m * voltage, k * 0.6 * voltage, 1e-3)
+    low, high = prior(name, ranges, exponent).frozen.ppf([0.16, 0.84])
+    return float(high - low) / 2
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 3.0])
+@pytest.mark.parametrize("name", POWERS)
+def test_a_default_prior_goes_with_the_units(name: str, exponent: float) -> None:
+    """Within the three digits that a default prior has."""
+    of_k, of_m = map(float, POWERS[name])
+    if name in ("beta", "gamma"):
+        of_k = 1 - exponent
+    for k, m in ((1000.0, 1.0), (1.0, 0.001), (0.03, 7.0)):
+        grown = half_width(name, exponent, k, m) / half_width(name, exponent)
+        np.testing.assert_allclose(k**of_k * m**of_m, grown, rtol=0.01)

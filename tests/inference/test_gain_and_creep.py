@@ -103,22 +103,6 @@ def test_creep_that_grows_is_as_strong_as_stated_at_the_largest_voltage() -> Non
         assert x[-1] == pytest.approx(90 * (1 + 0.05 * (1 + growth)), rel=1e-9)
 
 
-def test_pieces_equal_the_whole_with_gain_and_creep() -> None:
-    posterior = moving("white", "second-order", {"mass": 300.0, "stiffness": 4.1e5},
-                       parts=PARTS["both"])  # fmt: skip
-    actuator = posterior.likelihood.actuator
-    theta = posterior.only.table.actuator(
-        posterior.prior.theta(posterior.prior.draw(np.random.default_rng(6), 4))
-    )
-    unrest = np.random.default_rng(7).normal(size=(4, actuator.unknowns))
-    whole = actuator.advance(theta, posterior.only.voltage, unrest=unrest)[0]
-    state, parts = None, []
-    for first, last in ((0, 1), (1, 70), (70, 200)):
-        part, state = actuator.advance(theta, posterior.only.voltage[first:last], state, unrest)
-        parts.append(part)
-    np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, rtol=1e-11, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("interval", "duration", "times"),
     [

@@ -171,16 +171,6 @@ def test_own_parameters_change_their_own_record_alone() -> None:
     assert changes[1].all()
 
 
-def test_draws_of_a_record_are_those_of_its_columns() -> None:
-    both = joint(LOOPS, SLOW, per_record=("sensor_sd",))
-    free = both.prior.draw(np.random.default_rng(3), 5)
-    theta = both.prior.theta(free)
-    for name, alone, its in both.each(free):
-        np.testing.assert_array_equal(alone.prior.theta(its), both.table.of(theta, name))
-    (only,) = joint(LOOPS).each(free[:, : len(joint(LOOPS).names)])
-    np.testing.assert_array_equal(only.draws, free[:, : len(joint(LOOPS).names)])
-
-
 def test_bounds_hold_in_every_record() -> None:
     """With alpha of each record its own: 0 < alpha < d, and |gamma| <= beta."""
     both = joint(LOOPS, SLOW, per_record=("alpha", "gamma"))

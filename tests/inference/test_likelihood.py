@@ -214,13 +214,6 @@ def test_a_memory_is_kept_as_long_as_it_is_heard() -> None:
     np.testing.assert_allclose(posterior.log_likelihood(theta), expected, rtol=1e-9)
 
 
-def test_the_starts_sd_is_the_gain_times_half_the_range() -> None:
-    posterior = moving()
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(12), 5))
-    expected = theta[:, posterior.prior.names.index("d")] * np.ptp(posterior.only.voltage) / 2
-    np.testing.assert_allclose(posterior.likelihood.start_sd(theta)[:, 0], expected, rtol=1e-12)
-
-
 def test_from_rest_means_a_path_from_zero_volts() -> None:
     """A record from rest at 50 V is one from zero volts whose first samples were not read."""
     usual = short_posterior(samples=200, dynamics="lag", fixed={})

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
-from scipy.stats import kstest, multivariate_normal, norm
+from scipy.stats import multivariate_normal, norm
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
@@ -177,13 +177,6 @@ def test_long_series_lose_no_precision(theta: tuple[float, float, float]) -> Non
     assert_same(expected, got, samples)
 
 
-def test_without_discrepancy_the_noise_is_white() -> None:
-    residual = np.random.default_rng(5).standard_normal((1, 100))
-    expected = WhiteNoise().log_density(np.array([[0.7]]), residual)
-    got = DiscrepancyNoise(0.1).log_density(np.array([[0.7, 0.0, 1.0]]), residual)
-    np.testing.assert_allclose(expected, got, rtol=1e-13)
-
-
 def test_the_correlation_time_is_in_seconds() -> None:
     residual = np.random.default_rng(6).standard_normal((1, 50))
     expected = DiscrepancyNoise(1.0).log_density(np.array([[0.5, 1.0, 20.0]]), residual)
@@ -201,46 +194,6 @@ def test_rows_are_independent(kind: str) -> None:
     together = noise.log_density(theta, residual)
     alone = [noise.log_density(theta[[i]], residual[[i]])[0] for i in range(8)]
     np.testing.assert_array_equal(alone, together)
-
-
-def test_noise_model_goes_by_its_name() -> None:
-    assert noise_model("white", 0.1) == WhiteNoise(0.1)
-    assert noise_model("discrepancy", 0.1) == DiscrepancyNoise(0.1)
-
-
-def test_the_residual_is_not_modified() -> None:
-    residual = np.random.default_rng(8).standard_normal((1, 30))
-    before = residual.copy()
-    DiscrepancyNoise(1.0).log_density(np.array([[0.5, 1.0, 3.0]]), residual)
-    np.testing.assert_array_equal(before, residual)
-
-
-@pytest.mark.parametrize("theta", [(0.5, 1.0, 20.0), (0.01, 1.0, 3.0), (1.0, 0.05, 200.0)])
-def test_whitened_noise_is_white_with_unit_variance(theta: tuple[float, float, float]) -> None:
-    """Kolmogorov-Smirnov and the correlations at lags 1 to 5, four standard errors each."""
-    samples = 20_000
-    series = simulated(np.array(theta), samples, np.random.default_rng(9))
-    noise = DiscrepancyNoise(1.0)
-    (white,), _ = noise.whiten(np.array([theta]), np.stack([series, 2 * series])[np.newaxis])
-    np.testing.assert_allclose(2 * white[0], white[1])
-    assert kstest(white[0], "norm").pvalue > 1e-4
-    for lag in range(1, 6):
-        assert abs(np.mean(white[0, lag:] * white[0, :-lag])) < 4 / np.sqrt(samples)
-
-
-def test_white_noise_that_is_whitened_as_another_is_not_white() -> None:
-    """The twin: the check above notices a discrepancy that is left out."""
-    series = simulated(np.array([0.5, 1.0, 20.0]), 20_000, np.random.default_rng(9))
-    theta = np.array([[1.2, 1e-9, 20.0]])
-    left = DiscrepancyNoise(1.0).whiten(theta, series[np.newaxis, np.newaxis])[0][0, 0]
-    assert abs(np.mean(left[1:] * left[:-1])) > 4 / np.sqrt(left.size)
-
-
-def test_marginal_sds_are_those_of_the_two_parts() -> None:
-    discrepancy, sensor = DiscrepancyNoise(1.0).marginal_sd(np.array([[0.5, 1.5, 3.0]]))
-    assert (1.5, 0.5) == (discrepancy[0], sensor[0])
-    discrepancy, sensor = WhiteNoise().marginal_sd(np.array([[0.5]]))
-    assert (0.0, 0.5) == (discrepancy[0], sensor[0])
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.sampled_from([0.0, 0.1, 0.5]))

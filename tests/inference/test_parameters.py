@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
@@ -223,23 +223,6 @@ def test_draws_have_the_density_that_log_density_says() -> None:
         assert np.max(np.abs(scores)) < 4, scores
 
 
-def test_the_marginal_of_d_is_its_prior_times_the_room_for_alpha() -> None:
-    """P(d) ∝ p(d) F_alpha(d), by quadrature; Kolmogorov-Smirnov at one in 10,000."""
-    priors = {"d": normal(1.0, 0.5), "alpha": Distribution("uniform", {"lower": 0, "upper": 3})}
-    prior = joint([parameter(name, p) for name, p in priors.items()])
-    draws = prior.draw(np.random.default_rng(5), 5000)[:, 0]
-    grid = np.linspace(0, 3, 3001)
-    cumulative = integrate.cumulative_simpson(stats.norm(1, 0.5).pdf(grid) * grid, x=grid)
-    cumulative = np.concatenate([[0], cumulative / cumulative[-1]])
-
-    def distribution(d: FloatArray) -> FloatArray:
-        return np.interp(d, grid, cumulative)
-
-    assert stats.kstest(draws, distribution).pvalue > 1e-4
-    # The twin: the prior of d alone is not the marginal.
-    assert stats.kstest(draws, stats.truncnorm(-2, 4, 1, 0.5).cdf).pvalue < 1e-4
-
-
 def test_bounds_truncate_the_prior() -> None:
     prior = single("offset", normal(0.0, 1.0), lower=0.5, upper=2.0)
     cut = stats.truncnorm(0.5, 2.0)
@@ -320,12 +303,6 @@ def test_priors_that_meet_a_constraint_nowhere_are_refused(fixed: dict[str, floa
     prior = joint_prior(HYSTERESIS, RANGES, fixed)
     with pytest.raises(InputError, match=r"^priors: hardly any draw"):
         prior.draw(np.random.default_rng(8), 10_000)
-
-
-def test_draws_are_the_same_for_the_same_generator() -> None:
-    prior = PRIORS["cut"]
-    one, two = (prior.draw(np.random.default_rng(9), 100) for _ in range(2))
-    np.testing.assert_array_equal(one, two)
 
 
 def test_every_one_of_many_draws_has_a_finite_density() -> None:

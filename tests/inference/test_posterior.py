@@ -101,29 +101,6 @@ def test_samples_outside_the_training_windows_do_not_count() -> None:
     np.testing.assert_array_equal(before, posterior.log_likelihood(theta))
 
 
-def test_windows_share_one_simulation_from_the_first_sample() -> None:
-    """A window's likelihood differs from that of a record that starts with the window."""
-    posterior = short_posterior("white", 150, training=(slice(70, 120),))
-    theta = truth(posterior)
-    whole = short_posterior("white", 150)
-    simulated = whole.simulate(theta)
-    assert (1, 120) == posterior.simulate(theta).shape
-    np.testing.assert_array_equal(simulated[:, :120], posterior.simulate(theta))
-    residual = (whole.only.displacement - simulated)[:, 70:120]
-    expected = WhiteNoise().log_density(theta[:, -1:], residual)
-    np.testing.assert_allclose(expected, posterior.log_likelihood(theta), rtol=1e-12)
-
-
-def test_white_windows_add_up() -> None:
-    theta = truth(short_posterior("white", 150))
-    parts = [
-        short_posterior("white", 150, training=(window,)).log_likelihood(theta)
-        for window in (slice(0, 70), slice(70, 150))
-    ]
-    whole = short_posterior("white", 150).log_likelihood(theta)
-    np.testing.assert_allclose(np.sum(parts, axis=0), whole, rtol=1e-12)
-
-
 def test_fixed_parameters_take_their_value() -> None:
     """The posterior with d fixed is the whole posterior at that d, up to d's prior."""
     whole = short_posterior("white", 100)
@@ -165,20 +142,6 @@ def test_coordinates_that_are_not_numbers_have_no_density() -> None:
     z = np.zeros((3, len(posterior.names)))
     z[1, 2], z[2, 0] = np.nan, np.inf
     assert [True, False, False] == np.isfinite(posterior.log_density(z)).tolist()
-
-
-def test_all_models_outside_have_no_density() -> None:
-    posterior = short_posterior("white", 50)
-    z = np.full((2, len(posterior.names)), 50.0)
-    assert [-np.inf, -np.inf] == posterior.log_density(z).tolist()
-
-
-def test_the_input_is_not_modified() -> None:
-    posterior = short_posterior(samples=50)
-    z = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(4), 5))
-    before = z.copy()
-    posterior.log_density(z)
-    np.testing.assert_array_equal(before, z)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.conflict import around
+from bwbayes.diagnosis.conflict import around
 from bwbayes.inference.pointfit import fit
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution

@@ -14,12 +14,10 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
-from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.pinned import Pinned
-from tests.inference.test_compiled_extrema import COMPILED
 from tests.inference.test_gain_and_creep import GAIN, PARTS
 from tests.inference.test_likelihood import moving
 from tests.inference.test_stages import OPERATORS, models
@@ -45,11 +43,11 @@ def assert_walks_as(actuator: Actuator, theta: FloatArray, voltage: FloatArray, 
 
 @pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
 @pytest.mark.parametrize("hold", ["first", "zero"])
-@pytest.mark.parametrize("gain", [None, GAIN])
+@pytest.mark.parametrize("parts", ["none", *PARTS])
 @pytest.mark.parametrize("count", [1, LANES + 3])
-def test_bouc_wen_walks_as_with_numpy(dynamics: str, hold: Hold, gain: Any, count: int) -> None:
+def test_bouc_wen_walks_as_with_numpy(dynamics: str, hold: Hold, parts: str, count: int) -> None:
     fixed = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
-    posterior = moving("white", dynamics, fixed, hold=hold, parts={"gain": gain})
+    posterior = moving("white", dynamics, fixed, hold=hold, parts=PARTS.get(parts, {}))
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), count))
     only = posterior.only
     assert_walks_as(only.actuator, only.table.actuator(theta), only.voltage, count)
@@ -87,29 +85,17 @@ def test_pinned_walls_walk_as_with_numpy(operator: Pinned, path: str, gain: Any)
         assert (np.abs(begun.to(last) - expected) <= 1e-9 * size).all()
 
 
-@pytest.mark.parametrize("name", COMPILED)
+@pytest.mark.parametrize("name", CASES)
 def test_operators_that_remember_extrema_walk_as_with_numpy(name: str) -> None:
     actuator = Actuator("lag", "first", 1e-3, CASES[name].operator, span=SPAN)
     for voltage in paths().values():
         assert_walks_as(actuator, as_theta(actuator, dict(CASES[name].column)), voltage, 1)
 
 
-@pytest.mark.parametrize(
-    ("operator", "parts", "values"),
-    [
-        (BoucWen(), {"creep": PARTS["creep"]["creep"]}, {}),
-        (BoucWen(passive=False), {}, {"gamma": 0.03}),
-        (BoucWen(), {}, {"exponent": 1.5}),
-    ],
-    ids=["creep", "not passive", "exponent"],
-)
-def test_what_has_no_stage_is_left_to_numpy(
-    operator: Operator, parts: dict[str, Any], values: dict[str, float]
-) -> None:
-    posterior = moving("white", "none", parts={"hysteresis": operator, **parts})
+def test_what_has_no_stage_is_left_to_numpy() -> None:
+    posterior = moving("white", "none", parts={"hysteresis": BoucWen()})
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 3))
     actuator = posterior.only.actuator
     model = posterior.only.table.actuator(theta)
-    for name, value in values.items():
-        model[1, actuator.parameters.index(name)] = value
+    model[1, actuator.parameters.index("exponent")] = 1.5
     assert walk(actuator, model, posterior.only.voltage) is None

@@ -15,7 +15,6 @@ from scipy.integrate import solve_ivp
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.linear import Hold
 from bwbayes.model.registry import DYNAMICS
 from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
@@ -96,22 +95,6 @@ def test_agrees_with_a_slow_simulation(actuator: Actuator, exponent: float) -> N
     assert_close(expected, actuator.displacement(theta, voltage)[0], 1e-8)
 
 
-def test_without_dynamics_displacement_is_the_drive_and_the_offset() -> None:
-    actuator, voltage = Actuator("none"), random_walk(3)
-    h = hysteresis(voltage, VALUES["alpha"], VALUES["beta"], VALUES["gamma"], initial=1.5)
-    np.testing.assert_allclose(
-        actuator.displacement(theta_of(actuator), voltage), 0.7 * voltage - h + 12.0, rtol=1e-12
-    )
-
-
-def test_parameters_are_named_in_the_order_of_the_columns() -> None:
-    hysteretic = ("d", "alpha", "beta", "gamma", "exponent", "initial")
-    assert (*hysteretic, "offset") == Actuator("none").parameters
-    assert (*hysteretic, "lag", "offset") == Actuator("lag").parameters
-    second = (*hysteretic, "mass", "damping", "stiffness", "offset")
-    assert second == Actuator("second-order").parameters
-
-
 @every_kind
 @given(cuts=st.lists(st.integers(1, 149), max_size=6, unique=True))
 @settings(deadline=None, max_examples=15)
@@ -139,34 +122,10 @@ def test_pieces_go_on_from_a_saturated_state(exponent: float) -> None:
 
 
 @every_kind
-def test_a_state_can_be_used_twice(actuator: Actuator) -> None:
-    theta = batch_of(actuator, 3)
-    _, state = actuator.advance(theta, random_walk(6))
-    once, _ = actuator.advance(theta, random_walk(7), state)
-    again, _ = actuator.advance(theta, random_walk(7), state)
-    np.testing.assert_array_equal(once, again)
-
-
-@every_kind
 def test_constant_voltage_leaves_the_actuator_at_rest(actuator: Actuator) -> None:
     for voltage in (np.full(50, 30.0), np.array([30.0])):
         got = actuator.displacement(theta_of(actuator), voltage)[0]
         np.testing.assert_allclose(got, 0.7 * 30 - 1.5 + 12, rtol=1e-14)
-
-
-@every_kind
-def test_after_a_step_the_displacement_settles_on_the_drive(actuator: Actuator) -> None:
-    voltage = np.concatenate([np.zeros(5), np.full(400, 50.0)])
-    at_once = Actuator("none").displacement(theta_of(Actuator("none")), voltage)[0, -1]
-    got = actuator.displacement(theta_of(actuator), voltage)[0, -1]
-    assert pytest.approx(at_once, rel=1e-12) == got
-
-
-@every_kind
-def test_offset_shifts_everything(actuator: Actuator) -> None:
-    low = actuator.displacement(theta_of(actuator, offset=-3.0), random_walk(8))
-    high = actuator.displacement(theta_of(actuator, offset=4.0), random_walk(8))
-    np.testing.assert_allclose(high - low, 7.0, rtol=1e-12)
 
 
 @every_kind
@@ -195,43 +154,6 @@ def test_arguments_stay_as_they_are(actuator: Actuator) -> None:
     np.testing.assert_array_equal(random_walk(11), voltage)
     for one, other in zip(remembered, state.filter, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
-def test_a_held_drive_arrives_half_a_sample_later(dynamics: str) -> None:
-    """On a smooth voltage that is slow against the sampling."""
-    time = np.arange(4000) * 1e-3
-    voltage = 100 * np.sin(2 * np.pi * time)
-    outputs = {}
-    for hold in HOLDS:
-        actuator = Actuator(dynamics, hold, 1e-3)
-        outputs[hold] = actuator.displacement(theta_of(actuator), voltage)[0, 1000:]
-    speed = np.gradient(outputs["first"], 1e-3)
-    delay = (outputs["first"] - outputs["zero"]) @ speed / (speed @ speed)
-    assert pytest.approx(0.5e-3, rel=0.05) == delay
-
-
-@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
-def test_a_finer_sampling_changes_little_and_ever_less(dynamics: str) -> None:
-    """With the first-order hold the error falls with the square of the interval."""
-
-    def sampled(factor: int) -> FloatArray:
-        actuator = Actuator(dynamics, "first", 8e-3 / factor)
-        voltage = 100 * np.sin(2 * np.pi * np.arange(100 * factor + 1) * 8e-3 / factor)
-        return np.asarray(actuator.displacement(theta_of(actuator), voltage)[0, ::factor])
-
-    exact = sampled(64)
-    coarse, fine = (np.abs(sampled(factor) - exact).max() for factor in (1, 4))
-    assert coarse < 0.5
-    assert fine < coarse / 8
-
-
-@pytest.mark.parametrize("hold", HOLDS)
-def test_a_vanishing_mass_is_a_lag_of_damping_over_stiffness(hold: Hold) -> None:
-    second, lag = Actuator("second-order", hold), Actuator("lag", hold)
-    expected = lag.displacement(theta_of(lag, lag=1580.0 / 4.10e5), random_walk(12))
-    got = second.displacement(theta_of(second, mass=1e-12), random_walk(12))
-    assert_close(expected, got, 1e-10)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (1, 9), (2, 7), (1, 2, 8)])

@@ -102,31 +102,6 @@ def test_agrees_with_an_integrator_from_far_outside(
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale(parameters, start))
 
 
-@pytest.mark.parametrize("exponent", EXPONENTS)
-def test_chained_stretches_stay_with_the_integrator(exponent: float) -> None:
-    parameters = (ALPHA, 0.6 * ALPHA, 0.4 * ALPHA, exponent)
-    lengths = np.random.default_rng(1).exponential(1.0, 40)
-    expected = got = 0.2
-    for length in lengths:
-        expected = -integrate(parameters, expected, np.array([length]))[0]
-        got = -advance(parameters, got, np.array([length]))[0]
-        assert expected == pytest.approx(got, abs=1e-10)
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.05, 2.7, 10.0, 50.0])
-def test_many_stretches_equal_the_same_path_cut_into_more(exponent: float) -> None:
-    """Three hundred reversals, each stretch in one piece or in three: the errors do not pile up."""
-    one = flow(ALPHA, 0.7 * ALPHA, 0.6 * ALPHA, exponent)
-    lengths = np.random.default_rng(2).exponential(1.0, 300)
-    whole = cut = np.zeros(1)
-    for length in lengths:
-        whole = -one.advance(whole, np.array([length]))[:, -1]
-        for part in (0.2, 0.5, 0.3):
-            cut = one.advance(cut, np.array([part * length]))[:, -1]
-        cut = -cut
-        assert whole[0] == pytest.approx(cut[0], abs=1e-11)
-
-
 @pytest.mark.parametrize("exponent", [1.0, 1 + 1e-9, 1.05, 1.7, 3.3, 10.0, 50.0])
 def test_inverts_the_hypergeometric_travel_inside_the_ceiling(exponent: float) -> None:
     """v(g) = (g/alpha) 2F1(1, 1/n; 1 + 1/n; (lambda/alpha) g^n), here with G = 1."""
@@ -157,60 +132,6 @@ def test_falls_from_any_height_by_the_hypergeometric_travel(exponent: float, rat
     assert np.all(np.abs(got / height - 1) < 1e-11 + spread)
 
 
-def test_exponent_two_is_tanh_above_zero_and_tan_below() -> None:
-    alpha, beta, gamma = 0.36, 0.03, 0.01
-    up, down = np.sqrt(alpha / (beta + gamma)), np.sqrt(alpha / (beta - gamma))
-    travel = np.linspace(0.0, 60.0, 700)
-    for start in (-1e3, -5.0, -1e-3):
-        zero = down / alpha * np.arctan(-start / down)
-        left, right = np.maximum(zero - travel, 0.0), np.maximum(travel - zero, 0.0)
-        expected = up * np.tanh(right * alpha / up) - down * np.tan(left * alpha / down)
-        got = advance((alpha, beta, gamma, 2.0), start, travel)
-        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * max(up, -start))
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.0 + 1e-9])
-@pytest.mark.parametrize(("beta", "gamma"), [(0.02, 0.01), (0.02, 0.02), (0.02, -0.02), (0.0, 0.0)])
-def test_exponent_one_is_the_exponential(exponent: float, beta: float, gamma: float) -> None:
-    alpha, travel = 0.36, np.linspace(0.0, 150.0, 500)
-    with_up, with_down = (max(c, 1e-100) for c in (beta + gamma, beta - gamma))
-    for start in (0.0, 4.0, 50.0, -4.0, -30.0, -1e6):
-        if start < 0:
-            zero = np.log1p(-start * with_down / alpha) / with_down
-            early, late = np.minimum(travel, zero), np.maximum(travel - zero, 0.0)
-            offset = start * np.exp(-with_down * early) * (travel < zero)
-            offset -= alpha * np.expm1(-with_down * early) / with_down * (travel < zero)
-        else:
-            late, offset = travel, start * np.exp(-with_up * travel)
-        expected = offset - alpha * np.expm1(-with_up * late) / with_up
-        got = advance((alpha, beta, gamma, exponent), start, travel)
-        # n = 1 + 1e-9 is another equation, by a relative 1e-9 times a logarithm.
-        tolerance = 1e-11 + 20 * (exponent - 1.0)
-        np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * max(12, abs(start)))
-
-
-def test_beta_equal_gamma_and_its_opposite_are_limits_not_exceptions() -> None:
-    travel = np.linspace(0.0, 100.0, 300)
-    for sign in (1.0, -1.0):
-        for exponent in (1.0, 1.4, 3.0, 50.0):
-            for start in (-0.9, 0.4):
-                exact = advance((0.3, 0.2, sign * 0.2, exponent), start, travel)
-                for gamma in (0.2 * (1 - 1e-13), 0.2 * (1 + 1e-13) if sign > 0 else 0.2 - 1e-14):
-                    near = advance((0.3, 0.2, sign * gamma, exponent), start, travel)
-                    # Without a ceiling, n = 50 feels even this much where g^n is large.
-                    inside = np.abs(exact) < 1.1
-                    np.testing.assert_allclose(
-                        near[inside], exact[inside], rtol=0, atol=1e-11, err_msg=str(exponent)
-                    )
-
-
-def test_without_a_ceiling_the_rise_is_a_straight_line() -> None:
-    travel = np.linspace(0.0, 150.0, 200)
-    for exponent in (1.0, 1.2, 2.0, 10.0, 50.0):
-        got = advance((0.36, 0.02, -0.02, exponent), 3.0, travel)
-        np.testing.assert_allclose(got, 3.0 + 0.36 * travel, rtol=1e-12)
-
-
 def test_zero_travel_returns_the_start_itself() -> None:
     start = np.array([-1e9, -1.7, -0.2, 0.0, 0.1, 0.999, 5.0, 1e9])
     models = ExponentFlow(
@@ -220,17 +141,6 @@ def test_zero_travel_returns_the_start_itself() -> None:
     np.testing.assert_array_equal(got[:, 0], start)
     np.testing.assert_array_equal(got[:, 1], start)
     np.testing.assert_allclose(got[:, 2], start, rtol=1e-11, atol=1e-11)
-
-
-def test_no_travel_at_all_gives_no_points() -> None:
-    got = flow(0.3, 0.2, 0.1, 2.0).advance(np.zeros(1), np.zeros(0))
-    np.testing.assert_array_equal(got, np.zeros((1, 0)))
-
-
-def test_result_is_the_same_bits_every_time() -> None:
-    travel = np.linspace(0.0, 90.0, 400)
-    first, second = (advance((0.36, 0.03, 0.02, 1.6), -2.0, travel) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
 
 
 Model = tuple[float, float, float, float, float]
@@ -250,7 +160,7 @@ def models(draw: st.DrawFn, largest: float = 1e2, smallest: float = 1e-4) -> Mod
 
 
 @settings(deadline=None, max_examples=100)
-@given(models(), st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+@given(models(), *2 * [st.floats(0.0, 100.0, allow_subnormal=False)])
 def test_two_travels_in_turn_are_their_sum(model: Model, first: float, second: float) -> None:
     *shape, start = model
     one = flow(*shape)

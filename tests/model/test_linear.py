@@ -128,40 +128,6 @@ def test_any_oscillator_agrees_with_the_matrix_exponential(
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * np.abs(walk(60)).max())
 
 
-def step(samples: int) -> FloatArray:
-    """Zero, then one from sample 1 on: (samples,)."""
-    drive = np.ones(samples)
-    drive[0] = 0.0
-    return drive
-
-
-def test_held_step_gives_the_closed_step_responses() -> None:
-    time = np.arange(199) * INTERVAL
-    decay, turn, fast = 200.0, 700.0, 1.2e6
-    natural = np.hypot(decay, turn)
-    responses = {
-        (-decay, -decay): 1 - (1 + decay * time) * np.exp(-decay * time),
-        (-decay, -fast): 1
-        - (fast * np.exp(-decay * time) - decay * np.exp(-fast * time)) / (fast - decay),
-        (-decay + 1j * turn, -decay - 1j * turn): 1
-        - np.exp(-decay * time) * (np.cos(turn * time) + decay / turn * np.sin(turn * time)),
-        (1j * natural, -1j * natural): 1 - np.cos(natural * time),
-    }
-    for poles, expected in responses.items():
-        got = from_rest(oscillator(from_poles(*poles), "zero"), step(200))
-        np.testing.assert_allclose(got[1:], expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("poles", POLES.values(), ids=POLES)
-@pytest.mark.parametrize("hold", HOLDS)
-def test_static_gain_is_one(poles: tuple[complex, complex], hold: Hold) -> None:
-    """Up to the coefficients' rounding, which slow poles magnify."""
-    recursion = oscillator(from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL), hold)
-    gain = recursion.numerator.sum() / recursion.denominator.sum()
-    fading = abs((1 - np.exp(poles[0])) * (1 - np.exp(poles[1])))
-    assert pytest.approx(1.0, abs=1e-15 + 1e-15 / fading) == gain
-
-
 @pytest.mark.parametrize("lag", [1e-9, 1e-5, 4e-4, 1e-3, 3.85e-3, 0.5, 1e4])
 def test_lag_agrees_with_the_matrix_exponential(lag: float) -> None:
     rate = np.array([[-1 / lag, 1 / lag, 0], [0, 0, 1.0], [0, 0, 0]])
@@ -169,17 +135,6 @@ def test_lag_agrees_with_the_matrix_exponential(lag: float) -> None:
         expected = by_matrix_exponential(rate, hold, walk())
         got = from_rest(first_order_lag(np.array([lag]), INTERVAL, hold), walk())
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
-
-
-def test_lag_step_responses() -> None:
-    lag, count = 3.85e-3, np.arange(100)
-    held = from_rest(first_order_lag(np.array([lag]), INTERVAL, "zero"), step(101))
-    np.testing.assert_allclose(held[1:], -np.expm1(-count * INTERVAL / lag), rtol=0, atol=1e-14)
-    # Between samples 0 and 1 the first-order hold is a ramp; from there on an exponential.
-    first = lag / INTERVAL * -np.expm1(-INTERVAL / lag)
-    ramped = from_rest(first_order_lag(np.array([lag]), INTERVAL, "first"), step(101))
-    expected = 1 - first * np.exp(-count * INTERVAL / lag)
-    np.testing.assert_allclose(ramped[1:], expected, rtol=0, atol=1e-14)
 
 
 def test_without_a_lag_the_output_is_the_drive_as_it_is_held() -> None:

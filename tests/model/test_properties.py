@@ -1,12 +1,7 @@
-"""What the hysteresis model promises of any model, any start and any path of the voltage.
-
-An engine is a function with the arguments and the result of
-:func:`bwbayes.model.boucwen.hysteresis`; every promise here holds for each of ``ENGINES``.
-"""
+"""What the hysteresis model promises of any model, any start and any path of the voltage."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -18,18 +13,10 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.boucwen import ceiling, hysteresis
 from tests.model.references import Model
 
-Engine = Callable[..., FloatArray]
-
-ENGINES: dict[str, Engine] = {"numpy": hysteresis}
 TABLE_1 = Model(0.3575, 0.0272, 0.0172)
 NODES, WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(12))
 
 few = settings(deadline=None, max_examples=60)
-
-
-@pytest.fixture(scope="module", params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> Engine:
-    return ENGINES[request.param]
 
 
 def of(top: float, ratio: float, exponent: float, alpha: float) -> Model:
@@ -50,7 +37,6 @@ def models(
 every_ratio = st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 20))
 passive_ratio = st.one_of(st.sampled_from([0.0, 1.0]), st.floats(0, 20))
 any_model = models(every_ratio)
-linear_model = models(every_ratio, (1.0,))
 corners = st.lists(st.floats(-100, 100).map(lambda u: round(u, 6)), min_size=2, max_size=8)
 inside = st.floats(-1, 1)
 
@@ -72,11 +58,11 @@ def refined(path: list[float], pieces: list[int]) -> tuple[FloatArray, list[int]
 @given(parameters=any_model, share=inside, path=corners)
 @example(parameters=of(1.0, -1.0, 1.0, 1.0), share=1.0, path=[0.0, 0.0])
 def test_the_mirrored_drive_and_start_give_mirrored_h(
-    engine: Engine, parameters: Model, share: float, path: list[float]
+    parameters: Model, share: float, path: list[float]
 ) -> None:
     start, voltage = share * top_of(parameters), np.array(path)
-    expected = -engine(voltage, *parameters, initial=start)
-    np.testing.assert_array_equal(expected, engine(-voltage, *parameters, initial=-start))
+    expected = -hysteresis(voltage, *parameters, initial=start)
+    np.testing.assert_array_equal(expected, hysteresis(-voltage, *parameters, initial=-start))
 
 
 @few
@@ -87,12 +73,12 @@ def test_the_mirrored_drive_and_start_give_mirrored_h(
     holds=st.lists(st.integers(1, 4), min_size=8, max_size=8),
 )
 def test_h_does_not_depend_on_the_pace(
-    engine: Engine, parameters: Model, share: float, path: list[float], holds: list[int]
+    parameters: Model, share: float, path: list[float], holds: list[int]
 ) -> None:
     """Waiting at any sample, even within a stretch, changes nothing after it."""
     start, repeats = share * top_of(parameters), np.array(holds[: len(path)])
-    expected = engine(np.array(path), *parameters, initial=start)[0]
-    held = engine(np.repeat(path, repeats), *parameters, initial=start)[0]
+    expected = hysteresis(np.array(path), *parameters, initial=start)[0]
+    held = hysteresis(np.repeat(path, repeats), *parameters, initial=start)[0]
     np.testing.assert_allclose(
         held, np.repeat(expected, repeats), rtol=0, atol=1e-12 * top_of(parameters)
     )
@@ -106,12 +92,12 @@ def test_h_does_not_depend_on_the_pace(
     pieces=st.lists(st.integers(1, 9), min_size=7, max_size=7),
 )
 def test_refining_the_drive_changes_nothing(
-    engine: Engine, parameters: Model, share: float, path: list[float], pieces: list[int]
+    parameters: Model, share: float, path: list[float], pieces: list[int]
 ) -> None:
     start = share * top_of(parameters)
     fine, places = refined(path, pieces)
-    expected = engine(np.array(path), *parameters, initial=start)[0]
-    got = engine(fine, *parameters, initial=start)[0][places]
+    expected = hysteresis(np.array(path), *parameters, initial=start)[0]
+    got = hysteresis(fine, *parameters, initial=start)[0][places]
     tolerance = 1e-10 * growth(parameters, path) * top_of(parameters)
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
 
@@ -131,10 +117,10 @@ def growth(parameters: Model, path: list[float]) -> float:
 @few
 @given(parameters=any_model, share=inside, path=corners)
 def test_h_stays_below_the_ceiling_from_any_start_inside(
-    engine: Engine, parameters: Model, share: float, path: list[float]
+    parameters: Model, share: float, path: list[float]
 ) -> None:
     top = top_of(parameters)
-    h = engine(np.array(path), *parameters, initial=share * top)
+    h = hysteresis(np.array(path), *parameters, initial=share * top)
     assert np.isfinite(h).all()
     assert np.abs(h).max() <= top * (1 + 1e-11)
 
@@ -142,13 +128,13 @@ def test_h_stays_below_the_ceiling_from_any_start_inside(
 @few
 @given(batch=st.lists(st.tuples(any_model, inside), min_size=2, max_size=9), path=corners)
 def test_a_row_does_not_depend_on_its_batch(
-    engine: Engine, batch: list[tuple[Model, float]], path: list[float]
+    batch: list[tuple[Model, float]], path: list[float]
 ) -> None:
     starts = [share * top_of(parameters) for parameters, share in batch]
-    columns = np.array([parameters for parameters, _ in batch]).T
-    together = engine(np.array(path), *columns, initial=np.array(starts))
+    alpha, beta, gamma, exponent = np.array([parameters for parameters, _ in batch]).T
+    together = hysteresis(np.array(path), alpha, beta, gamma, exponent, np.array(starts))
     for (parameters, _), start, row in zip(batch, starts, together, strict=True):
-        alone = engine(np.array(path), *parameters, initial=start)[0]
+        alone = hysteresis(np.array(path), *parameters, initial=start)[0]
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-12 * top_of(parameters))
 
 
@@ -161,7 +147,6 @@ def test_a_row_does_not_depend_on_its_batch(
     length=st.floats(1e-3, 1e3),
 )
 def test_units_do_not_matter(
-    engine: Engine,
     parameters: Model,
     share: float,
     path: list[float],
@@ -171,9 +156,9 @@ def test_units_do_not_matter(
     """In other units of voltage and length the numbers differ, and h is the same displacement."""
     alpha, beta, gamma, n = parameters
     start, rate = share * top_of(parameters), length ** (1 - n) / volts
-    expected = length * engine(np.array(path), *parameters, initial=start)
+    expected = length * hysteresis(np.array(path), *parameters, initial=start)
     other = Model(alpha * length / volts, beta * rate, gamma * rate, n)
-    got = engine(volts * np.array(path), *other, initial=length * start)
+    got = hysteresis(volts * np.array(path), *other, initial=length * start)
     tolerance = 1e-10 * growth(parameters, path) * length * top_of(parameters)
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
 
@@ -181,7 +166,7 @@ def test_units_do_not_matter(
 # Energy
 
 
-def dissipated(engine: Engine, parameters: Model, start: float, path: list[float]) -> FloatArray:
+def dissipated(parameters: Model, start: float, path: list[float]) -> FloatArray:
     """∫ h du − Δ(h²)/(2α) along pieces of every stretch, in um V, for n = 1.
 
     The pieces end where the voltage turns and where h changes its sign, and besides are short
@@ -192,7 +177,7 @@ def dissipated(engine: Engine, parameters: Model, start: float, path: list[float
         edges = before + np.unique(travels(parameters, h, after - before)) * np.sign(after - before)
         inner = edges[:-1, np.newaxis] + np.diff(edges)[:, np.newaxis] * (NODES + 0.5)
         drive = np.concatenate([edges[:1], np.hstack([inner, edges[1:, np.newaxis]]).ravel()])
-        values = engine(drive, *parameters, initial=h)[0]
+        values = hysteresis(drive, *parameters, initial=h)[0]
         grid = values[1:].reshape(-1, NODES.size + 1)
         ends = np.concatenate([values[:1], grid[:, -1]])
         supplied = np.diff(edges) * (grid[:, :-1] @ WEIGHTS)
@@ -221,25 +206,16 @@ def travels(parameters: Model, h: float, change: float) -> FloatArray:
     path=st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=8),
 )
 def test_no_path_draws_energy_from_a_passive_model(
-    engine: Engine, parameters: Model, share: float, path: list[float]
+    parameters: Model, share: float, path: list[float]
 ) -> None:
     """Not even a piece of one, whatever its start: the loss is ∫ c h² |du| / α with c ≥ 0."""
-    parts = dissipated(engine, parameters, share * top_of(parameters), path)
+    parts = dissipated(parameters, share * top_of(parameters), path)
     size = 9 * top_of(parameters) ** 2 / parameters.alpha
     assert parts.min(initial=0) >= -1e-10 * (size + 200 * top_of(parameters))
 
 
-def test_gamma_above_beta_is_not_passive(engine: Engine) -> None:
-    assert dissipated(engine, Model(0.3575, 0.01, 0.03), -7.0, [0.0, 10.0]).sum() < -2.0
-
-
-def test_a_settled_loop_dissipates_its_area(engine: Engine) -> None:
-    path = [0.0, *[50.0, -50.0] * 20]
-    lost = [dissipated(engine, TABLE_1, 0.0, part).sum() for part in (path[:-2], path)]
-    start = engine(np.array(path), *TABLE_1)[0, -1]
-    loop, _ = refined([-50.0, 50.0, -50.0], [100_000] * 2)
-    area = np.trapezoid(engine(loop, *TABLE_1, initial=start)[0], loop)
-    assert pytest.approx(area, rel=1e-8) == lost[1] - lost[0]
+def test_gamma_above_beta_is_not_passive() -> None:
+    assert dissipated(Model(0.3575, 0.01, 0.03), -7.0, [0.0, 10.0]).sum() < -2.0
 
 
 # Memory. A Preisach model returns to the point where a minor loop began, and goes on as if it had
@@ -252,14 +228,12 @@ def test_a_settled_loop_dissipates_its_area(engine: Engine) -> None:
     far=st.floats(-3, 3),
     width=st.floats(0, 2),
 )
-def test_without_beta_a_minor_loop_closes(
-    engine: Engine, parameters: Model, far: float, width: float
-) -> None:
+def test_without_beta_a_minor_loop_closes(parameters: Model, far: float, width: float) -> None:
     turn = far - np.copysign(width, far)
     path = (
         top_of(parameters) / parameters.alpha / parameters.exponent * np.array([0, far, turn, far])
     )
-    h = engine(path, *parameters)[0]
+    h = hysteresis(path, *parameters)[0]
     tolerance = 1e-11 * growth(parameters, path.tolist()) * top_of(parameters)
     assert h[3] == pytest.approx(h[1], abs=tolerance)
 
@@ -271,11 +245,11 @@ def test_without_beta_a_minor_loop_closes(
     travel=st.floats(0, 100),
 )
 def test_the_trace_of_the_past_fades_with_the_travel(
-    engine: Engine, parameters: Model, shares: tuple[float, float], travel: float
+    parameters: Model, shares: tuple[float, float], travel: float
 ) -> None:
     """By exp(−(β + γ) v) after a voltage travel v, once h has the direction of the travel."""
     starts = np.array(shares) * top_of(parameters)
-    h = engine(np.array([3.0, 3.0 + travel]), *parameters, initial=starts)[:, -1]
+    h = hysteresis(np.array([3.0, 3.0 + travel]), *parameters, initial=starts)[:, -1]
     expected = (starts[1] - starts[0]) * np.exp(-(parameters.beta + parameters.gamma) * travel)
     assert expected == pytest.approx(h[1] - h[0], abs=1e-13 * top_of(parameters))
 
@@ -283,32 +257,19 @@ def test_the_trace_of_the_past_fades_with_the_travel(
 @few
 @given(parameters=models(passive_ratio, (1.0,)), share=inside, width=st.floats(1, 20))
 def test_minor_loops_drift_until_they_are_symmetric_about_zero(
-    engine: Engine, parameters: Model, share: float, width: float
+    parameters: Model, share: float, width: float
 ) -> None:
     """Whatever the bias that they began with; a width counts in units of 1/(β + γ)."""
     bottom, top = 10.0, 10.0 + width / (parameters.beta + parameters.gamma)
     path = np.array([bottom, *[top, bottom] * 60])
-    h = engine(path, *parameters, initial=share * top_of(parameters))[0]
+    h = hysteresis(path, *parameters, initial=share * top_of(parameters))[0]
     assert h[-2] > 0
     assert -h[-2] == pytest.approx(h[-1], rel=1e-9)
 
 
-def test_a_minor_loop_of_the_ring_bender_misses_its_beginning_by_a_micrometre(
-    engine: Engine,
-) -> None:
-    """20 V to 80 V and back lowers h by 0.97 um, then by ever less; of that 41 % last 20 V on."""
-    h = engine(np.array([0.0, 80.0, *[20.0, 80.0] * 12]), *TABLE_1)[0]
-    gaps = np.diff(h[1::2])
-    assert pytest.approx(-0.972087, rel=1e-5) == gaps[0]
-    assert np.abs(gaps[-3:]).max() < 1e-13
-    straight = engine(np.array([0.0, 80.0, 100.0]), *TABLE_1)[0, -1]
-    detour = engine(np.array([0.0, 80.0, 20.0, 80.0, 100.0]), *TABLE_1)[0, -1]
-    assert pytest.approx(-0.972087 * np.exp(-0.0444 * 20), rel=1e-5) == detour - straight
-
-
-def test_minor_loops_settle_by_the_same_part_every_round(engine: Engine) -> None:
+def test_minor_loops_settle_by_the_same_part_every_round() -> None:
     """By exp(−2 ((β − γ) v₀ + (β + γ) (w − v₀))): width w, of which v₀ leads from −h to zero."""
-    h = engine(np.array([0.0, 80.0, *[20.0, 80.0] * 12]), *TABLE_1)[0]
+    h = hysteresis(np.array([0.0, 80.0, *[20.0, 80.0] * 12]), *TABLE_1)[0]
     gaps = np.diff(h[1::2])
     against, ahead = TABLE_1.beta - TABLE_1.gamma, TABLE_1.beta + TABLE_1.gamma
     to_zero = np.log1p(h[-1] * against / TABLE_1.alpha) / against

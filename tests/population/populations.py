@@ -10,8 +10,6 @@ from scipy import stats
 from bwbayes.arrays import FloatArray
 from bwbayes.population.specimen import Specimen
 
-__all__ = ["Drawn", "covered", "drawn", "normal_specimen"]
-
 SPECIMENS = 8
 NAME = "gain"
 

@@ -13,7 +13,7 @@ from bwbayes.errors import InputError
 from bwbayes.population import population as module
 from bwbayes.population.next_specimen import next_specimen
 from bwbayes.population.normal import Hyperprior, spreads
-from bwbayes.population.population import Spread, population
+from bwbayes.population.population import PopulationParameter, population
 from bwbayes.population.specimen import Specimen, likelihoods, shared, specimen_of
 from tests.inference.problems import short_posterior
 from tests.measured import keep
@@ -22,7 +22,7 @@ from tests.population.populations import NAME, covered, drawn, normal_specimen
 QUICK, SLOW = 40, 100
 
 
-def of(specimens: list[Specimen], seed: int = 1) -> Spread:
+def of(specimens: list[Specimen], seed: int = 1) -> PopulationParameter:
     return population(specimens, np.random.default_rng(seed)).parameters[NAME]
 
 
@@ -114,7 +114,7 @@ def test_a_specimen_off_the_population_is_an_outlier_and_taken_for_normal() -> N
 def test_without_trust_in_weights_all_are_taken_for_normal(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = drawn(np.random.default_rng(8), 0.3, 0.15)
     monkeypatch.setattr(
-        module, "_smoothed", lambda logs: (np.full(logs.size, -np.log(logs.size)), 2.0)
+        module, "smoothed_weights", lambda logs: (np.full(logs.size, 1 / logs.size), 2.0)
     )
     result = of(truth.specimens)
     assert all(one.normal for one in result.specimens.values())

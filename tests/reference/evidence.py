@@ -19,8 +19,6 @@ import numpy as np
 from tests.reference.make import compiled, digest, from_cube
 from tests.reference.plain import FOLDER, Case, Floats, inside, load_case, log_likelihood
 
-__all__ = ["main"]
-
 LIVE, RUNS = 1000, 4
 
 

@@ -35,8 +35,6 @@ from tests.reference.plain import (
     log_likelihood,
 )
 
-__all__ = ["digest", "from_cube", "main", "statistics"]
-
 # The measured record leaves the discrepancy's time a long tail, which takes more.
 RUNS = MappingProxyType({"virtual": 2, "measured": 4})
 LIVE = 500

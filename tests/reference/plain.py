@@ -21,21 +21,6 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import expm
 
-__all__ = [
-    "FOLDER",
-    "MEASURED",
-    "PLAIN",
-    "Case",
-    "Loops",
-    "dynamics",
-    "hysteresis",
-    "kalman",
-    "load_case",
-    "log_likelihood",
-    "log_prior",
-    "simulate",
-]
-
 Floats = NDArray[np.float64]
 
 FOLDER = Path(__file__).resolve().parent

@@ -23,8 +23,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results.bands import KINDS, Bands, Kind
+from bwbayes.results.causes import LEAD_IN_ALARM
 from bwbayes.results.prediction import Start, predict_record
-from bwbayes.results.verdict import LEAD_IN_ALARM
 from tests.inference.problems import posterior_of
 
 __all__ = [

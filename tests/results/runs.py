@@ -18,20 +18,20 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.predictions import Swallowed
-from bwbayes.app.running.run import assemble, judged, versions
+from bwbayes.app.running.assembling import assemble
+from bwbayes.app.running.explaining import explained
+from bwbayes.app.running.fingerprint import versions
+from bwbayes.app.running.predictions import judged
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.inference import pointfit
+from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.bands import Bands
-from bwbayes.results.drift import drifted
-from bwbayes.results.innovations import innovations
 from bwbayes.results.prediction import predict_record, predict_windows
 from bwbayes.results.result import Result
-from bwbayes.results.transient import swallowed
 from bwbayes.results.verdict import Background, Verdict
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
@@ -119,17 +119,21 @@ def problem_of(text: str, folder: Path) -> Problem:
     return resolve(parse(text, "config"), folder)
 
 
-def posterior_draws(posterior: Posterior, source: np.random.Generator) -> FloatArray:
+def posterior_draws(
+    posterior: Posterior, source: np.random.Generator
+) -> tuple[PointFit, FloatArray]:
     """Fit, and draw (KEPT, free) in the parameters' own units."""
-    draws, weights = weighted_draws(posterior, source)
-    return draws[source.choice(len(draws), KEPT, p=weights)]
+    point = pointfit.fit(posterior, source)
+    draws, weights = weighted_draws(posterior, source, point)
+    return point, draws[source.choice(len(draws), KEPT, p=weights)]
 
 
 def weighted_draws(
-    posterior: Posterior, source: np.random.Generator
+    posterior: Posterior, source: np.random.Generator, point: PointFit | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit, and return draws (draws, free) in the parameters' own units and weights (draws,)."""
-    point = pointfit.fit(posterior, source)
+    """Return draws (draws, free) in the parameters' own units and weights (draws,)."""
+    if point is None:
+        point = pointfit.fit(posterior, source)
     random = np.random.RandomState(source.bit_generator)
     proposal = StudentMixture.around(point.optima, *pointfit.peaks(posterior, point))
     for _ in range(ROUNDS):
@@ -169,10 +173,10 @@ def _tried(
 def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) -> Judged:
     """Fit, predict all that the config names, and judge it.
 
-    Without a second fit (``again``) only the verdict on the training window is another one.
+    Without explanations (``again``) only the verdict on the training window is another one.
     """
     posterior, record = problem.posterior, problem.record
-    draws = posterior_draws(posterior, source)
+    point, draws = posterior_draws(posterior, source)
     windows = {"training": posterior.only.training}
     windows |= {name: v.windows for name, v in problem.validations.items() if v.windows}
     bands = predict_windows(posterior, draws, record, windows, source)
@@ -184,14 +188,14 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
-    odd = innovations(posterior, best, record.start)
-    seen = any(one.kind == "switch-on transient" for one in problem.findings["record"])
-    transient = swallowed(posterior, draws, source, record.start, seen=seen) if again else None
-    drift = drifted(posterior, draws, source) if again else None
     background = Background.of(posterior, draws)
-    verdicts = judged(
-        problem, bands, background, {"record": odd}, {"record": Swallowed(transient, drift)}
-    )
+    verdicts = judged(problem, bands, background, {})
+    if again:
+        failed = verdicts["training"].holds is False
+        places = posterior.prior.unconstrain(best[np.newaxis])
+        places = np.concatenate([places, point.optima])
+        found = explained(problem, "record", places, thorough=failed)
+        verdicts = judged(problem, bands, background, {"record": found})
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 
 

@@ -12,7 +12,7 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.agreement import Agreement, _cost, agreements, numbers, remarks
+from bwbayes.results.agreement import Agreement, _cost, agreements, disagreements, numbers
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
 from tests.inference.test_solvable import linear_posterior
@@ -42,7 +42,7 @@ def compared(posterior: Posterior) -> dict[str, Agreement]:
 
 def test_records_of_one_actuator_agree() -> None:
     every = compared(pair(1))
-    assert [] == remarks(every)
+    assert [] == [*disagreements(every)]
     assert all(one.degrees > 0 for one in every.values())
     assert all(one.p_value > 1e-3 for one in every.values())
     assert all(set(one) >= {"agrees", "p_value"} for one in numbers(every).values())  # type: ignore[call-overload]
@@ -51,8 +51,8 @@ def test_records_of_one_actuator_agree() -> None:
 def test_a_record_with_another_gain_is_named() -> None:
     """A tenth more, a mounting that slips: the remark says what is off, and what to do."""
     every = compared(pair(1, gain=1.1))
-    lines = remarks(every)
-    assert any(line.startswith("r1: does not agree with the other records: ") for line in lines)
+    lines = [*map(str, disagreements(every))]
+    assert any(line.startswith("r1: is inconsistent with the other records: ") for line in lines)
     assert every["r1"].joint_um > every["r1"].own_um
     assert any("model.per_record" in line for line in lines)
 
@@ -60,7 +60,9 @@ def test_a_record_with_another_gain_is_named() -> None:
 def test_a_record_with_another_noise_is_named_and_no_other() -> None:
     every = compared(pair(1, noise=1.5))
     assert ["r1"] == [name for name, one in every.items() if one.noisier and one.size > 1]
-    assert any(line.startswith("r1: has another noise") for line in remarks(every))
+    assert any(
+        line.startswith("r1: has another noise") for line in [*map(str, disagreements(every))]
+    )
 
 
 def test_one_record_alone_has_nothing_to_agree_with() -> None:
@@ -72,7 +74,7 @@ def test_one_record_alone_has_nothing_to_agree_with() -> None:
 def test_a_record_whose_posterior_is_bent_agrees(seed: int) -> None:
     """Of two hundred sound records these have the largest distances between means, 25 and 40."""
     every = compared(pair(seed))
-    assert [] == remarks(every)
+    assert [] == [*disagreements(every)]
     assert all(one.p_value > 1e-3 for one in every.values())
 
 
@@ -99,7 +101,7 @@ def test_false_alarms_are_as_rare_as_they_should_be() -> None:
     p = np.array([[one.p_value for one in both.values()] for both in every])
     beyond = float(np.mean(p < 0.05))
     alarms = sum(one.disagrees for both in every for one in both.values())
-    named = [bool(remarks(compared(pair(seed, gain=1.1)))) for seed in range(20)]
+    named = [any(disagreements(compared(pair(seed, gain=1.1)))) for seed in range(20)]
     keep(
         "joint fits: records that agree",
         {

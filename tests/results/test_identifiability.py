@@ -14,7 +14,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Sine, Waveform, identification_signal, verification_signal
+from bwbayes.data.waveforms import Sine, Waveform, signal
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
@@ -27,6 +27,12 @@ Discrepancy = Literal["none", "process", "structural"]
 
 
 RATES = [250.0, pytest.param(1000.0, marks=pytest.mark.slow)]
+
+
+def combinations(posterior: Posterior, point: PointFit) -> list[str]:
+    """Name the combinations that a record does not determine."""
+    draws = posterior.prior.draw(np.random.default_rng(1), 400)
+    return [finding.text.split(":")[0] for finding in undetermined(posterior, point, draws)]
 
 
 def measured(
@@ -58,14 +64,14 @@ def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
 @pytest.mark.parametrize("rate", RATES)
 def test_at_the_mode_of_a_fit_one_sine_leaves_gamma_open(rate: float) -> None:
     posterior = measured(sine(50.0, 1.0), rate=rate)
-    result = undetermined(posterior, fit(posterior, np.random.default_rng(1)))
+    result = combinations(posterior, fit(posterior, np.random.default_rng(1)))
     assert any("gamma" in text for text in result), result
 
 
 @pytest.mark.parametrize("rate", RATES)
 def test_at_the_mode_of_a_fit_decaying_amplitudes_leave_nothing_open(rate: float) -> None:
-    posterior = measured(identification_signal(), rate=rate)
-    assert [] == undetermined(posterior, fit(posterior, np.random.default_rng(1)))
+    posterior = measured(signal("identification"), rate=rate)
+    assert [] == combinations(posterior, fit(posterior, np.random.default_rng(1)))
 
 
 @pytest.mark.parametrize("discrepancy", ["none", "process", "structural"])
@@ -75,7 +81,7 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
     amplitude: float, frequency: float, discrepancy: Discrepancy
 ) -> None:
     posterior = measured(sine(amplitude, frequency), discrepancy)
-    result = undetermined(posterior, at_truth(posterior))
+    result = combinations(posterior, at_truth(posterior))
     assert 1 == len(result)
     assert "gamma" in result[0]
 
@@ -83,8 +89,8 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("discrepancy", ["none", "process", "structural"])
 def test_decaying_amplitudes_leave_nothing_open(discrepancy: Discrepancy, seed: int) -> None:
-    posterior = measured(identification_signal(), discrepancy, seed)
-    assert [] == undetermined(posterior, at_truth(posterior))
+    posterior = measured(signal("identification"), discrepancy, seed)
+    assert [] == combinations(posterior, at_truth(posterior))
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.03])
@@ -112,8 +118,8 @@ def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float)
 def test_decaying_amplitudes_leave_less_open_than_a_sine_the_more_of_them_the_less() -> None:
     """The verification signal has four amplitudes besides its largest, the other twenty."""
     constant = left(measured(sine(100.0, 0.1, periods=4.0)))
-    four = left(measured(verification_signal()))
-    twenty = left(measured(identification_signal()))
+    four = left(measured(signal("verification")))
+    twenty = left(measured(signal("identification")))
     assert (four < 0.9 * constant).all()
     assert (twenty < 0.9 * four).all()
 
@@ -175,16 +181,16 @@ def test_a_known_loop_has_nothing_open() -> None:
     known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
     posterior = short_posterior(samples=60, fixed=known)
     assert "offset" in posterior.names
-    assert [] == undetermined(posterior, at_truth(posterior))
+    assert [] == combinations(posterior, at_truth(posterior))
 
 
 def test_a_loop_with_one_free_parameter_is_named_after_it() -> None:
     known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "initial": 0.0}
     usual = short_posterior(samples=60, fixed=known)
-    assert ["gamma"] == undetermined(at_rest(usual), at_truth(usual))
+    assert ["gamma"] == combinations(at_rest(usual), at_truth(usual))
 
 
 def test_without_physical_parameters_nothing_is_open() -> None:
     known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
     posterior = short_posterior(samples=60, fixed={**known, "offset": 0.0})
-    assert [] == undetermined(posterior, at_truth(posterior))
+    assert [] == combinations(posterior, at_truth(posterior))

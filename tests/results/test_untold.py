@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.waveforms import identification_signal
-from bwbayes.inference.conflict import around
+from bwbayes.data.waveforms import signal
+from bwbayes.diagnosis.conflict import around
+from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
-from bwbayes.results.identifiability import percent, remarks, sway
+from bwbayes.results.identifiability import percent, sway, undetermined
 from tests.inference.problems import decaying_sine, posterior_of, ring_bender, short_posterior
 from tests.results.test_identifiability import at_truth, measured, sine
 
@@ -59,10 +60,10 @@ def test_where_the_wider_prior_leads_away_from_all_draws_nothing_is_told() -> No
     assert result.decides
 
 
-def judged(posterior: Posterior) -> list[str]:
+def judged(posterior: Posterior) -> list[Finding]:
     generator = np.random.default_rng(1)
     point = fit(posterior, generator)
-    return remarks(posterior, point, around(posterior.prior, point, generator))
+    return [*undetermined(posterior, point, around(posterior.prior, point, generator))]
 
 
 def near_truth(posterior: Posterior, spread: float = 0.05) -> tuple[PointFit, FloatArray]:
@@ -74,10 +75,10 @@ def near_truth(posterior: Posterior, spread: float = 0.05) -> tuple[PointFit, Fl
 @pytest.mark.parametrize(("amplitude", "periods"), [(50.0, 3.0), (100.0, 4.0), (20.0, 3.0)])
 def test_steady_sine_is_told_to_vary_its_amplitude(amplitude: float, periods: float) -> None:
     posterior = measured(sine(amplitude, 1.0, periods), rate=250.0)
-    (remark, *_) = remarks(posterior, *near_truth(posterior))
-    assert remark.startswith("the record does not determine gamma")
-    assert "% of the prior's sd left, next alpha" in remark
-    assert "; vary the amplitude: let it decay to a tenth over ten periods" in remark
+    (finding, *_) = undetermined(posterior, *near_truth(posterior))
+    assert finding.text.startswith("gamma")
+    assert "% of the prior's SD remains (next alpha" in finding.text
+    assert finding.fix == "vary the amplitude: let it decay to a tenth over ten periods"
 
 
 def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
@@ -88,14 +89,16 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     small = posterior_of(
         posterior.only.voltage, posterior.only.displacement, actuator, "discrepancy", fixed
     )
-    (remark,) = remarks(small, *near_truth(small))
-    assert remark.startswith("the record does not determine alpha with d against beta: ")
-    assert remark.endswith("drive over more than 20 V peak to peak, if the actuator allows it")
+    (finding,) = undetermined(small, *near_truth(small))
+    assert finding.text.startswith("alpha with d against beta: ")
+    assert finding.fix.startswith(
+        "drive over more than 20 V peak to peak, if the actuator allows it"
+    )
 
 
 def test_decaying_amplitudes_need_no_words() -> None:
-    posterior = measured(identification_signal(), rate=250.0)
-    assert [] == remarks(posterior, *near_truth(posterior))
+    posterior = measured(signal("identification"), rate=250.0)
+    assert [] == [*undetermined(posterior, *near_truth(posterior))]
 
 
 @pytest.mark.parametrize(
@@ -118,10 +121,10 @@ def test_prior_that_decides_is_said_to(amplitude: float, said: str) -> None:
     posterior = posterior_of(
         voltage, displacement, usual.only.actuator, "white", known, priors=priors
     )
-    remark = judged(posterior)[0]
-    assert said in remark
+    finding = judged(posterior)[0]
+    assert said in finding.text
     asked = "drive the actuator up and down several times" if amplitude > 20 else "drive over more"
-    assert asked in remark
+    assert asked in finding.fix
 
 
 def test_no_more_than_all_of_a_prior_is_left() -> None:
@@ -132,4 +135,4 @@ def test_no_more_than_all_of_a_prior_is_left() -> None:
 def test_known_loop_needs_no_words() -> None:
     known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
     posterior = short_posterior(samples=60, fixed=known)
-    assert [] == remarks(posterior, *near_truth(posterior))
+    assert [] == [*undetermined(posterior, *near_truth(posterior))]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.results.bands import LeadIn, Switched
+from bwbayes.results.bands import LeadIn
 from bwbayes.results.verdict import Background, Verdict, assess
 from tests.results.records import Made, bands_of, made
 
@@ -111,7 +111,7 @@ SPOILT: dict[str, Spoil] = {
 
 @pytest.mark.parametrize("kind", SPOILT)
 def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
-    """None of 50 is missed, and the cause is the right one in at least 45."""
+    """None of 50 is missed, and the cause is right or tied in at least 45."""
     causes = []
     for number in range(50):
         generator = np.random.default_rng([7, number])
@@ -127,9 +127,9 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
         assert verdict.holds is False, number
         assert verdict.reasons
         assert verdict.cause is not None
-        assert verdict.cause.remedy in verdict.line
-        causes.append(verdict.cause.kind)
-    assert causes.count(kind) >= 45  # type: ignore[arg-type]
+        assert verdict.cause.fix in verdict.line
+        causes.append(kind in verdict.cause.kind.split(" or "))
+    assert sum(causes) >= 45
 
 
 def test_readings_that_go_the_other_way_do_not_hold_even_if_a_strange_fit_follows() -> None:
@@ -231,23 +231,7 @@ def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
     assert verdict.holds is False
     assert verdict.cause is not None
     assert "lead-in" == verdict.cause.kind
-    assert "--lead-in-from" in verdict.cause.remedy
-
-
-@pytest.mark.parametrize(("size", "named"), [(7.35, False), (3.0, True)])
-def test_no_transient_is_named_that_is_far_larger_than_any_residual(
-    size: float, named: bool
-) -> None:
-    record = made(np.random.default_rng(3), 60, 0.01, 0.1, 0.3, 0.1, 0.03)
-    bands = replace(bands_of(record), scored_from=100)
-    assert bands.measured is not None
-    largest = float(np.max(np.abs(bands.measured - bands.mean)[100:]))
-    transient = Switched(size * largest / 1.17, 0.4, 20.0)
-    lead = LeadIn(0.0, 1.0, 100, 0.5, transient)
-    verdict = assess(replace(bands, lead_in=lead), Background(record.memory, 0.0, FITTED))
-    assert verdict is not None
-    assert verdict.holds is True
-    assert named == any("a transient of" in note for note in verdict.notes)
+    assert "--lead-in-from" in verdict.cause.fix
 
 
 def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:

@@ -94,9 +94,9 @@ def spoil(
 # Which verdict a spoilt record spoils, and the causes that are right. The other record's drive may
 # be the faster one: then that it is an extrapolation is as true as its other gain.
 SPOILT_KINDS = {
-    "transient": ("training", {"start"}),
+    "transient": ("training", {"transient"}),
     "sign": ("training", {"sign"}),
-    "outliers": ("training", {"outliers"}),
+    "outliers": ("training", {"heavy tails"}),
     "drift": ("training", {"drift"}),
     "gain": ("held", {"gain"}),
     "offset": ("held", {"offset", "drift"}),
@@ -180,7 +180,7 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
         if verdict.holds is False:
             assert verdict.cause is not None
             counts["seen"] += 1
-            counts["right cause"] += verdict.cause.kind in causes
+            counts["right cause"] += not causes.isdisjoint(verdict.cause.kind.split(" or "))
             counts[verdict.cause.kind] += 1
         elif right(told, where):
             counts["right"] += 1
@@ -218,12 +218,12 @@ def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
     """
     assert all(one.holds is not False for one in run(seed, tmp_path).verdicts.values())
     where, causes = SPOILT_KINDS[kind]
-    verdict = run(seed, tmp_path, kind).verdicts[where]
     told = run(seed, tmp_path, kind)
+    verdict = told.verdicts[where]
     assert verdict.holds in (holds, False) or right(told, where)
     if verdict.holds is False:
         assert verdict.cause is not None
-        assert verdict.cause.kind in causes
+        assert not causes.isdisjoint(verdict.cause.kind.split(" or "))
 
 
 @pytest.mark.slow

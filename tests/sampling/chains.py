@@ -9,26 +9,12 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.sampling.bends import Bend, pairs
 from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.curvature import QuadraticMap, pairs
 from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
 from bwbayes.sampling.moves import MOVES
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
 from bwbayes.sampling.storage import ChainFile
-
-__all__ = [
-    "ATTRIBUTES",
-    "ENSEMBLES",
-    "PLAN",
-    "STEPS",
-    "arrays",
-    "assert_same",
-    "blocks",
-    "committed",
-    "finish",
-    "new",
-    "proposal",
-]
 
 ENSEMBLES, WALKERS, FREE, STEPS = 4, 16, 8, 50
 ATTRIBUTES: dict[str, str | int] = {
@@ -67,11 +53,11 @@ def blocks(phase: Phase, number: int) -> list[Block]:
 def proposal(phase: Phase) -> StudentMixture:
     generator = np.random.default_rng(PHASES.index(phase))
     factors = np.tril(generator.standard_normal((COMPONENTS, FREE, FREE)))
-    centres = generator.standard_normal((COMPONENTS, FREE))
-    parts = tuple(StudentProposal(*pair) for pair in zip(centres, factors, strict=True))
+    centers = generator.standard_normal((COMPONENTS, FREE))
+    parts = tuple(StudentProposal(*pair) for pair in zip(centers, factors, strict=True))
     bends = np.zeros((pairs(FREE), FREE))
     bends[0, 1] = generator.standard_normal()
-    bend = Bend(centres[0], factors[0], bends)
+    bend = QuadraticMap(centers[0], factors[0], bends)
     return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts, bend)
 
 
@@ -111,7 +97,7 @@ def arrays(chain: ChainFile) -> dict[str, Any]:
         mixture = chain.proposals[phase]
         if mixture is not None:
             held[f"{phase} weights"] = mixture.weights
-            held[f"{phase} centres"] = np.stack([c.centre for c in mixture.components])
+            held[f"{phase} centers"] = np.stack([c.center for c in mixture.components])
             held[f"{phase} factors"] = np.stack([c.factor for c in mixture.components])
     for kind, states in (("start", chain.starts), ("end", chain.ends)):
         for name in ("coordinates", "log_density", "random_state"):

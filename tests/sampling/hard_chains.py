@@ -13,8 +13,6 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 
-__all__ = ["BLOCK", "HARD", "autoregressive", "good", "moved"]
-
 STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 18, 2
 BLOCK = 50
 

@@ -15,21 +15,6 @@ from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import Outcome, first_chain, sample
 from tests.inference.problems import gaussian
 
-__all__ = [
-    "LONG",
-    "PLAN",
-    "POINT",
-    "POSTERIOR",
-    "InterruptedRunError",
-    "PluggedExecutor",
-    "Watched",
-    "assert_same_chain",
-    "assert_same_outcome",
-    "assert_same_proposal",
-    "new_chain",
-    "run",
-]
-
 PLAN = SamplingPlan(
     ess=400,
     walkers=12,
@@ -75,12 +60,12 @@ def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None)
     np.testing.assert_array_equal(one.weights, two.weights)
     for mine, yours in zip(one.components, two.components, strict=True):
         assert mine.freedom == yours.freedom
-        np.testing.assert_array_equal(mine.centre, yours.centre)
+        np.testing.assert_array_equal(mine.center, yours.center)
         np.testing.assert_array_equal(mine.factor, yours.factor)
     if one.bend is None or two.bend is None:
         assert one.bend is two.bend
         return
-    for name in ("centre", "factor", "bends"):
+    for name in ("center", "factor", "bends"):
         np.testing.assert_array_equal(getattr(one.bend, name), getattr(two.bend, name))
 
 

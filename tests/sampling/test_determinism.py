@@ -117,14 +117,3 @@ def test_in_five_pieces(
         done = ChainFile.read(path)
         assert number * piece == sum(done.blocks(phase) for phase in PHASES)
     assert_same_end(path, go_on(path, executor), expected)
-
-
-def test_twin_another_seed_gives_other_bits(
-    tmp_path: Path, expected: tuple[dict[str, Any], Outcome]
-) -> None:
-    path = tmp_path / "chain.h5"
-    begin(path, seed=2)
-    with ThreadPoolExecutor(1) as executor:
-        go_on(path, executor)
-    got = arrays(ChainFile.read(path))["pilot coordinates"]
-    assert not np.isin(got, expected[0]["pilot coordinates"]).any()

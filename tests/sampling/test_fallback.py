@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,7 +36,6 @@ from tests.sampling.samplings import (
     PluggedExecutor,
     assert_same_chain,
     assert_same_outcome,
-    assert_same_proposal,
     new_chain,
     run,
 )
@@ -46,10 +44,10 @@ from tests.sampling.samplings import (
 tune = sampler._tune
 
 
-def narrow(draws: FloatArray) -> StudentMixture:
+def narrow(draws: FloatArray, _: FloatArray | None = None) -> StudentMixture:
     """Fit normal distributions of a third of the width: a tail shape of 1 − 0.3² = 0.91."""
-    centre, factor = np.mean(draws, axis=0), 0.3 * np.linalg.cholesky(np.cov(draws, rowvar=False))
-    component = StudentProposal(centre, factor, freedom=1e6)
+    center, factor = np.mean(draws, axis=0), 0.3 * np.linalg.cholesky(np.cov(draws, rowvar=False))
+    component = StudentProposal(center, factor, freedom=1e6)
     return StudentMixture(np.full(COMPONENTS, 1 / COMPONENTS), (component,) * COMPONENTS)
 
 
@@ -87,21 +85,6 @@ def refitted() -> tuple[Chain, Outcome]:
 @pytest.fixture(scope="module")
 def fallen_back() -> tuple[Chain, Outcome]:
     return planted(plant_every)
-
-
-def test_a_second_proposal_is_fitted_to_what_the_first_does_not_cover(
-    refitted: tuple[Chain, Outcome],
-) -> None:
-    chain, outcome = refitted
-    assert FIRST_CHECK == chain.set_aside == chain.refitted
-    aside = [np.stack([b.coordinates for b in x], axis=1) for x in chain.history("sampling")]
-    draws_aside = np.concatenate(aside[:FIRST_CHECK]).reshape(-1, 3)
-    assert_same_proposal(StudentMixture.fitted(draws_aside), chain.proposal_in_use("sampling"))
-    assert "mixture" in chain.moves("sampling")
-    assert outcome.check.pareto_k is not None
-    assert outcome.check.pareto_k < 0.7
-    (remark,) = outcome.remarks
-    assert re.search(r"Pareto k 0\.\d\d is not .* a second one, fitted to them, made", remark)
 
 
 def test_two_proposals_that_do_not_cover_their_draws_are_given_up(
@@ -155,6 +138,7 @@ def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
 ) -> None:
     """In the first block of the sampling, before a check that fails, and after it."""
     expected, outcome = request.getfixturevalue(given_up)
+    blocks = min(blocks, len(expected.history("sampling")) - 1)
     planting(monkeypatch)
     before = expected.blocks("pilot") + expected.blocks("tuning")
     chain = new_chain(LONG)
@@ -167,12 +151,3 @@ def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
     assert expected.set_aside == chain.set_aside
     assert_same_chain(expected, chain)
     assert_same_outcome(outcome, again)
-
-
-def test_a_budget_that_ends_with_a_proposal_that_does_not_cover_is_told(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(StudentMixture, "fitted", narrow)
-    chain, outcome = run(replace(PLAN, most_steps=40))
-    assert 0 == chain.set_aside
-    assert re.search(r"used up: .*Pareto k 0\.\d\d is not below 0\.7", outcome.stop_reason)

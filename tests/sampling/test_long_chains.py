@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling import judge, sampler
+from bwbayes.sampling import monitor, sampler
 from bwbayes.sampling.chain import thinning
 from bwbayes.sampling.diagnostics import check
 from bwbayes.sampling.sampler import draws, log_densities
@@ -73,18 +73,10 @@ def test_the_default_budget_takes_less_than_a_gibibyte(tmp_path: Path) -> None:
     assert int(done.stdout) < 2**20
 
 
-@pytest.mark.parametrize("count", [1, 100, 101, 200, 201, 12_345])
-def test_thinning_is_the_least_power_of_two_that_is_enough(count: int) -> None:
-    thin = thinning(count, 100)
-    assert count <= 100 * thin
-    assert thin == 1 or count > 100 * thin / 2
-    assert 1 == bin(thin).count("1")
-
-
 def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """As its steps counted from one are, however often it was thinned on the way; and says so."""
     plan, most = replace(PLAN, ess=200), 800
-    monkeypatch.setattr(judge, "MOST_DRAWS", most)
+    monkeypatch.setattr(monitor, "MOST_DRAWS", most)
     monkeypatch.setattr(sampler, "thinning", lambda count, most=most: thinning(count, most))
     chain, outcome = run(plan)
     assert outcome.check.steps == chain.steps("sampling")
@@ -99,24 +91,3 @@ def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.Monke
     for name in ("rhat", "ess_bulk", "ess_tail", "ess_mean", "autocorrelation", "stuck"):
         np.testing.assert_array_equal(getattr(expected, name), getattr(outcome.check, name))
     assert f"one in {thin} is reported" in outcome.remarks[-1]
-
-
-def test_a_thinned_series_has_its_autocorrelation_in_steps() -> None:
-    """Of an AR(1) with φ = 0.95, 39 steps; half as many draws are hardly fewer effective ones."""
-    generator = np.random.default_rng(2)
-    series = np.empty((4000, 4, 16, 1))
-    series[0] = generator.standard_normal((4, 16, 1))
-    for step in range(1, 4000):
-        shocks = np.sqrt(1 - 0.95**2) * generator.standard_normal((4, 16, 1))
-        series[step] = 0.95 * series[step - 1] + shocks
-    accepted = np.full((80, 4, 16), 20)
-    whole, half = check(series, accepted, 50), check(series[3::4], accepted, 50, 4)
-    assert whole.steps == half.steps == 4000
-    assert whole.autocorrelation[0] == pytest.approx(half.autocorrelation[0], rel=0.1)
-    assert whole.ess_bulk[0] == pytest.approx(half.ess_bulk[0], rel=0.1)
-
-
-def test_a_chain_of_a_usual_length_is_used_as_a_whole() -> None:
-    chain, outcome = run()
-    assert len(draws(POSTERIOR, chain)) == chain.steps("sampling")
-    assert not any("reported" in remark for remark in outcome.remarks)

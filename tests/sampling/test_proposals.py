@@ -5,7 +5,7 @@ How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import emcee
 import numpy as np
@@ -93,7 +93,7 @@ def test_twin_forgotten_weights_are_found() -> None:
 
 def scipys_density(proposal: StudentProposal, x: FloatArray) -> FloatArray:
     shape = proposal.factor @ proposal.factor.T
-    scipys = stats.multivariate_t(proposal.centre, shape, df=int(proposal.freedom))
+    scipys = stats.multivariate_t(proposal.center, shape, df=int(proposal.freedom))
     return np.asarray(scipys.logpdf(x))
 
 
@@ -114,18 +114,10 @@ def test_the_mixtures_density_is_that_of_scipys_mixture() -> None:
     np.testing.assert_allclose(difference[0], difference, atol=1e-10)
 
 
-@pytest.mark.parametrize("proposal", [MIXTURE, MIXTURE.components[0]], ids=["mixture", "student"])
-def test_the_ratio_is_that_of_the_densities(proposal: StudentMixture | StudentProposal) -> None:
-    """It is log q(old) − log q(new), at the places proposed."""
-    old = np.random.default_rng(3).normal(0, 3, (50, 2))
-    new, ratio = proposal(old, np.random.RandomState(3))
-    np.testing.assert_allclose(proposal.log_density(old) - proposal.log_density(new), ratio)
-
-
 def mixture_cdf(mixture: StudentMixture, direction: FloatArray, x: FloatArray) -> FloatArray:
     parts = [
         weight
-        * stats.t.cdf(x, c.freedom, c.centre @ direction, np.linalg.norm(direction @ c.factor))
+        * stats.t.cdf(x, c.freedom, c.center @ direction, np.linalg.norm(direction @ c.factor))
         for weight, c in zip(mixture.weights, mixture.components, strict=True)
     ]
     return np.asarray(np.sum(parts, axis=0))
@@ -143,78 +135,20 @@ def test_draws_have_the_distribution(proposal: StudentMixture | StudentProposal)
         assert stats.kstest(along, expected).pvalue > 1e-4
 
 
-def test_the_mixtures_draws_have_its_weights() -> None:
-    """Within four standard errors of a binomial count."""
-    count = 20_000
-    draws = MIXTURE.draw(np.random.RandomState(4), count)
-    centres = np.stack([component.centre for component in MIXTURE.components])
-    nearest = np.argmin(np.linalg.norm(draws[:, np.newaxis] - centres, axis=2), axis=1)
-    result = np.bincount(nearest, minlength=3) / count
-    error = np.sqrt(MIXTURE.weights * (1 - MIXTURE.weights) / count)
-    assert np.max(np.abs(MIXTURE.weights - result) / error) < 4
-
-
-def test_the_mixtures_draws_have_its_moments() -> None:
-    """The scale LLᵀ times ν/(ν − 2) is a component's covariance."""
-    draws = MIXTURE.draw(np.random.RandomState(5), 200_000)
-    mean = np.einsum("j,jk->k", MIXTURE.weights, [c.centre for c in MIXTURE.components])
-    squares = sum(
-        weight * (1.5 * c.factor @ c.factor.T + np.outer(c.centre, c.centre))
-        for weight, c in zip(MIXTURE.weights, MIXTURE.components, strict=True)
-    )
-    products = draws[:, :, np.newaxis] * draws[:, np.newaxis]
-    for expected, each in ((mean, draws), (squares, products)):
-        error = np.std(each, axis=0) / np.sqrt(len(draws))
-        assert np.max(np.abs(np.mean(each, axis=0) - expected) / error) < 4
-
-
-@pytest.mark.parametrize("free", [1, 4])
-def test_a_fitted_student_has_the_mean_and_covariance_of_the_draws(free: int) -> None:
-    draws = np.random.default_rng(4).standard_normal((500, free)) @ np.diag(np.arange(1, free + 1))
-    proposal = StudentProposal.fitted(draws)
-    np.testing.assert_allclose(np.mean(draws, axis=0), proposal.centre)
-    expected = np.atleast_2d(np.cov(draws, rowvar=False))
-    np.testing.assert_allclose(expected, proposal.factor @ proposal.factor.T, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_fitted_mixture_has_the_mean_and_covariance_of_the_draws(name: str) -> None:
     """Its scales as covariances; what each takes from all together leaves their mean as it is."""
     draws = TARGETS[name].draw(np.random.default_rng(6), 2000)
     mixture = StudentMixture.fitted(draws)
-    centres = np.stack([component.centre for component in mixture.components])
+    centers = np.stack([component.center for component in mixture.components])
     scales = np.stack([component.factor @ component.factor.T for component in mixture.components])
     whole = np.cov(draws, rowvar=False)
     assert 1.0 == pytest.approx(np.sum(mixture.weights))
-    np.testing.assert_allclose(np.mean(draws, axis=0), mixture.weights @ centres, atol=1e-10)
+    np.testing.assert_allclose(np.mean(draws, axis=0), mixture.weights @ centers, atol=1e-10)
     within = np.einsum("j,jkl->kl", mixture.weights, scales)
-    away = centres - np.mean(draws, axis=0)
+    away = centers - np.mean(draws, axis=0)
     between = np.einsum("j,jk,jl->kl", mixture.weights, away, away)
     np.testing.assert_allclose(whole, within + between, rtol=1e-3, atol=1e-3)
-
-
-def test_a_mixture_around_modes_has_their_places_widths_and_shares() -> None:
-    """The first three modes, or fewer, and these once more twice as wide, with half of a share."""
-    one = np.array([[2.0, 0.3], [0.3, 0.5]])
-    covariances = np.stack([one, 4 * one, 9 * one, 16 * one])
-    optima, shares = np.arange(8.0).reshape(4, 2), np.array([0.6, 0.2, 0.2, 0.0])
-    for modes, places, widths, weights in (
-        (4, [0, 1, 2], [1, 1, 1], [0.6, 0.2, 0.2]),
-        (2, [0, 1, 0], [1, 1, 2], [0.375, 0.25, 0.375]),
-    ):
-        mixture = StudentMixture.around(optima[:modes], covariances[:modes], shares[:modes])
-        np.testing.assert_allclose(0.75 * np.array(weights) + 0.25 / 3, mixture.weights)
-        for part, place, width in zip(mixture.components, places, widths, strict=True):
-            np.testing.assert_array_equal(optima[place], part.centre)
-            expected = width**2 * covariances[place]
-            np.testing.assert_allclose(expected, part.factor @ part.factor.T)
-
-
-@pytest.mark.parametrize("kind", [StudentProposal, StudentMixture])
-def test_a_fit_is_deterministic(kind: type[StudentProposal] | type[StudentMixture]) -> None:
-    draws = TARGETS["banana"].draw(np.random.default_rng(7), 2000)
-    one, two = (kind.fitted(draws.copy()).log_density(draws) for _ in range(2))
-    np.testing.assert_array_equal(one, two)
 
 
 def efficiency(known: Known, proposal: StudentMixture | StudentProposal) -> float:
@@ -236,11 +170,6 @@ def efficiencies(name: str) -> tuple[float, float]:
 def test_a_mixture_covers_a_skewed_target_better_than_one_student(name: str) -> None:
     one, mixture = efficiencies(name)
     assert mixture > 1.1 * one
-
-
-def test_a_mixture_covers_a_gaussian_as_well_as_one_student() -> None:
-    one, mixture = efficiencies("gaussian")
-    assert mixture > 0.9 * one
 
 
 def test_modes_far_apart_do_not_widen_each_other() -> None:
@@ -306,13 +235,34 @@ TINY = {
 
 @pytest.mark.parametrize("name", TINY)
 def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
-    mixture = StudentMixture.fitted(TINY[name])
+    mixture = StudentMixture.fitted(TINY[name], np.zeros(len(TINY[name])))
     assert (COMPONENTS,) == mixture.weights.shape
     assert (mixture.weights > 0).all()
     assert np.isfinite(mixture.log_density(TINY[name])).all()
     proposed, ratio = mixture(TINY[name][:500], np.random.RandomState(14))
     assert np.isfinite(proposed).all()
     assert np.isfinite(ratio).all()
+
+
+def test_a_component_of_its_own_covers_what_the_others_cover_worst() -> None:
+    """Four small modes beside a large one are too many for three components.
+
+    The largest weight p/q, in units of the mean one, is how long a walker stays there.
+    """
+    rng = np.random.default_rng(16)
+    centers = np.array([[0, 0], [9, 9], [9, -9], [-9, 9], [-9, -9]])
+    shares, widths = np.array([0.96, 0.01, 0.01, 0.01, 0.01]), np.array([1, 0.5, 0.5, 0.5, 0.5])
+    modes = rng.choice(5, p=shares, size=10_000)
+    draws = centers[modes] + widths[modes, np.newaxis] * rng.standard_normal((modes.size, 2))
+    squares = np.sum((draws[:, np.newaxis] - centers) ** 2, axis=-1) / widths**2
+    log_density = np.logaddexp.reduce(np.log(shares / widths**2) - 0.5 * squares, axis=1)
+
+    def longest_stay(mixture: StudentMixture) -> float:
+        log_weights = log_density - mixture.log_density(draws)
+        return float(np.max(log_weights) + np.log(np.mean(np.exp(-log_weights))))
+
+    without = longest_stay(StudentMixture.fitted(draws))
+    assert longest_stay(StudentMixture.fitted(draws, log_density)) < without - np.log(3)
 
 
 def test_the_fit_goes_with_the_units() -> None:
@@ -322,18 +272,3 @@ def test_the_fit_goes_with_the_units() -> None:
     usual = StudentMixture.fitted(draws).log_density(draws)
     moved = StudentMixture.fitted(5 + draws * scale).log_density(5 + draws * scale)
     np.testing.assert_allclose(usual - np.log(np.prod(np.abs(scale))), moved, atol=1e-6)
-
-
-def test_another_number_of_degrees_of_freedom_is_another_density() -> None:
-    x = np.array([[3.0, -2.0]])
-    usual = MIXTURE.components[0]
-    assert usual.log_density(x) != replace(usual, freedom=30.0).log_density(x)
-
-
-def test_components_are_chosen_as_numpy_chooses() -> None:
-    """From the same random numbers: the same places as with ``RandomState.choice``."""
-    parts = tuple(StudentProposal(np.full(2, centre), np.eye(2)) for centre in (-100.0, 0.0, 100.0))
-    mixture = StudentMixture(np.array([0.2, 0.5, 0.3]), parts)
-    drawn = mixture.draw(np.random.RandomState(3), 500)
-    chosen = np.random.RandomState(3).choice(3, size=500, p=mixture.weights)
-    np.testing.assert_array_equal(chosen, np.round(drawn[:, 0] / 100) + 1)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import cast
 
 import emcee
 import numpy as np
 import pytest
 from emcee.moves import DEMove, Move, StretchMove
 
-from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.pointfit import PointFit
@@ -20,11 +17,10 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.ensemble import EnsembleState, advance, advance_together, start
 from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
-from tests.inference.problems import gaussian, short_posterior, target
+from tests.inference.problems import gaussian, short_posterior
 
 FREE, WALKERS, STEPS = 3, 12, 60
 POSTERIOR, POINT = gaussian(FREE)
-FLAT = target(lambda x: np.zeros(len(x)), FREE)
 MIXTURE = StudentMixture.fitted(np.random.default_rng(1).standard_normal((500, FREE)))
 
 Moves = list[tuple[Move, float]]
@@ -40,24 +36,6 @@ MOVES: dict[str, Callable[[], Moves]] = {
 def begin(number: int, posterior: Posterior = POSTERIOR, point: PointFit = POINT) -> EnsembleState:
     walkers = max(WALKERS, 2 * posterior.prior.dimensions)
     return start(posterior, point, number, walkers, np.random.default_rng(number))
-
-
-class Counted:
-    """A posterior that counts its calls, and remembers how many places each asked for."""
-
-    def __init__(self, posterior: Posterior) -> None:
-        self.posterior = posterior
-        self.calls: list[int] = []
-
-    def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Pass on a call."""
-        self.calls.append(len(coordinates))
-        return self.posterior.log_density(coordinates)
-
-
-def counted(posterior: Posterior = POSTERIOR) -> tuple[Posterior, list[int]]:
-    made = Counted(posterior)
-    return cast("Posterior", made), made.calls
 
 
 @pytest.mark.parametrize("name", MOVES)
@@ -99,35 +77,3 @@ def test_ensembles_that_move_together_move_as_alone(phase: str, engine: Engine) 
         np.testing.assert_array_equal(alone.accepted, block.accepted)
         np.testing.assert_array_equal(alone.moves, block.moves)
         np.testing.assert_array_equal(alone.end.random_state, block.end.random_state)
-
-
-def test_one_call_serves_all_ensembles() -> None:
-    """Stretch moves ask twice a step: so do four ensembles together, for four times as much."""
-    posterior, calls = counted()
-    states = [begin(number) for number in range(4)]
-    advance_together(posterior, [MOVES["stretch"]() for _ in states], states, STEPS)
-    assert [4 * WALKERS // 2] * 2 * STEPS == calls
-
-
-def test_independent_steps_in_a_row_ask_once() -> None:
-    posterior, calls = counted()
-    block = advance(posterior, sampling_moves(MIXTURE), begin(1), STEPS)
-    mixture = int(block.moves[2, 0])
-    others = 2 * int(block.moves[0, 0]) // WALKERS + 2 * int(block.moves[1, 0]) // WALKERS
-    assert STEPS * WALKERS == sum(calls)
-    assert max(calls) > 2 * WALKERS
-    assert len(calls) < others + mixture // WALKERS
-
-
-def test_places_that_are_not_finite_have_no_density() -> None:
-    posterior, calls = counted(FLAT)
-    state = begin(1)
-    far = EnsembleState(state.coordinates * 1e307, state.log_density, state.random_state)
-    block = advance(posterior, [(StretchMove(1e9), 1.0)], far, 5)
-    assert np.isfinite(block.coordinates).all()
-    assert sum(calls) < 5 * WALKERS
-
-
-def test_a_move_of_another_kind_is_refused() -> None:
-    with pytest.raises(InputError, match="moves: Move is neither a RedBlueMove nor an MHMove"):
-        advance(POSTERIOR, [(Move(), 1.0)], begin(1), 1)

@@ -29,7 +29,7 @@ REPLICATES = 500
 
 @click.command()
 @click.argument("config", type=FILE, required=False)
-@click.option("--resume", "begun", type=FILE, help="Go on with the calibration in this folder.")
+@click.option("--resume", "resumed", type=FILE, help="Go on with the calibration in this folder.")
 @click.option(
     "--replicates", type=click.IntRange(1), help=f"How many; default: {REPLICATES}, or as begun."
 )
@@ -41,13 +41,13 @@ REPLICATES = 500
 @quiet_option
 def calibrate(
     config: Path | None,
-    begun: Path | None,
+    resumed: Path | None,
     replicates: int | None,
     out: Path | None,
     seed: int | None,
     overwrite: bool,
     workers: int | None,
-    how: str | None,
+    backend: str | None,
     quiet: bool,
 ) -> int:
     """Simulation-based calibration of a CONFIG: fit simulated records whose truth is known.
@@ -61,12 +61,12 @@ def calibrate(
     from bwbayes.app.jobs.calibrate import start
     from bwbayes.app.running.folder import CalibrationFolder
 
-    if (config is None) == (begun is None):
+    if (config is None) == (resumed is None):
         raise InputError("calibrate: give either a CONFIG or --resume FOLDER")
-    if begun is not None:
+    if resumed is not None:
         if out is not None or seed is not None or overwrite:
             raise InputError("calibrate: --resume goes on as begun; leave the other options out")
-        return _calibrate(CalibrationFolder.open(begun), replicates, workers, how, quiet)
+        return _calibrate(CalibrationFolder.open(resumed), replicates, workers, backend, quiet)
     assert config is not None
     changes = {"name": config.stem} | ({} if seed is None else {"seed": seed})
     from bwbayes.app.config.config import load
@@ -75,27 +75,29 @@ def calibrate(
     chosen = chosen.model_copy(update=changes | ({"name": chosen.name} if chosen.name else {}))
     where = out or Path("results") / f"{config.stem}-calibration"
     folder = start(chosen, config.parent, where, replicates or REPLICATES, overwrite=overwrite)
-    return _calibrate(folder, None, workers, how, quiet)
+    return _calibrate(folder, None, workers, backend, quiet)
 
 
 def _calibrate(
     folder: CalibrationFolder,
     replicates: int | None,
     workers: int | None,
-    how: str | None,
+    backend: str | None,
     quiet: bool,
 ) -> int:
-    from bwbayes.app.jobs.calibrate import carry_on
-    from bwbayes.app.screen import show_calibration
+    from bwbayes.app.jobs.calibrate import resume
+    from bwbayes.report.calibration import calibration_report
+    from bwbayes.report.screen import show
 
     console = Console(stderr=True, quiet=quiet)
     try:
-        calibration = carry_on(folder, console, workers=workers, count=replicates, how=how)
+        calibration = resume(folder, console, workers=workers, count=replicates, backend=backend)
     except KeyboardInterrupt:
-        click.echo(f"interrupted; go on with {folder.resuming}", err=True)
+        click.echo(f"interrupted; resume with {folder.resuming}", err=True)
         return INTERRUPTED
     if not quiet:
-        show_calibration(calibration, folder, Console())
+        show(calibration_report(calibration), Console())
+        click.echo(f"report: {folder.path / 'calibration.html'}")
     if calibration.passed:
         return 0
     first, *others = calibration.shortcomings

@@ -21,7 +21,7 @@ __all__ = ["campaign"]
 @click.argument("folder", type=FILE, required=False)
 @click.option("--config", type=FILE, help="Config of all records; default: each proposes its own.")
 @click.option("--out", type=FILE, help="The campaign's folder; default: results/NAME-OF-FOLDER.")
-@click.option("--resume", "begun", type=FILE, help="Go on with the campaign in this folder.")
+@click.option("--resume", "resumed", type=FILE, help="Go on with the campaign in this folder.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
 @click.option("--workers", type=click.IntRange(1), help="Records side by side; default: cores.")
@@ -31,11 +31,11 @@ def campaign(
     folder: Path | None,
     config: Path | None,
     out: Path | None,
-    begun: Path | None,
+    resumed: Path | None,
     overwrite: bool,
     no_pictures: bool,
     workers: int | None,
-    how: str | None,
+    backend: str | None,
     quiet: bool,
 ) -> int:
     """Fit every record of a FOLDER as a run does, and put them side by side.
@@ -49,16 +49,16 @@ def campaign(
     from bwbayes.app.jobs.campaign import config_text, start
     from bwbayes.app.running.campaign_folder import CampaignFolder
 
-    if (folder is None) == (begun is None):
+    if (folder is None) == (resumed is None):
         raise InputError("campaign: give either a FOLDER of records or --resume CAMPAIGN")
-    if begun is not None:
+    if resumed is not None:
         if out is not None or config is not None or overwrite or no_pictures:
             raise InputError("campaign: --resume goes on as begun; leave the other options out")
-        return _carry_on(CampaignFolder.open(begun), workers, how, quiet)
+        return _resume(CampaignFolder.open(resumed), workers, backend, quiet)
     assert folder is not None
     text = "" if config is None else config_text(config)
     where = folder if config is None else config.parent
-    made = start(
+    created = start(
         folder,
         text,
         where,
@@ -66,22 +66,23 @@ def campaign(
         pictures=not no_pictures,
         overwrite=overwrite,
     )
-    return _carry_on(made, workers, how, quiet)
+    return _resume(created, workers, backend, quiet)
 
 
-def _carry_on(folder: CampaignFolder, workers: int | None, how: str | None, quiet: bool) -> int:
-    from bwbayes.app.jobs.campaign import carry_on
-    from bwbayes.app.screen import show_campaign
+def _resume(folder: CampaignFolder, workers: int | None, backend: str | None, quiet: bool) -> int:
+    from bwbayes.app.jobs.campaign import resume
+    from bwbayes.report.screen import show
 
     console = Console(stderr=True, quiet=quiet)
     try:
-        ended = carry_on(folder, console, workers=workers, how=how)
+        result = resume(folder, console, workers=workers, backend=backend)
     except KeyboardInterrupt:
-        click.echo(f"interrupted; go on with `bwbayes campaign --resume {folder.path}`", err=True)
+        click.echo(f"interrupted; resume with `bwbayes campaign --resume {folder.path}`", err=True)
         return INTERRUPTED
     if not quiet:
-        show_campaign(ended, folder, Console())
-    for row in ended.rows:
+        show(result.report(folder.path.name), Console())
+        click.echo(f"report: {folder.page}")
+    for row in result.rows:
         if row.reason:
             click.echo(f"{row.status.upper()}: {row.name}: {row.reason}", err=True)
-    return ended.exit_status
+    return result.exit_status

@@ -24,9 +24,13 @@ def check(config: Path, record: Path | None, naming: NamingOptions, out: Path | 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
     from bwbayes.app.jobs.check import check as look
+    from bwbayes.report.screen import show
 
     chosen, _ = config_or_proposal(config, naming, Console(quiet=True), "check", refuse=False)
     if record is not None:
         chosen = chosen.with_record(record)
-    look(chosen, config.parent, out or Path("results") / f"{config.stem}-check", Console())
+    out = out or Path("results") / f"{config.stem}-check"
+    _, report = look(chosen, config.parent, out)
+    show(report, Console())
+    click.echo(f"report: {out / 'check.html'}")
     return 0

@@ -85,7 +85,9 @@ def main() -> None:
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
     except NotConvergedError as error:
-        click.echo(f"NOT CONVERGED: {as_typed(str(error))}", err=True)
+        click.echo(
+            f"NOT CONVERGED: {as_typed(str(error).removeprefix('not converged: '))}", err=True
+        )
         status = NOT_CONVERGED
     except InputError as error:
         line = error.in_config() if isinstance(error, ColumnsError) else error
@@ -101,9 +103,9 @@ def main() -> None:
         status = BAD_INPUT
     except BrokenExecutor as error:
         # Python's own says nothing of use.
-        said = "" if isinstance(error, BrokenProcessPool) else str(error)
-        said = said or "a worker process was killed; free some memory, and resume"
-        click.echo(f"bwbayes: {' '.join(said.split())}", err=True)
+        message = "" if isinstance(error, BrokenProcessPool) else str(error)
+        message = message or "a worker process was killed; free some memory, and resume"
+        click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
         status = BAD_INPUT
     except MemoryError:
         click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)

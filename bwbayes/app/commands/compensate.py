@@ -10,10 +10,10 @@ import click
 from bwbayes.app.commands.shared import (
     FILE,
     capacitance_option,
-    conclude,
     current_option,
     hold_option,
     overwrite_option,
+    present,
     slew_option,
     voltage_option,
 )
@@ -77,18 +77,12 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.jobs.at_work import drawn
-    from bwbayes.app.jobs.compensate import compensate_draws
+    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.jobs.compensate import compensate as invert
 
     if (shape is None) == (reference is None):
         raise InputError("compensate: give either a shape or --reference")
-    made = compensate_draws(drawn(folder), shape or reference, **options)
-    name = made.reference.name
-    files = made.save(out or folder / "compensation" / name, overwrite=overwrite)
-    status = conclude(made.standing)
-    for remark in made.remarks:
-        click.echo(f"bwbayes: {remark}", err=True)
-    click.echo(repr(made))
-    for path in files:
-        click.echo(f"wrote {path}")
-    return status
+    command = invert(opened(folder), shape or reference, **options)
+    where = out or folder / "compensation" / command.reference.name
+    files = command.save(where, overwrite=overwrite)
+    return present(command.report(), files, command.standing)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
-from rich.console import Console
 
 from bwbayes.app.commands.shared import (
     FILE,
     capacitance_option,
-    conclude,
     current_option,
     overwrite_option,
+    present,
     slew_option,
     voltage_option,
 )
+from bwbayes.errors import InputError
 
 __all__ = ["design"]
 
@@ -23,7 +24,9 @@ __all__ = ["design"]
 @click.command()
 @click.argument("folder", type=FILE)
 @click.option("--parameter", help="The parameter to know better.")
-@click.option("--drive", help="Or the drive whose band is to be narrow: a record or a signal.")
+@click.option(
+    "--drive", type=FILE, help="Or the drive whose band is to be narrow: a record or a signal."
+)
 @click.option(
     "--candidates",
     default="standard",
@@ -38,15 +41,11 @@ __all__ = ["design"]
 @overwrite_option
 def design(
     folder: Path,
-    parameter: str | None,
-    drive: str | None,
-    candidates: str,
-    voltage: tuple[float, float] | None,
-    slew: float | None,
-    current: float | None,
-    capacitance: float | None,
     out: Path | None,
+    parameter: str | None,
+    drive: Path | None,
     overwrite: bool,
+    **options: Any,
 ) -> int:
     """Rank signals by what they would teach, from the run in FOLDER.
 
@@ -55,21 +54,19 @@ def design(
 
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
+    from bwbayes.app.jobs.at_work import opened
     from bwbayes.app.jobs.design import design as rank
-    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.data import Record, write_record
+    from bwbayes.report.saving import refuse_existing, save
 
-    rank(
-        folder,
-        out or folder / "design",
-        Console(),
-        candidates=candidates,
-        parameter=parameter,
-        drive=drive,
-        voltage=voltage,
-        slew=slew,
-        current=current,
-        capacitance=capacitance,
-        overwrite=overwrite,
-    )
-    # The screen begins with it.
-    return conclude(RunFolder.open(folder).standing(), say=False)
+    target = parameter if drive is None else drive
+    if target is None or (parameter is not None and drive is not None):
+        raise InputError("design: give either a parameter or a drive")
+    out = out or folder / "design"
+    names = ("best.csv", "design.html", "design.json")
+    refuse_existing([out / name for name in names], overwrite=overwrite)
+    ranking = rank(opened(folder), target, **options)
+    files = save(ranking.report(), out, "design")
+    best = ranking.signals[ranking.best.name]
+    write_record(Record(best, None, ranking.interval, voltage_is="command"), out / "best.csv")
+    return present(ranking.report(), [out / "best.csv", *files], ranking.standing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -25,14 +26,7 @@ __all__ = ["export"]
 )
 @hold_option
 @overwrite_option
-def export(
-    folder: Path,
-    out: Path | None,
-    voltage: tuple[float, float] | None,
-    rate: float | None,
-    hold: str,
-    overwrite: bool,
-) -> int:
+def export(folder: Path, out: Path | None, **options: Any) -> int:
     """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
 
     It is the posterior's mean. The C file needs math.h alone and does a sample a call. 0 um is
@@ -40,19 +34,15 @@ def export(
 
     Example: bwbayes export results/ring_bender --rate 1000
     """
+    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.jobs.export import FILES
     from bwbayes.app.jobs.export import export as write
 
-    made, files = write(
-        folder,
-        out,
-        voltage=voltage,
-        rate=rate,
-        hold=hold,
-        overwrite=overwrite,
-    )
-    status = conclude(made.standing)
-    if made.without_inverse is not None:
-        click.echo(f"bwbayes: no inverse in it: {made.without_inverse}", err=True)
-    for path in files:
-        click.echo(f"wrote {path}")
+    out = out or folder / "export"
+    model = write(opened(folder), out, **options)
+    status = conclude(model.standing)
+    if model.without_inverse is not None:
+        click.echo(f"bwbayes: no inverse in it: {model.without_inverse}", err=True)
+    for name in FILES:
+        click.echo(f"wrote {out / name}")
     return status

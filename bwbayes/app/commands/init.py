@@ -36,13 +36,13 @@ def init(record: Path, naming: NamingOptions, out: Path | None) -> int:
     out = out or record.with_suffix(CONFIG)
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    made = _proposed(record, out.parent, naming, "init")
+    proposal = _proposed(record, out.parent, naming, "init")
     try:
-        out.write_text(made.text, encoding="utf-8")
+        out.write_text(proposal.text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{out}: {error.strerror}; choose another place with --out") from None
     console = Console()
-    _show(made, console)
+    _show(proposal, console)
     console.print(
         f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`",
         highlight=False,
@@ -74,22 +74,22 @@ def config_or_proposal(
                 "units and fs under [record]"
             )
         return config, False
-    made = _proposed(path, path.parent, naming, command)
-    if refuse and made.pointless is not None:
+    proposal = _proposed(path, path.parent, naming, command)
+    if refuse and proposal.pointless is not None:
         raise InputError(
-            f"{path}: {made.pointless}; if the record is right as it is, write a config with "
-            f"`bwbayes init {path}` and run that"
+            f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "
+            f"with `bwbayes init {path}` and run that"
         )
-    _show(made, console)
-    train = ", ".join(f"{a:g} to {b:g}" for a, b in made.config.records["record"].train or ())
-    held = "the rest" if "held_out" in made.config.validation else "nothing"
+    _show(proposal, console)
+    train = ", ".join(f"{a:g} to {b:g}" for a, b in proposal.config.records["record"].train or ())
+    held = "the rest" if "held_out" in proposal.config.validation else "nothing"
     console.print(
         f"training on {train} s, holding out {held}; save this config with `bwbayes init {path}`",
         highlight=False,
         markup=False,
         soft_wrap=True,
     )
-    return made.config, True
+    return proposal.config, True
 
 
 def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> ConfigProposal:
@@ -102,11 +102,12 @@ def _proposed(path: Path, where: Path, naming: NamingOptions, command: str) -> C
         raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
 
 
-def _show(made: ConfigProposal, console: Console) -> None:
+def _show(proposal: ConfigProposal, console: Console) -> None:
     """Show what was said of the record, with what to do."""
-    from bwbayes.app.screen import show_remarks
+    from bwbayes.report.report import Report, remarks_banner
+    from bwbayes.report.screen import show
 
-    show_remarks(made.remarks, console)
-    for one in made.findings:
-        text = f"{one.kind}: {one.text}\n    fix: {one.remedy}"
+    show(Report(title="remarks", banners=remarks_banner(proposal.remarks)), console)
+    for finding in proposal.findings:
+        text = f"{finding.kind}: {finding.text}\n    fix: {finding.fix}"
         console.print(escape(text), highlight=False, soft_wrap=True)

@@ -34,6 +34,9 @@ __all__ = ["resume", "run"]
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @click.option("--seed", type=click.IntRange(0, LARGEST_SEED), help="Seed, instead of the config's.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing run.")
+@click.option(
+    "--improve", is_flag=True, help="Add the parts of the model that the record supports."
+)
 @workers_option
 @executor_option
 @quiet_option
@@ -44,8 +47,9 @@ def run(
     out: Path | None,
     seed: int | None,
     overwrite: bool,
+    improve: bool,
     workers: int | None,
-    how: str | None,
+    backend: str | None,
     quiet: bool,
 ) -> int:
     """Fit a model to a record: sample the posterior, predict, write the report.
@@ -54,8 +58,12 @@ def run(
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.improving import improve_model
     from bwbayes.app.running.run import start
-    from bwbayes.app.screen import show_priors, show_remarks
+    from bwbayes.report.priors import priors_table
+    from bwbayes.report.report import Report, remarks_banner
+    from bwbayes.report.screen import show as show_report
 
     chosen, is_proposal = config_or_proposal(config, naming, Console(quiet=quiet), "run")
     if record is not None:
@@ -64,14 +72,19 @@ def run(
         chosen = chosen.model_copy(update={"seed": seed})
     if chosen.name is None:
         chosen = chosen.model_copy(update={"name": config.stem})
-    folder = start(chosen, config.parent, out or Path("results") / config.stem, overwrite=overwrite)
+    path = out or Path("results") / config.stem
+    if improve:
+        RunFolder.require_free(path, overwrite)
+        chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
+    folder = start(chosen, config.parent, path, overwrite=overwrite)
 
     def show(problem: Problem) -> None:
-        if not is_proposal:  # of a record alone they are shown already
-            show_remarks(problem.remarks, Console())
-        show_priors(problem.posterior.prior, Console())
+        # Of a record alone the remarks are shown already.
+        banners = [] if is_proposal else remarks_banner(problem.remarks)
+        priors = priors_table(problem.posterior.prior)
+        show_report(Report(title="priors", banners=banners, blocks=[priors]), Console())
 
-    return finish(folder.path, workers, quiet, how=how, show=None if quiet else show)
+    return finish(folder.path, workers, quiet, backend=backend, show=None if quiet else show)
 
 
 @click.command()
@@ -88,11 +101,11 @@ def resume(
     steps: int | None,
     engine: Engine | None,
     workers: int | None,
-    how: str | None,
+    backend: str | None,
     quiet: bool,
 ) -> int:
     """Go on with the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine, how=how)
+    return finish(folder, workers, quiet, ess=ess, steps=steps, engine=engine, backend=backend)

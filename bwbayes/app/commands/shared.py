@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
     from bwbayes.data.io.columns import Naming
     from bwbayes.inference.engine import Engine
+    from bwbayes.report.report import Report
     from bwbayes.results.standing import Standing
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "hold_option",
     "naming_options",
     "overwrite_option",
+    "present",
     "quiet_option",
     "slew_option",
     "voltage_option",
@@ -99,8 +101,8 @@ def naming_options[**P, R](command: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(command)
     def with_naming(*args: Any, **kwargs: Any) -> R:
-        said = (kwargs.pop(name) for name in ("columns", "units", "fs"))
-        return command(*args, naming=NamingOptions(*said), **kwargs)  # type: ignore[arg-type]
+        names = (kwargs.pop(name) for name in ("columns", "units", "fs"))
+        return command(*args, naming=NamingOptions(*names), **kwargs)  # type: ignore[arg-type]
 
     for option in (
         click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column."),
@@ -129,7 +131,7 @@ workers_option = click.option(
 )
 executor_option = click.option(
     "--executor",
-    "how",
+    "backend",
     metavar="KIND",
     help="local (default), threads, processes, dask, or dask://HOST:PORT.",
 )
@@ -165,7 +167,7 @@ def finish(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
-    how: str | None = None,
+    backend: str | None = None,
     show: Callable[[Problem], None] | None = None,
 ) -> int:
     """Sample the run in a folder to its end, say how it went, and return the exit status.
@@ -173,41 +175,57 @@ def finish(
     ``show`` is called with the problem at first.
     """
     from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.run import carry_on, going_on, load_run
-    from bwbayes.app.screen import show_result
+    from bwbayes.app.running.run import resume
+    from bwbayes.report.screen import show as show_report
 
     folder = RunFolder.open(path)
     console = Console(stderr=True, quiet=quiet)
     try:
-        result = carry_on(
+        fit = resume(
             folder,
             console,
             workers=workers,
             ess=ess,
             steps=steps,
             engine=engine,
-            how=how,
-            apart=True,
+            backend=backend,
+            background=True,
             show=show,
+            answer=None if quiet else lambda fit: show_report(fit.report(), Console()),
         )
     except KeyboardInterrupt:
-        click.echo(f"interrupted; go on with `bwbayes resume {path}`", err=True)
+        click.echo(f"interrupted; resume with `bwbayes resume {path}`", err=True)
         return INTERRUPTED
     if not quiet:
-        show_result(result, folder, Console())
-    if not result.outcome.converged:
+        click.echo(f"report: {folder.path / 'report.html'}")
+    if not fit.converged:
         click.echo(
-            f"NOT CONVERGED: {result.outcome.stop_reason}; intervals are withheld. Resume with "
-            f"`{going_on(path, load_run(folder))}`, and look at the traces in {path}/report.html",
+            f"NOT CONVERGED: {fit.outcome.stop_reason}; intervals are withheld. Resume with "
+            f"`{fit.resuming}`, and look at the traces in {path}/report.html",
             err=True,
         )
         return NOT_CONVERGED
     # The screen begins with it.
-    return conclude(result.standing, say=quiet)
+    return conclude(fit.standing, say=quiet)
 
 
 def conclude(standing: Standing, *, say: bool = True) -> int:
     """Say that the bands of a run do not hold, or that nobody knows; return the exit status."""
     for line in standing.said if say else ():
         click.echo(line, err=True)
+    return standing.exit_status
+
+
+def present(
+    report: Report, files: Sequence[Path], standing: Standing, *, quiet: bool = False
+) -> int:
+    """Show what came of a run and the files of it; return the exit status of that run."""
+    # Here, because it is slow to load.
+    from bwbayes.report.screen import show
+
+    if quiet:
+        return conclude(standing)
+    show(report, Console())
+    for path in files:
+        click.echo(f"wrote {path}")
     return standing.exit_status

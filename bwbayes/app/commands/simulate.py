@@ -52,12 +52,12 @@ def simulate(
     """
     from bwbayes.app.jobs.simulate import simulate as write
 
-    given = (amplitude, frequency, duration)
-    if waveform != "sine" and any(value is not None for value in given):
+    sine_options = (amplitude, frequency, duration)
+    if waveform != "sine" and any(value is not None for value in sine_options):
         raise InputError("simulate: amplitude, frequency and duration need --signal sine")
     first, second, third = (
         default if value is None else value
-        for value, default in zip(given, (100.0, 1.0, 16.0), strict=True)
+        for value, default in zip(sine_options, (100.0, 1.0, 16.0), strict=True)
     )
     sine = (first, second, third)
     for path in write(out, waveform, sine, discrepancy, seed, rate, overwrite=overwrite):

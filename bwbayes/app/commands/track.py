@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
-from rich.console import Console
 
 from bwbayes.app.commands.shared import (
     FILE,
-    conclude,
     overwrite_option,
+    present,
     quiet_option,
     voltage_option,
 )
@@ -51,15 +51,9 @@ def track(
     folder: Path,
     out: Path | None,
     frequencies: tuple[float, ...],
-    amplitude: float | None,
-    voltage: tuple[float, float] | None,
-    rate: float,
-    delay: int,
-    gain_margin: float,
-    phase_margin: float,
-    draws: int,
     overwrite: bool,
     quiet: bool,
+    **options: Any,
 ) -> int:
     """Say how well the actuator of the run in FOLDER would follow the paper's signals.
 
@@ -69,22 +63,13 @@ def track(
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.jobs.track import Setup, show, track_run
+    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.jobs.track import track as follow
+    from bwbayes.report.saving import refuse_existing, save
 
-    setup = Setup(
-        voltage=voltage,
-        rate=rate,
-        delay=delay,
-        gain_margin=gain_margin,
-        phase_margin=phase_margin,
-        frequencies=frequencies or None,
-        amplitude=amplitude,
-        draws=draws,
-    )
-    made, files = track_run(folder, out, setup, overwrite=overwrite)
-    status = conclude(made.standing)
-    if not quiet:
-        show(made, Console())
-        for path in files:
-            click.echo(f"wrote {path}")
-    return status
+    out = out or folder / "track"
+    files = [out / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
+    refuse_existing(files, overwrite=overwrite)
+    tracking = follow(opened(folder), frequencies=frequencies or None, **options)
+    written = save(tracking.report(), out, "track")
+    return present(tracking.report(), written, tracking.standing, quiet=quiet)

@@ -1,7 +1,7 @@
 """What an error says to do, in the words of the command line.
 
 Errors speak to those who call the package from Python, of arguments and functions in backticks:
-``overwrite=True``, ``bwbayes.resume_run("results/a", steps=100)``. On the command line the same
+``overwrite=True``, ``bwbayes.resume("results/a", steps=100)``. On the command line the same
 are ``--overwrite`` and ``bwbayes resume results/a --steps 100``.
 """
 
@@ -13,7 +13,7 @@ import re
 __all__ = ["as_typed"]
 
 # Functions and arguments that are called otherwise there.
-COMMANDS = {"bwbayes.fit": "bwbayes run", "bwbayes.resume_run": "bwbayes resume"}
+COMMANDS = {"bwbayes.fit": "bwbayes run", "bwbayes.resume": "bwbayes resume"}
 OPTIONS = {"folder": "out"}
 
 
@@ -33,7 +33,7 @@ def _typed(code: str) -> str:
     if not isinstance(call, ast.Call) or not (is_call or (call.keywords and " = " not in code)):
         return code
     words = [COMMANDS[ast.unparse(call.func)]] if is_call else []
-    words += [_value(one) for one in call.args]
+    words += [_value(argument) for argument in call.args]
     for keyword in call.keywords:
         name = str(keyword.arg)
         words.append(f"--{OPTIONS.get(name, name).replace('_', '-')}")

@@ -16,15 +16,17 @@ from typing import Annotated, Self
 import tomlkit
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
-from bwbayes.app.config.keys import ConfigTable, described, one_line
+from bwbayes.app.config.keys import ConfigTable, key, one_line
 from bwbayes.app.config.limits import LARGEST_SEED
-from bwbayes.app.config.model_settings import ActuatorConfig, ModelConfig, StandConfig
 from bwbayes.app.config.settings import (
+    ActuatorConfig,
+    ModelConfig,
     Name,
     ParameterConfig,
     RecordConfig,
     SamplingConfig,
     SignalConfig,
+    StandConfig,
     ValidationConfig,
 )
 from bwbayes.errors import InputError, suggestion
@@ -60,94 +62,77 @@ def _is_table(value: object) -> bool:
     return isinstance(value, Mapping | RecordConfig)
 
 
-def _one_or_several(given: object) -> str:
+def _one_or_several(value: object) -> str:
     """Tell the keys of one record from the tables of several."""
-    if not isinstance(given, Mapping) or not given:
+    if not isinstance(value, Mapping) or not value:
         return ONE
-    tables = all(key not in RecordConfig.model_fields and _is_table(given[key]) for key in given)
+    tables = all(key not in RecordConfig.model_fields and _is_table(value[key]) for key in value)
     return SEVERAL if tables else ONE
 
 
 class Config(ConfigTable):
     """A whole run."""
 
-    name: Annotated[
-        Annotated[str, Field(min_length=1)] | None,
-        described("The run's name; by default the config's file name.", example='"bender 7"'),
-    ] = None
-    seed: Annotated[
-        int,
-        Field(ge=0, le=LARGEST_SEED),
-        described("Seed of all random numbers.", example="7"),
-    ] = 1
+    name: Annotated[str, Field(min_length=1)] | None = key(None, example='"bender 7"')
+    """The run's name; by default the config's file name."""
+    seed: int = key(1, ge=0, le=LARGEST_SEED, example="7")
+    """Seed of all random numbers."""
     record: Annotated[
         Annotated[RecordConfig, Tag(ONE)] | Annotated[dict[Name, RecordConfig], Tag(SEVERAL)],
         Discriminator(_one_or_several),
-        described(
-            "The training record; file or signal is required. Several records of one actuator, "
-            "fitted jointly: a table [record.NAME] with these keys for each, under names of your "
-            "choice, and none of the keys in [record] itself."
-        ),
-    ]
-    stand: Annotated[StandConfig, described("The virtual test stand, for signals.")] = StandConfig()
-    model: Annotated[ModelConfig, described("The model of the actuator and of the residual.")] = (
-        ModelConfig()
-    )
-    parameters: Annotated[
-        dict[str, ParameterConfig],
-        described(
-            "What is known of a parameter; NAME is its name, see `bwbayes models`.",
-        ),
-    ] = Field(default_factory=dict)
-    sampling: Annotated[SamplingConfig, described("How to sample, and when to stop.")] = (
-        SamplingConfig()
-    )
-    validation: Annotated[
-        dict[Name, ValidationConfig],
-        described("Data to predict and judge, under a NAME of your choice."),
-    ] = Field(default_factory=dict)
-    truth: Annotated[
-        dict[str, float],
-        described(
-            "True parameters of a simulated record, to be shown beside the estimates.",
-            unit="the parameter's",
-            example="{ d = 0.7, alpha = 0.3575 }",
-        ),
-    ] = Field(default_factory=dict)
+    ] = key()
+    """The training record; file or signal is required. Several records of one actuator, fitted
+    jointly: a table [record.NAME] with these keys for each, under names of your choice, and none of
+    the keys in [record] itself.
+    """
+    stand: StandConfig = key(StandConfig())
+    """The virtual test stand, for signals."""
+    model: ModelConfig = key(ModelConfig())
+    """The model of the actuator and of the residual."""
+    parameters: dict[str, ParameterConfig] = key({})
+    """What is known of a parameter; NAME is its name, see `bwbayes models`."""
+    sampling: SamplingConfig = key(SamplingConfig())
+    """How to sample, and when to stop."""
+    validation: dict[Name, ValidationConfig] = key({})
+    """Data to predict and judge, under a NAME of your choice."""
+    truth: dict[str, float] = key({}, unit="the parameter's", example="{ d = 0.7, alpha = 0.3575 }")
+    """True parameters of a simulated record, to be shown beside the estimates."""
 
     @field_validator("record", mode="before")
     @classmethod
-    def _not_both(cls, given: object) -> object:
-        if isinstance(given, Mapping):
-            known = [key for key in given if key in RecordConfig.model_fields]
-            tables = [key for key, value in given.items() if key not in known and _is_table(value)]
-            if known and tables:
+    def _not_both(cls, value: object) -> object:
+        if isinstance(value, Mapping):
+            single = [key for key in value if key in RecordConfig.model_fields]
+            tables = [key for key in value if key not in single and _is_table(value[key])]
+            if single and tables:
                 raise ValueError(
-                    f"{known[0]} is a key of one record, and {tables[0]} a table of several; move "
-                    f"{known[0]} into a table [record.NAME] of its own"
+                    f"{single[0]} is a key of one record, and {tables[0]} a table of several; move "
+                    f"{single[0]} into a table [record.NAME] of its own"
                 )
-        return given
+        return value
 
     @field_validator("validation")
     @classmethod
-    def _names_of_its_own(cls, given: dict[str, object]) -> dict[str, object]:
-        for name in given:
+    def _names_of_its_own(cls, tables: dict[str, object]) -> dict[str, object]:
+        for name in tables:
             if name == "record" or re.fullmatch(r"training(-\d+)?", name):
                 raise ValueError(f"the name {name!r} is taken by the training record")
-        return given
+        return tables
 
     @model_validator(mode="after")
     def _names_of_their_own(self) -> Self:
         for name in self.records:
             if len(self.records) > 1 and re.fullmatch(r"record|training(-\d+)?", name):
                 raise ValueError(f"the name {name!r} of a record is taken; choose another")
-        for name, one in self.validation.items():
+        for name, validation in self.validation.items():
             if any(re.fullmatch(rf"{re.escape(other)}(-\d+)?", name) for other in self.records):
                 raise ValueError(f"validation: the name {name!r} is taken by a training record")
-            if one.of is not None and one.of not in self.records:
-                hint = suggestion(one.of, list(self.records))
-                raise ValueError(f"validation.{name}.of: no training record {one.of!r}; {hint}")
-            if one.of is None and not one.another and len(self.records) > 1:
+            if validation.of is not None and validation.of not in self.records:
+                hint = suggestion(validation.of, list(self.records))
+                raise ValueError(
+                    f"validation.{name}.of: no training record {validation.of!r}; {hint}"
+                )
+            if validation.of is None and not validation.another and len(self.records) > 1:
                 raise ValueError(
                     f"validation.{name}: its window is of one of several records; say of which, "
                     f'of = "{next(iter(self.records))}" for instance'
@@ -243,7 +228,7 @@ def checked(table: Mapping[str, object], where: str) -> Config:
 
 def _check_keys(text: str) -> None:
     for line in text.splitlines():
-        parts = max(part.count(".") for part in re.split("[=,{]", line))
+        parts = max(name.count(".") for name in re.split("[=,{]", line))
         if parts > MOST_KEY_PARTS and not line.lstrip().startswith("#"):
             raise ValueError("a key has too many parts")
 

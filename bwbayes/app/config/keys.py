@@ -1,9 +1,9 @@
 """The keys of a config: where they are, what is said of them, and what to say where one is wrong.
 
-A config is a pydantic model whose fields are tables and keys; :func:`described` puts on a field
-what a person needs to know of it. :func:`keys` walks through a config's model and lists them, and
-:func:`one_line` makes one line of what pydantic has against a config. Neither knows any key: the
-models say it all.
+A config is a pydantic model whose fields are tables and keys; :func:`key` and the docstring below
+a field say what a person needs to know of it. :func:`keys` walks through a config's model and lists
+them, and :func:`one_line` makes one line of what pydantic has against a config. Neither knows any
+key: the models say it all.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = [
     "Key",
     "Positive",
     "Texts",
-    "described",
+    "key",
     "keys",
     "one_line",
 ]
@@ -81,7 +81,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 # A list of texts; a text stands for a list of one.
 Texts = Annotated[
-    list[str], BeforeValidator(lambda given: [given] if isinstance(given, str) else given)
+    list[str], BeforeValidator(lambda value: [value] if isinstance(value, str) else value)
 ]
 
 KINDS = {str: "text", bool: "true or false", int: "whole number", float: "number", dict: "table"}
@@ -92,16 +92,18 @@ class ConfigTable(BaseModel):
 
     __repr__ = brief
 
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
-def described(text: str, *, unit: str = "", example: str = "") -> Any:
-    """Return what a field's annotation says of a key: its description, unit, and example in TOML.
+def key(default: Any = ..., *, unit: str = "", example: str = "", **limits: Any) -> Any:
+    """Return a field for a key: its default, unit, example in TOML, and limits as pydantic's.
 
-    The default is the field's own.
+    What it is stands below the field, as its docstring.
     """
-    extra: dict[str, Any] = {"unit": unit}
-    return Field(description=text, examples=[example] if example else None, json_schema_extra=extra)
+    examples = [example] if example else None
+    return Field(default, examples=examples, json_schema_extra={"unit": unit}, **limits)
 
 
 @dataclass(frozen=True)
@@ -128,11 +130,11 @@ class Key:
         return self.path.split(".")[-1]
 
 
-def keys(model: type[BaseModel], place: tuple[str, ...] = ()) -> Iterator[Key]:
+def keys(model: type[BaseModel], tables: tuple[str, ...] = ()) -> Iterator[Key]:
     """Yield the keys of a config's model, each table before what is in it."""
     for name, field in model.model_fields.items():
         table, named = _table(field.annotation)
-        path = (*place, name, ANY) if named else (*place, name)
+        path = (*tables, name, ANY) if named else (*tables, name)
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
         yield Key(
             path=".".join(path),
@@ -140,7 +142,7 @@ def keys(model: type[BaseModel], place: tuple[str, ...] = ()) -> Iterator[Key]:
             unit=str(extra.get("unit", "")),
             default=_default(field, table),
             example=str((field.examples or [""])[0]),
-            description=field.description or "",
+            description=" ".join((field.description or "").split()),
             table=table,
         )
         if table is not None:
@@ -152,60 +154,64 @@ def _parts(annotation: Any) -> Iterator[Any]:
     if get_origin(annotation) is Annotated:
         yield from _parts(get_args(annotation)[0])
     elif get_origin(annotation) in (Union, types.UnionType):
-        for one in get_args(annotation):
-            yield from _parts(one)
+        for branch in get_args(annotation):
+            yield from _parts(branch)
     else:
         yield annotation
 
 
 def _table(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
     """Return the model of a table that a field holds, if any, and whether users name its tables."""
-    for one in _parts(annotation):
-        if isinstance(one, type) and issubclass(one, BaseModel):
-            return one, False
-        if get_origin(one) is dict:
-            inner, _ = _table(get_args(one)[1])
+    for branch in _parts(annotation):
+        if isinstance(branch, type) and issubclass(branch, BaseModel):
+            return branch, False
+        if get_origin(branch) is dict:
+            inner, _ = _table(get_args(branch)[1])
             if inner is not None:
                 return inner, True
     return None, False
 
 
 def _kind(field: FieldInfo) -> str:
-    kinds = [_words(one) for one in _parts(field.annotation) if one is not types.NoneType]
-    said = " or ".join(dict.fromkeys(kinds))
-    limits = [_limit(one) for one in (*field.metadata, *_inner_limits(field.annotation))]
-    return ", ".join([said, *dict.fromkeys(limit for limit in limits if limit)])
+    kinds = [_words(branch) for branch in _parts(field.annotation) if branch is not types.NoneType]
+    words = " or ".join(dict.fromkeys(kinds))
+    limits = [
+        _limit(constraint) for constraint in (*field.metadata, *_inner_limits(field.annotation))
+    ]
+    return ", ".join([words, *dict.fromkeys(limit for limit in limits if limit)])
 
 
 def _inner_limits(annotation: Any) -> Iterator[Any]:
     """Yield what is said about the branches of a field that are not lists."""
-    for one in get_args(annotation):
-        if get_origin(one) is Annotated:
-            inner, *metadata = get_args(one)
+    for branch in get_args(annotation):
+        if get_origin(branch) is Annotated:
+            inner, *metadata = get_args(branch)
             if get_origin(inner) is not list:
-                for said in metadata:
-                    yield from said.metadata if isinstance(said, FieldInfo) else [said]
+                for constraint in metadata:
+                    yield from (
+                        constraint.metadata if isinstance(constraint, FieldInfo) else [constraint]
+                    )
 
 
-def _words(one: Any) -> str:
+def _words(branch: Any) -> str:
     """Say what a branch holds."""
-    if get_origin(one) is Literal:
-        return "one of " + ", ".join(f'"{value}"' for value in get_args(one))
-    if get_origin(one) is list:
-        inner = " or ".join(dict.fromkeys(_words(part) for part in _parts(get_args(one)[0])))
+    if get_origin(branch) is Literal:
+        return "one of " + ", ".join(f'"{value}"' for value in get_args(branch))
+    if get_origin(branch) is list:
+        inner = " or ".join(dict.fromkeys(_words(item) for item in _parts(get_args(branch)[0])))
         if inner == KINDS[str]:
             return "text or list of texts"
         return f"list of {inner}s" if not inner.startswith("list of ") else "list of [start, stop]"
-    if get_origin(one) is dict or (isinstance(one, type) and issubclass(one, BaseModel)):
+    if get_origin(branch) is dict or (isinstance(branch, type) and issubclass(branch, BaseModel)):
         return KINDS[dict]
-    return KINDS[one]
+    return KINDS[branch]
 
 
-def _limit(said: Any) -> str:
+def _limit(constraint: Any) -> str:
     """Say a limit of a number."""
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most", "multiple_of": "even"}
     for name, word in words.items():
-        value = getattr(said, name, None)
+        value = getattr(constraint, name, None)
         if value is not None and abs(value) < 2**62:
             return word if name == "multiple_of" else f"{word} {value:g}"
     return ""
@@ -238,40 +244,43 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     # Unknown keys first: a misspelt key is often why another one seems to be missing. Then the
     # deepest place: the branch of a union that the user meant.
     first = min(errors, key=lambda e: (e["type"] != "extra_forbidden", -len(e["loc"])))
-    place = [str(part) for part in first["loc"] if not _is_branch(str(part))]
-    path = ".".join(place) or "config"
+    names = [str(name) for name in first["loc"] if not _is_branch(str(name))]
+    path = ".".join(names) or "config"
     if first["type"] == "extra_forbidden":
-        hint = _home(place, root) or suggestion(place[-1], _keys_at(place[:-1], root), MEANINGS)
+        hint = _home(names, root) or suggestion(names[-1], _keys_at(names[:-1], root), MEANINGS)
         return f"{where}: {path}: unknown key; {hint}"
     message = first["msg"].removeprefix("Value error, ")
-    if place[-1:] == ["prior"]:
+    if names[-1:] == ["prior"]:
         message = 'write a table like { distribution = "normal", mean = 1.0, sd = 0.1 }'
-    elif place[-1:] == ["signal"]:
+    elif names[-1:] == ["signal"]:
         message = (
             "write a signal's name or a table like { amplitude = 100.0, frequency = 1.0, ... }"
         )
     elif first["type"] == "dict_type":
         message = f"is not a table; write [{path}.NAME] and its keys below"
     elif first["type"] == "model_type":
-        message = f"is not a table; known keys are {', '.join(_keys_at(place, root))}"
+        message = f"is not a table; known keys are {', '.join(_keys_at(names, root))}"
     elif first["type"] == "missing":
         message = "is missing"
     got = "" if isinstance(first["input"], dict) else f", got {_shown(first['input'])}"
     return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
 
 
-def _home(place: list[str], root: type[BaseModel]) -> str:
+def _home(names: list[str], root: type[BaseModel]) -> str:
     """Say where a key belongs that is known, but in another table; nothing if it is not."""
-    key, table = place[-1], place[0] if len(place) > 1 else ""
+    key, table = names[-1], names[0] if len(names) > 1 else ""
     if key in root.model_fields:
         return "it belongs above the first table, or is a table of its own"
     homes = {name: _table(field.annotation) for name, field in root.model_fields.items()}
-    names = [
+    tables = [
         name
-        for name, (one, named) in homes.items()
-        if one is not None and not named and key in one.model_fields and name != table
+        for name, (table_model, named) in homes.items()
+        if table_model is not None
+        and not named
+        and key in table_model.model_fields
+        and name != table
     ]
-    return f"it belongs under [{names[0]}]" if names else ""
+    return f"it belongs under [{tables[0]}]" if tables else ""
 
 
 def _shown(value: object) -> str:
@@ -281,20 +290,20 @@ def _shown(value: object) -> str:
         return "a very long number"
 
 
-def _is_branch(part: str) -> bool:
+def _is_branch(name: str) -> bool:
     """Tell the names that pydantic gives to the branches of a union from keys."""
-    return part in (
+    return name in (
         "str",
         "float",
         "SignalConfig",
         "one record",
         "several records",
-    ) or part.startswith("function-after")
+    ) or name.startswith("function-after")
 
 
-def _keys_at(place: list[str], root: type[BaseModel]) -> list[str]:
+def _keys_at(names: list[str], root: type[BaseModel]) -> list[str]:
     """Return the keys that exist at a place of a config."""
-    model, parts = root, list(place)
+    model, parts = root, list(names)
     while parts:
         field = model.model_fields.get(parts.pop(0))
         table, named = _table(field.annotation) if field is not None else (None, False)

@@ -16,8 +16,7 @@ from pydantic import BaseModel
 
 from bwbayes.app.config.config import ALONE, Config, checked
 from bwbayes.app.config.keys import MEANINGS
-from bwbayes.app.config.model_settings import ModelConfig
-from bwbayes.app.config.settings import RecordConfig, SamplingConfig, ValidationConfig
+from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig, ValidationConfig
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
 
@@ -77,13 +76,13 @@ def config_of(
         tables["record"]["file"] = _file(record, ALONE, records, where)
     else:
         tables["record"] = {
-            name: tables["record"] | _training(name, one, records, where)
-            for name, one in _by_name(record, where).items()
+            name: tables["record"] | _training(name, training, records, where)
+            for name, training in _by_name(record, where).items()
         }
     if isinstance(keys.get("validation"), Mapping):
         tables["validation"] = {
-            name: _validation(str(name), given, records, where)
-            for name, given in keys["validation"].items()
+            name: _validation(str(name), held_out, records, where)
+            for name, held_out in keys["validation"].items()
         }
     return checked(tables, where), records
 
@@ -91,65 +90,65 @@ def config_of(
 def _by_name(record: Any, where: str) -> Mapping[str, Any]:
     """Return several records by name."""
     if isinstance(record, Mapping) and record:
-        return {str(name): one for name, one in record.items()}
+        return {str(name): source for name, source in record.items()}
     if not isinstance(record, list | tuple) or not record:
         _file(record, ALONE, {}, where)
     named: dict[str, Any] = {}
-    for number, one in enumerate(record, start=1):
-        name = Path(one).stem if isinstance(one, str | Path) else f"record_{number}"
+    for number, source in enumerate(record, start=1):
+        name = Path(source).stem if isinstance(source, str | Path) else f"record_{number}"
         if name in named:
             raise InputError(
                 f"{where}: two records are called {name!r}; give a dict of names and records"
             )
-        named[name] = one
+        named[name] = source
     return named
 
 
-def _training(name: str, given: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
+def _training(name: str, source: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
     """Return one of several training records as a config's table has it."""
-    if not isinstance(given, Mapping):
-        return {"file": _file(given, name, records, where)}
-    table = {key: _plain(value) for key, value in given.items() if key != "record"}
-    return table | {"file": _file(given.get("record"), name, records, where)}
+    if not isinstance(source, Mapping):
+        return {"file": _file(source, name, records, where)}
+    table = {key: _plain(value) for key, value in source.items() if key != "record"}
+    return table | {"file": _file(source.get("record"), name, records, where)}
 
 
-def _hint(key: str, known: list[str]) -> str:
+def _hint(key: str, names: list[str]) -> str:
     """Say which key is meant."""
     if key in TABLES:
         example = next(iter(TABLES[key].model_fields))
         return f"give the keys of [{key}] themselves, {example} for instance"
-    return suggestion(key, known, MEANINGS)
+    return suggestion(key, names, MEANINGS)
 
 
-def _validation(name: str, given: Any, records: dict[str, Record], where: str) -> Any:
+def _validation(name: str, held_out: Any, records: dict[str, Record], where: str) -> Any:
     """Return a validation as a config's table has it."""
-    if isinstance(given, Record | str | Path):
-        return {"file": _file(given, name, records, where)}
-    if not isinstance(given, Mapping):
-        return {"window": _plain(given)}
-    table = {key: _plain(value) for key, value in given.items() if key != "record"}
-    if "record" in given:
-        if not isinstance(given["record"], Record | str | Path):
-            known = ", ".join(ValidationConfig.model_fields)
+    if isinstance(held_out, Record | str | Path):
+        return {"file": _file(held_out, name, records, where)}
+    if not isinstance(held_out, Mapping):
+        return {"window": _plain(held_out)}
+    table = {key: _plain(value) for key, value in held_out.items() if key != "record"}
+    if "record" in held_out:
+        if not isinstance(held_out["record"], Record | str | Path):
+            names = ", ".join(ValidationConfig.model_fields)
             raise InputError(
                 f"{where}: validation.{name}.record: is not a record; give a Record, a file or a "
-                f"window; other keys are {known}"
+                f"window; other keys are {names}"
             )
-        table["file"] = _file(given["record"], name, records, where)
+        table["file"] = _file(held_out["record"], name, records, where)
     return table
 
 
-def _file(given: Any, name: str, records: dict[str, Record], where: str) -> str:
+def _file(source: Any, name: str, records: dict[str, Record], where: str) -> str:
     """Return the file of a record; of one in memory, which is noted, the name it will have."""
-    if isinstance(given, Record):
-        if given.displacement is None:
+    if isinstance(source, Record):
+        if source.displacement is None:
             raise InputError(f"{where}: {name}: has no displacement; give a measured record")
-        records[name] = given
+        records[name] = source
         return IN_MEMORY.format(name)
-    if isinstance(given, str | Path):
-        return str(Path(given).absolute())
+    if isinstance(source, str | Path):
+        return str(Path(source).absolute())
     raise InputError(
-        f"{where}: {name}: {type(given).__name__} is not a record; make one with "
+        f"{where}: {name}: {type(source).__name__} is not a record; make one with "
         "Record.from_arrays(voltage, displacement, interval=...) or Record.from_pandas(frame)"
     )
 

@@ -35,7 +35,7 @@ def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
         A word that is not known, or the same model twice.
     """
     models: dict[str, ModelConfig] = {}
-    for written in filter(None, (" ".join(part.split()) for part in text.split(";"))):
+    for written in filter(None, (" ".join(model.split()) for model in text.split(";"))):
         name = re.sub(r"\s*\+\s*", " + ", written)
         if name in models:
             raise InputError(f"models: {name!r} is there twice; leave one out")
@@ -66,7 +66,7 @@ def _model(name: str, base: ModelConfig) -> ModelConfig:
     }
     if options:
         changes |= _options(name, options)
-    for word in (one.strip() for one in others):
+    for word in (term.strip() for term in others):
         if word in TERMS:
             changes["gain"] = [*changes["gain"], word]
         elif word == "creep":
@@ -76,8 +76,8 @@ def _model(name: str, base: ModelConfig) -> ModelConfig:
         elif word in NOISES:
             changes["noise"] = word
         else:
-            known = [*TERMS, "creep", *DYNAMICS, *NOISES]
-            raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, known)}")
+            words = [*TERMS, "creep", *DYNAMICS, *NOISES]
+            raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, words)}")
     try:
         return ModelConfig.model_validate(base.model_dump() | changes)
     except ValidationError as error:
@@ -87,12 +87,12 @@ def _model(name: str, base: ModelConfig) -> ModelConfig:
 def _options(name: str, text: str) -> dict[str, Any]:
     """Read what stands in an operator's brackets: ``thresholds=4``."""
     try:
-        given = tomllib.loads(f"options = {{ {text} }}")["options"]
+        options = tomllib.loads(f"options = {{ {text} }}")["options"]
     except (ValueError, RecursionError):
         raise InputError(
             f"models: {name!r}: cannot read {text!r}; write options as in thresholds=4"
         ) from None
-    for key in given:
+    for key in options:
         if key not in OPTIONS:
             raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
-    return dict(given)
+    return dict(options)

@@ -21,12 +21,13 @@ from scipy import stats
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record
-from bwbayes.data.inspection import Finding, inspect, isolated_outliers
 from bwbayes.data.io.checks import checked
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.io.formats import read_table
 from bwbayes.data.io.grid import decimals_of
 from bwbayes.data.io.table import FileTable
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning
 from bwbayes.model.drive import rate
 from bwbayes.model.registry import DYNAMICS
@@ -74,7 +75,7 @@ class ConfigProposal:
     @property
     def pointless(self) -> Finding | None:
         """What makes a fit pointless, if anything."""
-        return next((one for one in self.findings if one.kind in POINTLESS), None)
+        return next((finding for finding in self.findings if finding.kind in POINTLESS), None)
 
 
 def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
@@ -100,7 +101,7 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
         table = read_table(path, naming)
         record = Record(**checked(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
-    findings = tuple(_with_sign(one, path, table) for one in inspect(record))
+    findings = tuple(_with_sign(finding, path, table) for finding in inspect(record))
     text = _text(path, where, table.naming, record, findings)
     return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
 
@@ -115,7 +116,7 @@ def _with_sign(finding: Finding, path: Path, table: FileTable) -> Finding:
         f'units = {{ displacement = "{turned}" }} under [record], or '
         f"`bwbayes init {path} --unit displacement={turned}`"
     )
-    return replace(finding, remedy=f"{finding.remedy}, or say {here}")
+    return replace(finding, fix=f"{finding.fix}, or say {here}")
 
 
 def _text(
@@ -124,13 +125,13 @@ def _text(
     """Write the config."""
     lines: dict[str, list[str]] = {"record": [], "model": []}
     notes = []
-    for one in findings:
-        notes.append(f"# {one.kind}: {one.text}")
-        remedy = re.fullmatch(r"(\w+ = .+) under \[(record|model)\]", one.remedy)
-        if remedy:
-            lines[remedy[2]].append(f"{remedy[1]}  # {one.kind}")
+    for finding in findings:
+        notes.append(f"# {finding.kind}: {finding.text}")
+        fix = re.fullmatch(r"(\w+ = .+) under \[(record|model)\]", finding.fix)
+        if fix:
+            lines[fix[2]].append(f"{fix[1]}  # {finding.kind}")
         else:
-            notes.append(f"#   what to do: {one.remedy}")
+            notes.append(f"#   fix: {finding.fix}")
     held = _held_out(record)
     train = _rest(record, held)
     aside = _spikes(record, held)
@@ -199,23 +200,23 @@ def _start(record: Record) -> list[str]:
     """Say how the drive starts, and what no record tells of it."""
     extent = float(np.ptp(record.voltage))
     away = abs(float(record.voltage[0])) > AWAY * extent
-    few = record.voltage[: max(record.samples // 100, 2)]
-    moving = float(np.ptp(few)) > MOVES * extent
-    how = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
+    beginning = record.voltage[: max(record.samples // 100, 2)]
+    moving = float(np.ptp(beginning)) > MOVES * extent
+    state = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
     if away:
-        return [f"# from_rest = false  # it starts {how}: its history is unknown, and estimated"]
+        return [f"# from_rest = false  # it starts {state}: its history is unknown, and estimated"]
     return [
-        f"# from_rest = true  # it starts {how}; say so if the actuator was demagnetised and "
+        f"# from_rest = true  # it starts {state}; say so if the actuator was demagnetised and "
         "nothing moved"
     ]
 
 
 def _tables(naming: Naming) -> list[str]:
     """Write which columns are meant, and their units."""
-    both = {"columns": naming.columns, "units": naming.units}
+    tables = {"columns": naming.columns, "units": naming.units}
     lines = [
         f"{key} = {{ {', '.join(f'{q} = {_quoted(name)}' for q, name in table.items())} }}"
-        for key, table in both.items()
+        for key, table in tables.items()
         if table
     ]
     return lines if naming.fs is None else [*lines, f"fs = {naming.fs!r}"]
@@ -262,8 +263,10 @@ def _difference(record: Record, windows: list[slice]) -> float:
     if not inside or np.ptp(other) == 0 or np.ptp(record.displacement[readings & held]) == 0:
         return 1.0
     drive = record.voltage, np.abs(rate(record.voltage, record.interval))
-    some = slice(None, None, 1 + record.samples // SEEN)
-    differences = [stats.ks_2samp(x[some][held[some]], x[some][~held[some]])[0] for x in drive]
+    thinned = slice(None, None, 1 + record.samples // SEEN)
+    differences = [
+        stats.ks_2samp(x[thinned][held[thinned]], x[thinned][~held[thinned]])[0] for x in drive
+    ]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
 
 

@@ -73,42 +73,45 @@ def config_reference(requested: str | None) -> str:
     InputError
         There is no such key.
     """
-    every = list(keys(Config))
+    documented = list(keys(Config))
     if requested is None:
         head = (
             "Every key of a config, by table. `bwbayes config KEY` shows one; notebooks and runs "
             "have whole configs."
         )
-        return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(every))])
-    asked = [key for key in every if _is_asked(key, requested.split("."))]
-    if not asked:
-        known = list(dict.fromkeys(key.name for key in every if key.name != ANY))
+        return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(documented))])
+    requested_keys = [key for key in documented if _is_asked(key, requested.split("."))]
+    if not requested_keys:
+        names = list(dict.fromkeys(key.name for key in documented if key.name != ANY))
         last = requested.split(".")[-1]
-        raise InputError(f"config: no key {requested!r}; {suggestion(last, known, MEANINGS)}")
-    inside = tuple(f"{key.path}." for key in asked if key.table is not None)
-    shown = [key for key in every if key in asked or key.path.startswith(inside)]
+        raise InputError(f"config: no key {requested!r}; {suggestion(last, names, MEANINGS)}")
+    inside = tuple(f"{key.path}." for key in requested_keys if key.table is not None)
+    shown = [key for key in documented if key in requested_keys or key.path.startswith(inside)]
     return "\n\n".join(_entry(key) for key in shown)
 
 
-def _once(every: list[Key]) -> Iterator[Key]:
+def _once(documented: list[Key]) -> Iterator[Key]:
     """Yield keys without those of a table that stands elsewhere already."""
-    seen: dict[type, str] = {}
+    first_paths: dict[type, str] = {}
     skipped: tuple[str, ...] = ()
-    for key in every:
+    for key in documented:
         if key.path.startswith(skipped or ("\n",)):
             continue
         yield key
-        if key.table is not None and seen.setdefault(key.table, key.path) != key.path:
+        if key.table is not None and first_paths.setdefault(key.table, key.path) != key.path:
             skipped = (*skipped, f"{key.path}.")
 
 
 def _is_asked(key: Key, requested: list[str]) -> bool:
     """Tell whether the path that a user wrote ends a key's path, with a name of theirs for NAME."""
     path = key.path.split(".")
-    for whole in (path, path[:-1] if path[-1] == ANY else path):
-        tail = whole[-len(requested) :]
+    for candidate in (path, path[:-1] if path[-1] == ANY else path):
+        tail = candidate[-len(requested) :]
         if len(tail) == len(requested) and tail[0] == requested[0]:
-            return all(mine in (ANY, theirs) for mine, theirs in zip(tail, requested, strict=True))
+            return all(
+                documented in (ANY, written)
+                for documented, written in zip(tail, requested, strict=True)
+            )
     return False
 
 
@@ -149,7 +152,9 @@ def parts_reference(requested: str | None) -> str:
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():
         lines.append(f"{kind}:")
-        lines += [f"  {name:25}{_paragraphs(_doc(maker))[0]}" for name, maker in makers.items()]
+        for name, maker in makers.items():
+            summary, *_ = (inspect.getdoc(type(maker())) or "").split("\n\n")
+            lines.append(f"  {name:25}{' '.join(summary.split())}")
         lines.append("")
     lines.append(
         _wrapped(
@@ -165,28 +170,19 @@ def _asked_parts(requested: str) -> Iterator[tuple[str, Maker]]:
     for kind in kinds:
         yield kind, PARTS[kind][requested]
     if not kinds:
-        every = {name: maker for makers in PARTS.values() for name, maker in makers.items()}
-        part = made("models", requested, every, {})
-        yield "from outside", lambda: part
-
-
-def _doc(maker: Maker) -> str:
-    """Return the docstring of what a maker makes."""
-    return inspect.getdoc(type(maker())) or ""
-
-
-def _paragraphs(text: str) -> list[str]:
-    return [" ".join(one.split()) for one in text.split("\n\n")]
+        registered = {name: maker for makers in PARTS.values() for name, maker in makers.items()}
+        component = made("models", requested, registered, {})
+        yield "from outside", lambda: component
 
 
 def _part(kind: str, name: str, maker: Maker) -> str:
     """Say all of a part: its docstring, then its parameters."""
-    part = maker()
-    own = inspect.getdoc(type(part)) or "It has no docstring."
+    component = maker()
+    text = inspect.getdoc(type(component)) or "It has no docstring."
     declared: tuple[Declaration, ...] = (
-        part.declarations if hasattr(part, "declarations") else part.parameters
+        component.declarations if hasattr(component, "declarations") else component.parameters
     )
-    lines = [f"{name} ({kind})", "", *_plain(own, options=kind == "hysteresis")]
+    lines = [f"{name} ({kind})", "", *_plain(text, options=kind == "hysteresis")]
     if declared:
         ranges = RING_BENDER
         lines += [
@@ -197,8 +193,10 @@ def _part(kind: str, name: str, maker: Maker) -> str:
                 "turn to turn); they scale with those of a record. `bwbayes check` prints yours."
             ),
         ]
-        for _, alike in groupby(declared, lambda one: re.sub(r"_\d+$", "_#", one.name)):
-            lines += ["", *_parameter(list(alike), "residual" if kind == "noise" else "actuator")]
+        for _, group in groupby(
+            declared, lambda declaration: re.sub(r"_\d+$", "_#", declaration.name)
+        ):
+            lines += ["", *_parameter(list(group), "residual" if kind == "noise" else "actuator")]
     return "\n".join(lines)
 
 
@@ -207,11 +205,11 @@ def _plain(doc: str, *, options: bool) -> Iterator[str]:
     body, *sections = re.split(r"\n\n(?=\w+\n-+\n)", doc)
     yield from _unmarked(body)
     for section in sections:
-        title, _, rest = section.split("\n", 2)
+        title, _, content = section.split("\n", 2)
         if title == "Notes":
-            yield from ("", *_unmarked(rest))
+            yield from ("", *_unmarked(content))
         elif title == "Parameters" and options:
-            yield from ("", "Options:", *(f"    {line}" for line in _unmarked(rest)))
+            yield from ("", "Options:", *(f"    {line}" for line in _unmarked(content)))
 
 
 def _unmarked(text: str) -> Iterator[str]:
@@ -222,28 +220,28 @@ def _unmarked(text: str) -> Iterator[str]:
     yield from "\n\n".join(paragraphs).splitlines()
 
 
-def _parameter(alike: list[Declaration], of: str) -> Iterator[str]:
+def _parameter(group: list[Declaration], of: str) -> Iterator[str]:
     """Yield the lines of a parameter, or of a row of numbered ones that are alike."""
-    declared, last = alike[0], alike[-1]
+    declared, last = group[0], group[-1]
     unit = "no unit" if declared.unit == "-" else declared.unit
     names = declared.name if last is declared else f"{declared.name} to {last.name}"
     until = "" if last is declared else f", and so on to: {last.description}"
     yield _wrapped(f"{names} ({unit}): {declared.description}{until}", "  ")
     limits = declared.stated_bounds or ("positive" if declared.positive else "")
     scope = "of each record" if declared.scope == "record" else f"of the {of}"
-    known = ", ".join(part for part in (scope, limits) if part)
-    yield _wrapped(f"{known}; {_default(declared)}", "      ")
+    facts = ", ".join(fact for fact in (scope, limits) if fact)
+    yield _wrapped(f"{facts}; {_default(declared)}", "      ")
 
 
 def _default(declared: Declaration) -> str:
     """Say a default prior at the ring bender's ranges."""
-    default, given = declared.default(Context(RING_BENDER)), ""
+    default, condition = declared.default(Context(RING_BENDER)), ""
     if default is None:
         default = declared.default(Context(RING_BENDER, {"stiffness": STIFFNESS}))
-        given = f" if stiffness is fixed, here at {STIFFNESS:g} N/m"
+        condition = f" if stiffness is fixed, here at {STIFFNESS:g} N/m"
     if default is None:
         why = f" ({declared.without_default})" if declared.without_default else ""
         return f"no default: give prior or fixed{why}"
     if isinstance(default, float | int):
-        return f"fixed at {default:g}{given}"
-    return f"{default}{given}"
+        return f"fixed at {default:g}{condition}"
+    return f"{default}{condition}"

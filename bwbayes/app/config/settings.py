@@ -1,6 +1,6 @@
-"""What a config says, except for the model: the home of every key's type, default and description.
+"""What a config says: the home of every key's type, default and description.
 
-A key is a field here and nowhere else: its type is what is checked, its :func:`described` what
+A key is a field here and nowhere else: its type is what is checked, its docstring what
 ``bwbayes config`` prints. A new key is a new field, and a new table a model that
 :class:`~bwbayes.app.config.config.Config` has a field for.
 """
@@ -9,17 +9,20 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
-from bwbayes.app.config.keys import ConfigTable, Positive, Texts, described
+from bwbayes.app.config.keys import ConfigTable, Positive, Texts, key
 from bwbayes.inference.engine import EngineChoice
 
 __all__ = [
+    "ActuatorConfig",
+    "ModelConfig",
     "Name",
     "ParameterConfig",
     "RecordConfig",
     "SamplingConfig",
     "SignalConfig",
+    "StandConfig",
     "ValidationConfig",
 ]
 
@@ -27,58 +30,50 @@ __all__ = [
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
 NotNegative = Annotated[float, Field(ge=0)]
 Window = Annotated[list[float], Field(min_length=2, max_length=2)]
-Windows = Annotated[list[Window], Field(min_length=1)]
-
-
-def _one_window(given: object) -> object:
-    """Take a single window for a list of one."""
-    alone = isinstance(given, list) and given and not any(isinstance(x, list) for x in given)
-    return [given] if alone else given
+# A single window stands for a list of one.
+Windows = Annotated[
+    list[Window],
+    BeforeValidator(
+        lambda value: (
+            [value]
+            if isinstance(value, list) and value and not any(isinstance(x, list) for x in value)
+            else value
+        )
+    ),
+    Field(min_length=1),
+]
 
 
 class SignalConfig(ConfigTable):
     """A voltage for the virtual test stand: V, Hz, s."""
 
-    shape: Annotated[
-        Literal["sine", "triangle", "steps"],
-        described("Shape of a period, or steps.", example='"triangle"'),
-    ] = "sine"
-    amplitude: Annotated[
-        Positive | None, described("Amplitude; not for steps.", unit="V", example="100.0")
-    ] = None
-    frequency: Annotated[
-        Positive | None, described("Frequency; not for steps.", unit="Hz", example="1.0")
-    ] = None
-    levels: Annotated[
-        Annotated[list[float], Field(min_length=1)] | None,
-        described("Voltages of steps.", unit="V", example="[10.0, 50.0, 0.0]"),
-    ] = None
-    dwell: Annotated[
-        Positive | None,
-        described(
-            "How long each step lasts; the last one stays to the end.", unit="s", example="2.0"
-        ),
-    ] = None
-    duration: Annotated[
-        Positive, described("Length of the record, from zero.", unit="s", example="16.0")
-    ]
-    start: Annotated[
-        NotNegative, described("When the voltage leaves zero.", unit="s", example="0.5")
-    ] = 0.0
-    decay: Annotated[
-        NotNegative,
-        described("Part of the amplitude that is lost every second.", unit="1/s", example="0.1"),
-    ] = 0.0
-    decay_from: Annotated[
-        NotNegative, described("When the decay begins.", unit="s", example="4.0")
-    ] = 0.0
+    shape: Literal["sine", "triangle", "steps"] = key("sine", example='"triangle"')
+    """Shape of a period, or steps."""
+    amplitude: Positive | None = key(None, unit="V", example="100.0")
+    """Amplitude; not for steps."""
+    frequency: Positive | None = key(None, unit="Hz", example="1.0")
+    """Frequency; not for steps."""
+    levels: Annotated[list[float], Field(min_length=1)] | None = key(
+        None, unit="V", example="[10.0, 50.0, 0.0]"
+    )
+    """Voltages of steps."""
+    dwell: Positive | None = key(None, unit="s", example="2.0")
+    """How long each step lasts; the last one stays to the end."""
+    duration: Positive = key(unit="s", example="16.0")
+    """Length of the record, from zero."""
+    start: NotNegative = key(0.0, unit="s", example="0.5")
+    """When the voltage leaves zero."""
+    decay: NotNegative = key(0.0, unit="1/s", example="0.1")
+    """Part of the amplitude that is lost every second."""
+    decay_from: NotNegative = key(0.0, unit="s", example="4.0")
+    """When the decay begins."""
 
     @model_validator(mode="after")
     def _of_its_shape(self) -> SignalConfig:
-        own, other = (self.levels, self.dwell), (self.amplitude, self.frequency)
+        needed, other = (self.levels, self.dwell), (self.amplitude, self.frequency)
         if self.shape != "steps":
-            own, other = other, own  # type: ignore[assignment]
-        if None in own or other != (None, None):
+            needed, other = other, needed  # type: ignore[assignment]
+        if None in needed or other != (None, None):
             raise ValueError("give levels and dwell for steps, else amplitude and frequency")
         return self
 
@@ -86,48 +81,26 @@ class SignalConfig(ConfigTable):
 class _Source(ConfigTable):
     """Where samples come from: a file, or a signal on the virtual test stand."""
 
-    file: Annotated[
-        str | None,
-        described(
-            "A record's file (text, HDF5, MATLAB, LVM or TDMS), relative to the config; this or "
-            "signal.",
-            example='"my_record.csv"',
-        ),
-    ] = None
-    signal: Annotated[
-        str | SignalConfig | None,
-        described(
-            "A voltage that the virtual test stand runs, by name or as a table.",
-            example="{ amplitude = 100.0, frequency = 1.0, duration = 16.0, decay = 0.1 }",
-        ),
-    ] = None
-    voltage_is: Annotated[
-        Literal["command", "output"] | None,
-        described(
-            "Whether the voltage is the command that a DAC held, or the amplifier's measured "
-            "output; by default what the file says, else the output.",
-            example='"command"',
-        ),
-    ] = None
-    columns: Annotated[
-        dict[str, str] | None,
-        described(
-            "The file's columns by quantity, where their names are not like voltage_V: names, the "
-            "ends of paths, or numbers counted from 1.",
-            example='{ time = "t [ms]", voltage = "U_mV", displacement = "3" }',
-        ),
-    ] = None
-    units: Annotated[
-        dict[str, str] | None,
-        described(
-            "Units by quantity, where the file does not state them; a minus turns the sign.",
-            example='{ displacement = "nm" }',
-        ),
-    ] = None
-    fs: Annotated[
-        Positive | None,
-        described("The file's sampling rate, in place of a time column.", unit="Hz", example="1e3"),
-    ] = None
+    file: str | None = key(None, example='"my_record.csv"')
+    """A record's file (text, HDF5, MATLAB, LVM or TDMS), relative to the config; this or signal."""
+    signal: str | SignalConfig | None = key(
+        None, example="{ amplitude = 100.0, frequency = 1.0, duration = 16.0, decay = 0.1 }"
+    )
+    """A voltage that the virtual test stand runs, by name or as a table."""
+    voltage_is: Literal["command", "output"] | None = key(None, example='"command"')
+    """Whether the voltage is the command that a DAC held, or the amplifier's measured output; by
+    default what the file says, else the output.
+    """
+    columns: dict[str, str] | None = key(
+        None, example='{ time = "t [ms]", voltage = "U_mV", displacement = "3" }'
+    )
+    """The file's columns by quantity, where their names are not like voltage_V: names, the ends of
+    paths, or numbers counted from 1.
+    """
+    units: dict[str, str] | None = key(None, example='{ displacement = "nm" }')
+    """Units by quantity, where the file does not state them; a minus turns the sign."""
+    fs: Positive | None = key(None, unit="Hz", example="1e3")
+    """The file's sampling rate, in place of a time column."""
 
     @model_validator(mode="after")
     def _naming(self) -> Self:
@@ -144,65 +117,26 @@ class RecordConfig(_Source):
     runs from the file's first sample.
     """
 
-    from_rest: Annotated[
-        bool,
-        described("Whether the record starts at rest, demagnetised.", example="true"),
-    ] = False
-    continues: Annotated[
-        Name | None,
-        described(
-            "Of several records, the one that this one goes on from at once: state, offset and "
-            "discrepancy carry over, and the two are fitted as one record of that name.",
-            example='"first"',
-        ),
-    ] = None
-    start: Annotated[
-        float | None,
-        described(
-            "Readings before are left out; the voltage is not, because the hysteresis remembers "
-            "it.",
-            unit="s",
-            example="2.0",
-        ),
-    ] = None
-    stop: Annotated[
-        float | None, described("The record is cut here.", unit="s", example="14.0")
-    ] = None
-    exclude: Annotated[
-        Windows | None,
-        described("Stretches whose readings are left out.", unit="s", example="[[3.1, 3.2]]"),
-    ] = None
-    outliers: Annotated[
-        list[float] | None,
-        described(
-            "Times of single readings that are left out; a run with model.outliers writes them.",
-            unit="s",
-            example="[3.105, 7.42]",
-        ),
-    ] = None
-    remarks: Annotated[
-        Texts | None,
-        described(
-            "What was noted when the record's files were read; a run writes it and shows it again.",
-            example='["my_record.csv:1: ignored columns: temperature_C"]',
-        ),
-    ] = None
-    decimate: Annotated[
-        int, Field(ge=1), described("Of so many readings one is used.", example="5")
-    ] = 1
-    train: Annotated[
-        Windows | None,
-        described(
-            "Windows to fit, [start, stop]; by default the whole record.",
-            unit="s",
-            example="[[0.0, 12.0]]",
-        ),
-    ] = None
-
-    @field_validator("train", "exclude", mode="before")
-    @classmethod
-    def _several(cls, given: object) -> object:
-        return _one_window(given)
+    from_rest: bool = key(False, example="true")
+    """Whether the record starts at rest, demagnetised."""
+    continues: Name | None = key(None, example='"first"')
+    """Of several records, the one that this one goes on from at once: state, offset and discrepancy
+    carry over, and the two are fitted as one record of that name.
+    """
+    start: float | None = key(None, unit="s", example="2.0")
+    """Readings before are left out; the voltage is not, because the hysteresis remembers it."""
+    stop: float | None = key(None, unit="s", example="14.0")
+    """The record is cut here."""
+    exclude: Windows | None = key(None, unit="s", example="[[3.1, 3.2]]")
+    """Stretches whose readings are left out."""
+    outliers: list[float] | None = key(None, unit="s", example="[3.105, 7.42]")
+    """Times of single readings that are left out; a run with model.outliers writes them."""
+    remarks: Texts | None = key(None, example='["my_record.csv:1: ignored columns: temperature_C"]')
+    """What was noted when the record's files were read; a run writes it and shows it again."""
+    decimate: int = key(1, ge=1, example="5")
+    """Of so many readings one is used."""
+    train: Windows | None = key(None, unit="s", example="[[0.0, 12.0]]")
+    """Windows to fit, [start, stop]; by default the whole record."""
 
     @model_validator(mode="after")
     def _one_source(self) -> RecordConfig:
@@ -211,36 +145,95 @@ class RecordConfig(_Source):
         return self
 
 
+class ActuatorConfig(ConfigTable):
+    """The parts of an actuator, by name or by import path, and their options.
+
+    ``passive``, ``thresholds``, ``odd`` and ``terms`` are options of some operators only.
+    """
+
+    hysteresis: str = key("bouc-wen", example='"prandtl-ishlinskii"')
+    """The hysteresis operator."""
+    gain: Texts = key([], example='["quadratic", "cubic"]')
+    """Terms of the voltage without memory, about the middle of its range: the asymmetry of measured
+    loops.
+    """
+    creep: bool | list[float] = key(False, example="true")
+    """Slow growth after a step: true for a lag per decade of time, or the lags' times in s."""
+    creep_growth: bool = key(False, example="true")
+    """Whether the creep grows with the voltage; needs creep."""
+    dynamics: str = key("lag", example='"second-order"')
+    """The linear dynamics behind the hysteresis."""
+    passive: bool | None = key(None, example="false")
+    """For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true)."""
+    thresholds: int | list[float] | None = key(
+        None, unit="V if a list", example="[5.0, 20.0, 60.0]"
+    )
+    """For plays and maxwell-slip: how many thresholds (default: 10), or which."""
+    odd: bool | None = key(None, example="false")
+    """For duhem: whether there are no even terms (default: true)."""
+    terms: Texts | None = key(None, example='["b4", "b5"]')
+    """For bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all)."""
+
+
+class ModelConfig(ActuatorConfig):
+    """The model: an actuator, and what is read of it."""
+
+    hold: Literal["auto", "first", "zero"] = key("auto", example='"zero"')
+    """What the voltage does between samples: straight lines (first), held (zero), or held if it is
+    a command (auto).
+    """
+    noise: str = key("discrepancy", example='"white"')
+    """The model of the residual."""
+    per_record: Texts = key([], example='["sensor_sd"]')
+    """Parameters that each of several records has of its own, besides initial and offset."""
+    shared: Texts = key([], example='["offset"]')
+    """Of initial and offset, what all of several records share."""
+    outliers: bool = key(False, example="true")
+    """Whether readings far from what their neighbours predict are set aside."""
+
+
+class StandModelConfig(ActuatorConfig):
+    """The actuator on the stand, by default the paper's ring bender."""
+
+    dynamics: str = key("second-order", example='"lag"')
+    """The linear dynamics of the stand's actuator."""
+
+
+class StandConfig(ConfigTable):
+    """The virtual test stand that signals are run on."""
+
+    discrepancy: Literal["none", "process", "structural"] = key("process", example='"structural"')
+    """How the stand's actuator departs from the model: not at all, by a random process, or by
+    creep, drift and an even term.
+    """
+    sample_rate: Positive = key(1000.0, unit="Hz", example="200.0")
+    """Samples of a record per second."""
+    model: StandModelConfig = key(StandModelConfig())
+    """The actuator on the stand, in parts."""
+    parameters: dict[str, float] = key({}, unit="the parameter's", example="{ d = 0.8 }")
+    """True values of its parameters; by default those of the paper's ring bender, or typical ones.
+    """
+
+
 class ParameterConfig(ConfigTable):
     """A parameter's prior or fixed value, bounds, and names for people."""
 
-    prior: Annotated[
-        dict[str, float | str] | None,
-        described(
-            "Its prior: a distribution and its arguments.",
-            example='{ distribution = "normal", mean = 0.7, sd = 0.07 }',
-        ),
-    ] = None
-    fixed: Annotated[
-        float | None,
-        described("Its value, if it is not fitted.", unit="the parameter's", example="0.7"),
-    ] = None
-    lower: Annotated[
-        float | None, described("Lower bound.", unit="the parameter's", example="0.5")
-    ] = None
-    upper: Annotated[
-        float | None, described("Upper bound.", unit="the parameter's", example="0.9")
-    ] = None
-    unit: Annotated[
-        str | None,
-        described("Its unit, to be checked; no other can be chosen.", example='"um/V"'),
-    ] = None
-    label: Annotated[
-        str | None, described("Its symbol in figures, in LaTeX.", example='"d_{33}"')
-    ] = None
-    description: Annotated[
-        str | None, described("What it is, for the report.", example='"gain of the bender"')
-    ] = None
+    prior: dict[str, float | str] | None = key(
+        None, example='{ distribution = "normal", mean = 0.7, sd = 0.07 }'
+    )
+    """Its prior: a distribution and its arguments."""
+    fixed: float | None = key(None, unit="the parameter's", example="0.7")
+    """Its value, if it is not fitted."""
+    lower: float | None = key(None, unit="the parameter's", example="0.5")
+    """Lower bound."""
+    upper: float | None = key(None, unit="the parameter's", example="0.9")
+    """Upper bound."""
+    unit: str | None = key(None, example='"um/V"')
+    """Its unit, to be checked; no other can be chosen."""
+    label: str | None = key(None, example='"d_{33}"')
+    """Its symbol in figures, in LaTeX."""
+    description: str | None = key(None, example='"gain of the bender"')
+    """What it is, for the report."""
 
     @model_validator(mode="after")
     def _prior_or_value(self) -> ParameterConfig:
@@ -254,93 +247,50 @@ class ParameterConfig(ConfigTable):
 class SamplingConfig(ConfigTable):
     """When to stop and how to sample; see :class:`bwbayes.sampling.plan.SamplingPlan`."""
 
-    engine: Annotated[
-        EngineChoice,
-        described("What evaluates the likelihood; auto: numba if installed.", example='"numpy"'),
-    ] = "auto"
-    ess: Annotated[
-        Positive,
-        described("Effective draws of every parameter at which to stop.", example="4000"),
-    ] = 2000.0
-    ensembles: Annotated[
-        int, Field(ge=4), described("Independent ensembles of walkers.", example="8")
-    ] = 4
-    walkers: Annotated[
-        Annotated[int, Field(ge=4, multiple_of=2)] | None,
-        described(
-            "Walkers of each ensemble; by default 64 (numba) or 32 (NumPy), or more for many "
-            "parameters.",
-            example="40",
-        ),
-    ] = None
-    block: Annotated[
-        int, Field(ge=10), described("Steps between two looks at convergence.", example="25")
-    ] = 50
-    steps: Annotated[
-        int, Field(ge=1), described("Largest number of steps that count.", example="40_000")
-    ] = 20_000
-    pilot_steps: Annotated[
-        int,
-        Field(ge=1),
-        described("Largest number of steps until the ensembles have met.", example="6_000"),
-    ] = 3_000
+    engine: EngineChoice = key("auto", example='"numpy"')
+    """What evaluates the likelihood; auto: numba if installed."""
+    ess: Positive = key(2000.0, example="4000")
+    """Effective draws of every parameter at which to stop."""
+    ensembles: int = key(4, ge=4, example="8")
+    """Independent ensembles of walkers."""
+    walkers: Annotated[int, Field(ge=4, multiple_of=2)] | None = key(None, example="40")
+    """Walkers of each ensemble; by default 64 (numba) or 32 (NumPy), or more for many parameters.
+    """
+    block: int = key(50, ge=10, example="25")
+    """Steps between two looks at convergence."""
+    steps: int = key(20_000, ge=1, example="40_000")
+    """Largest number of steps that count."""
+    pilot_steps: int = key(3_000, ge=1, example="6_000")
+    """Largest number of steps until the ensembles have met."""
 
 
 class ValidationConfig(_Source):
     """Held-out data: a window of the training record, or another record."""
 
-    window: Annotated[
-        Windows | None,
-        described(
-            "Windows [start, stop] of the training record that are held out, judged together; or "
-            "the part of another record to judge.",
-            unit="s",
-            example="[[6.0, 8.0], [14.0, 16.0]]",
-        ),
-    ] = None
-    of: Annotated[
-        str | None,
-        described(
-            "Of several training records, the one that the window is of, or whose own parameters "
-            "another record takes where nothing tells its own; by default the first.",
-            example='"record"',
-        ),
-    ] = None
-    from_rest: Annotated[
-        bool,
-        described("Whether another record starts at rest, demagnetised.", example="true"),
-    ] = False
-    own_offset: Annotated[
-        bool,
-        described(
-            "Whether the sensor may have been set to zero again before another record.",
-            example="false",
-        ),
-    ] = True
-    lead_in: Annotated[
-        Positive | None,
-        described(
-            "How long the beginning of another record, the lead-in, estimates its initial state "
-            "and offset; by default a quarter of the record, and ten correlation times of the "
-            "discrepancy at most.",
-            unit="s",
-            example="2.0",
-        ),
-    ] = None
-    lead_in_from: Annotated[
-        float | None,
-        described("Where the lead-in begins; by default with the record.", unit="s", example="0.5"),
-    ] = None
-
-    @field_validator("window", mode="before")
-    @classmethod
-    def _several(cls, given: object) -> object:
-        return _one_window(given)
+    window: Windows | None = key(None, unit="s", example="[[6.0, 8.0], [14.0, 16.0]]")
+    """Windows [start, stop] of the training record that are held out, judged together; or the part
+    of another record to judge.
+    """
+    of: str | None = key(None, example='"record"')
+    """Of several training records, the one that the window is of, or whose own parameters another
+    record takes where nothing tells its own; by default the first.
+    """
+    from_rest: bool = key(False, example="true")
+    """Whether another record starts at rest, demagnetised."""
+    own_offset: bool = key(True, example="false")
+    """Whether the sensor may have been set to zero again before another record."""
+    lead_in: Positive | None = key(None, unit="s", example="2.0")
+    """How long the beginning of another record, the lead-in, estimates its initial state and
+    offset; by default a quarter of the record, and ten correlation times of the discrepancy at
+    most.
+    """
+    lead_in_from: float | None = key(None, unit="s", example="0.5")
+    """Where the lead-in begins; by default with the record."""
 
     @model_validator(mode="after")
     def _one_source(self) -> ValidationConfig:
-        both = self.file is not None and self.signal is not None
-        if both or not (self.another or self.window is not None):
+        two_sources = self.file is not None and self.signal is not None
+        if two_sources or not (self.another or self.window is not None):
             raise ValueError("give one of window, file and signal")
         if not self.another and self.lead_in_from is not None:
             raise ValueError("lead_in_from is for another record; give file or signal with it")

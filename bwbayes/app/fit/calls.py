@@ -1,33 +1,26 @@
 """From a record to a fit in Python: ``fit = bwbayes.fit(record, dynamics="lag", train=(0, 12))``.
 
 What :func:`fit` makes, ``bwbayes run`` makes too, by the same functions; :func:`open_run` reads
-what either has written, and :func:`resume_run` goes on with it. :func:`compare` tells which of
-several models to take.
+what either has written, and :func:`resume` continues it. :func:`compare` tells which of
+several models to take. They load what they need when they are called.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from bwbayes.app.config.keywords import config_of
 from bwbayes.app.config.limits import USUAL_MODELS
-from bwbayes.app.config.models import models_of
-from bwbayes.app.fit.compared import Compared, compared, named
-from bwbayes.app.fit.fitted import Fit, carried_on, to_know
-from bwbayes.app.fit.surroundings import Scratch, console_of, warn
-from bwbayes.app.jobs.compare import Fitted, require_free, run_models
-from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import finished
-from bwbayes.data import Record
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
 
-__all__ = ["compare", "fit", "open_run", "resume_run"]
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.comparison.compared import Comparison
+    from bwbayes.data import Record
+    from bwbayes.inference.engine import Engine
+
+__all__ = ["compare", "fit", "open_run", "resume"]
 
 
 def fit(
@@ -35,6 +28,7 @@ def fit(
     *,
     folder: str | Path | None = None,
     overwrite: bool = False,
+    improve: bool = False,
     workers: int | None = None,
     executor: Any = None,
     progress: bool = True,
@@ -51,9 +45,11 @@ def fit(
         itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
     folder
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
-        Ctrl-C too, for :func:`resume_run`. By default nothing is left but the fit.
+        Ctrl-C too, for :func:`resume`. By default nothing is left but the fit.
     overwrite
         Replace a run that is in the folder already.
+    improve
+        First add the parts of the model, one after the other, for which the record has evidence.
     workers
         Ensembles side by side; by default one a core. The draws do not depend on it.
     executor
@@ -79,16 +75,31 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
+    from bwbayes.app.config.keywords import config_of
+    from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+    from bwbayes.app.problem.problem import resolve
+    from bwbayes.app.running import run
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.improving import improve_model
+
     config, records = config_of(record, keys)
-    problem = resolve(config, Path(), records)
-    warn(problem.remarks, 3)
     scratch = Scratch() if folder is None else None
     path = scratch.path / "run" if scratch is not None else Path(str(folder))
-    made = carried_on(
-        RunFolder.create(path, problem, overwrite), scratch, progress, workers, how=executor
+    console = console_of(progress)
+    if improve:
+        RunFolder.require_free(path, overwrite)
+        config = improve_model(config, Path(), console, records)
+    problem = resolve(config, Path(), records)
+    warn(problem.remarks, 3)
+    result = run.resume(
+        RunFolder.create(path, problem, overwrite),
+        console,
+        workers=workers,
+        files=scratch is None,
+        backend=executor,
     )
-    warn([one for one in to_know(made) if one not in problem.remarks], 3)
-    return made
+    warn([note for note in result.notes if note not in problem.remarks], 3)
+    return result.knowing(_scratch=scratch)
 
 
 def compare(
@@ -96,15 +107,17 @@ def compare(
     models: str | Sequence[str] | None = None,
     folder: str | Path | None = None,
     overwrite: bool = False,
+    screen: bool = True,
     future: bool = True,
     workers: int | None = None,
     executor: Any = None,
     progress: bool = True,
     **keys: Any,
-) -> Compared:
+) -> Comparison:
     """Compare models of the same readings, to tell which one to take.
 
-    To a record each model is fitted first; fits and runs that exist are compared as they are.
+    To a record each model is fitted first, side by side; fits and runs that exist are compared as
+    they are.
 
     Parameters
     ----------
@@ -120,9 +133,11 @@ def compare(
         that are there go on. By default nothing is left but the comparison.
     overwrite
         Replace what is in the folder already.
+    screen
+        Whether to leave out the sampling of models that are out of reach at their MAP estimates.
     future
-        Whether to predict the later half of the training readings from the earlier ones too, which
-        takes short fits.
+        Whether to score the later half of the training readings too, given the earlier half, which
+        takes a short fit.
     workers, executor, progress
         As in :func:`fit`.
     keys
@@ -138,74 +153,85 @@ def compare(
     Two models of a record, and fits that exist::
 
         comparison = bwbayes.compare(record, models="bouc-wen; maxwell-slip + quadratic")
-        comparison.recommended, comparison.against
+        comparison.recommended, comparison.caveats
         comparison = bwbayes.compare(fit, other_fit, "results/bender")
     """
+    from bwbayes.app.config.keywords import config_of
+    from bwbayes.app.config.models import models_of
+    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.fit.surroundings import Scratch, console_of
+    from bwbayes.app.jobs import compare as job
+    from bwbayes.app.jobs import models as models_job
+    from bwbayes.report.saving import refuse_existing
+
     scratch = Scratch() if folder is None else None
     path = scratch.path / "comparison" if scratch is not None else Path(str(folder))
-    require_free(path, overwrite)
-    given = runs[0] if len(runs) == 1 else list(runs)
-    listed = given if isinstance(given, list | tuple) else [given]
-    if any(isinstance(one, Fit) or _is_folder(one) for one in listed):
+    refuse_existing([path / "comparison.json"], overwrite=overwrite)
+    compared_runs = runs[0] if len(runs) == 1 else list(runs)
+    listed = compared_runs if isinstance(compared_runs, list | tuple) else [compared_runs]
+    if any(isinstance(run, Fit) or _is_folder(run) for run in listed):
         for name in [*keys] if models is None else ["models"]:
             raise InputError(f"compare: {name}: fits are compared as they are; leave it out")
         if len(listed) < 2:
             raise InputError("compare: one fit alone; give two or more, or a record")
-        fits = [_finished(one) for one in listed]
+        fits = job.by_name(_finished(fit) for fit in listed)
+        comparison = job.compare(fits, future=future, workers=workers, executor=executor)
     else:
-        config, records = config_of(given, keys, "compare")
+        config, records = config_of(compared_runs, keys, "compare")
         named_models = USUAL_MODELS if models is None else models
         text = named_models if isinstance(named_models, str) else "; ".join(named_models)
-        fits = run_models(
+        comparison = models_job.compare_models(
             config,
             Path(),
             models_of(text, config.model),
             path,
             console_of(progress),
-            workers,
-            executor,
-            given=records,
+            in_memory=records,
             overwrite=overwrite,
+            screen=screen,
+            future=future,
+            files=scratch is None,
+            workers=workers,
+            executor=executor,
         )
-    made = compared(fits, future=future, workers=workers, executor=executor)
     if scratch is None:
-        made.save(path)
-    return replace(made, _scratch=scratch)
+        comparison.save(path)
+    return comparison
 
 
-def _is_folder(given: Any) -> bool:
-    return isinstance(given, str | Path) and Path(given).is_dir()
+def _is_folder(run: Any) -> bool:
+    return isinstance(run, str | Path) and Path(run).is_dir()
 
 
-def _finished(given: Any) -> Fitted:
-    """Return a fit, or the run in a folder under the folder's name."""
-    if isinstance(given, Fit):
-        return named(given)
-    if not _is_folder(given):
+def _finished(run: Any) -> tuple[str, Fit]:
+    """Return a fit with its name, or the run in a folder with the folder's name."""
+    from bwbayes.app.fit.fitted import Fit
+
+    if isinstance(run, Fit):
+        return run.name, run
+    if not _is_folder(run):
         raise InputError(
-            f"compare: {given if isinstance(given, str | Path) else type(given).__name__}: is "
+            f"compare: {run if isinstance(run, str | Path) else type(run).__name__}: is "
             "neither a fit nor the folder of a run; give a list of those alone, or records alone"
         )
-    return replace(named(open_run(given)), name=Path(given).name)
+    return Path(run).name, open_run(run)
 
 
 def open_run(folder: str | Path) -> Fit:
-    """Open a run's folder, written by :func:`fit`, :meth:`Fit.save` or ``bwbayes run``.
+    """Open a run's folder, written by :func:`fit`, :meth:`bwbayes.Fit.save` or ``bwbayes run``.
 
     Raises
     ------
     InputError
         No such run, or it has no draws yet.
     """
-    where = RunFolder.open(Path(folder))
-    problem, chain, outcome = finished(where)
-    seconds = 0.0
-    if where.summary.is_file():
-        seconds = json.loads(where.summary.read_text(encoding="utf-8"))["wall_s"]
-    return Fit(problem, chain, outcome, where, seconds)
+    from bwbayes.app.running import run
+    from bwbayes.app.running.folder import RunFolder
+
+    return run.finished(RunFolder.open(Path(folder)))
 
 
-def resume_run(
+def resume(
     folder: str | Path,
     *,
     ess: float | None = None,
@@ -215,7 +241,7 @@ def resume_run(
     executor: Any = None,
     progress: bool = True,
 ) -> Fit:
-    """Go on with a run in a folder that was interrupted or is short of its target.
+    """Continue a run in a folder that was interrupted or is short of its target.
 
     Parameters
     ----------
@@ -224,7 +250,7 @@ def resume_run(
     ess, steps
         A new target of effective draws, a new budget of steps; by default as before.
     engine
-        Go on with this engine, whatever the chain was begun with.
+        Continue with this engine, whatever the chain was begun with.
     workers, executor, progress
         As in :func:`fit`.
 
@@ -238,7 +264,18 @@ def resume_run(
     InputWarning
         As :func:`fit` does.
     """
-    where = RunFolder.open(Path(folder))
-    made = carried_on(where, None, progress, workers, ess, steps, engine, executor)
-    warn(to_know(made), 3)
-    return made
+    from bwbayes.app.fit.surroundings import console_of, warn
+    from bwbayes.app.running import run
+    from bwbayes.app.running.folder import RunFolder
+
+    result = run.resume(
+        RunFolder.open(Path(folder)),
+        console_of(progress),
+        workers=workers,
+        ess=ess,
+        steps=steps,
+        engine=engine,
+        backend=executor,
+    )
+    warn(result.notes, 3)
+    return result

@@ -14,11 +14,10 @@ from typing import Any
 
 from bwbayes.app.config.config import dump
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.fit.calls import open_run
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
-from bwbayes.app.jobs.campaign import carry_on, config_text, start
+from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult
@@ -27,6 +26,7 @@ from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.population.next_specimen import next_specimen
 from bwbayes.population.population import Population
+from bwbayes.report.figures import drawn
 from bwbayes.results.start import Start
 from bwbayes.shown import head
 
@@ -110,7 +110,7 @@ class Campaign:
         )
         source = generator(first.problem.config.seed, "next specimen")
         posterior = first.problem.posterior
-        draws = next_specimen(self.population, posterior, first.result.flat_draws, source)
+        draws = next_specimen(self.population, posterior, first.flat_draws, source)
         begin = Start(from_rest, True, lead_in)
         return predict_another(first.problem, draws, other, begin, "next specimen", None)
 
@@ -122,17 +122,16 @@ class Campaign:
         InputError
             No record has converged.
         """
-        figures = draw_campaign(self.result)
-        if not figures:
+        if not self.result.units:
             raise InputError("campaign: no record has converged, so there is nothing to draw")
-        return figures["parameters"]
+        return drawn(self.result.draw)
 
     def __repr__(self) -> str:
         return head(str(self))
 
     def __str__(self) -> str:
-        ended = ", ".join(f"{n} {status}" for status, n in self.result.counts.items() if n)
-        lines = [f"{len(self.result.rows)} records: {ended}"]
+        counts = ", ".join(f"{n} {status}" for status, n in self.result.counts.items() if n)
+        lines = [f"{len(self.result.rows)} records: {counts}"]
         lines += [f"{name}: {why}" for name, why in self.short.items()]
         lines += [
             f"{name}: off the population in {', '.join(o)}" for name, o in self.outliers.items()
@@ -194,22 +193,24 @@ def campaign(
     if config is not None:
         text, where = config_text(Path(config)), Path(config).parent
     elif keys:
-        each, in_memory = config_of("each", keys, "campaign")
+        common, in_memory = config_of("each", keys, "campaign")
         if in_memory:
             raise InputError("campaign: validation: give files, which each record's run can read")
-        text = dump(each)
+        text = dump(common)
     scratch = Scratch() if folder is None else None
     path = scratch.path / "campaign" if scratch is not None else Path(str(folder))
     source = path.with_name(f"{path.name}-records") if isinstance(records, Mapping) else records
     if isinstance(records, Mapping):
         _write(records, Path(source))
-    made = start(Path(source), text, where, path, pictures=pictures, overwrite=overwrite)
-    ended = Campaign(
-        carry_on(made, console_of(progress), workers=workers, how=executor), made, scratch
+    begun_folder = start(Path(source), text, where, path, pictures=pictures, overwrite=overwrite)
+    finished = Campaign(
+        resume(begun_folder, console_of(progress), workers=workers, backend=executor),
+        begun_folder,
+        scratch,
     )
-    off = [f"{name}: off the population in {', '.join(o)}" for name, o in ended.outliers.items()]
-    warn([*(f"{name}: {why}" for name, why in ended.short.items()), *off], 3)
-    return ended
+    off = [f"{name}: off the population in {', '.join(o)}" for name, o in finished.outliers.items()]
+    warn([*(f"{name}: {why}" for name, why in finished.short.items()), *off], 3)
+    return finished
 
 
 def _write(records: Mapping[str, Record], folder: Path) -> None:

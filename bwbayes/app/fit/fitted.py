@@ -2,70 +2,68 @@
 
 A :class:`Fit` is a run's folder with the run in memory; ``bwbayes run`` makes the same folder by
 the same functions. Without a folder of one's own it lives in a temporary one, as long as the fit
-does. What the command line prints as a remark is a warning here
-(:class:`~bwbayes.errors.InputWarning`).
+does.
 """
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self, cast
 
-from rich.console import Console
-
-from bwbayes.app.fit.advice import Advice, require_converged
 from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+from bwbayes.app.jobs.at_work import at_work
+from bwbayes.app.jobs.compare import by_name
+from bwbayes.app.jobs.compare import compare as compare_fits
+from bwbayes.app.jobs.compensate import compensate as compensate_fit
+from bwbayes.app.jobs.design import design as design_fit
+from bwbayes.app.jobs.export import export as export_fit
+from bwbayes.app.jobs.track import track as track_fit
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.report.page import template
+from bwbayes.app.running.assembling import assemble, load_result
+from bwbayes.app.running.fingerprint import version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another, residuals_along
-from bwbayes.app.running.run import (
-    Run,
-    assemble,
-    go_on,
-    log_likelihood,
-    write_files,
-)
-from bwbayes.app.screen import (
-    PARAMETER_COLUMNS,
-    SCORE_COLUMNS,
-    parameter_rows,
-    score_texts,
-    show_result,
-)
+from bwbayes.app.running.workers import executor
+from bwbayes.arrays import FloatArray
+from bwbayes.comparison.compared import Comparison
 from bwbayes.data import Record, read_record
+from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
+from bwbayes.report.page import fragment
+from bwbayes.report.report import Report
+from bwbayes.report.run import run_report
+from bwbayes.report.screen import as_text
 from bwbayes.results.loops import Loops
 from bwbayes.results.outputs import posterior_tree
 from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
-from bwbayes.sampling.sampler import Outcome
+from bwbayes.sampling.sampler import Outcome, draws, log_densities, sample
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.shown import head
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Fit", "carried_on", "to_know"]
+__all__ = ["Fit"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit(Advice):
+class Fit:
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
     Parameters
     ----------
     problem
         What was fitted: config in explicit numbers, record, priors.
-    chain, outcome
-        The draws, and how the sampling ended.
+    chain
+        The draws.
     folder
         The run's folder.
     seconds
@@ -74,25 +72,50 @@ class Fit(Advice):
     Notes
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
-    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` goes on.
+    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them. Whatever
+    is worked out of them is worked out when it is first asked for.
     """
 
     problem: Problem
     chain: ChainFile
-    outcome: Outcome
     folder: RunFolder
     seconds: float = 0.0
     _scratch: Scratch | None = field(default=None, repr=False)
+
+    def knowing(self, **results: object) -> Self:
+        """Return this fit with attributes that are there already, worked out ones too."""
+        fit = copy(self)
+        fit.__dict__.update(results)  # a cached property is a plain attribute
+        return fit
+
+    @property
+    def name(self) -> str:
+        """The name of its config, or else of its operator."""
+        return self.problem.config.name or self.problem.config.model.hysteresis
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """How the sampling ended, or stands."""
+        if self._loaded is not None:
+            return self._loaded.outcome
+        plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
+        with executor(1) as pool:
+            return sample(self.problem.posterior, plan, self.chain, pool)
 
     @property
     def converged(self) -> bool:
         """Whether the sampling has converged."""
         return self.outcome.converged
 
+    @cached_property
+    def standing(self) -> Standing:
+        """Whether the bands hold, all together: as its folder says, if it does."""
+        return self.folder.standing() if self.folder.numbers() else self.result.standing
+
     @property
     def holds(self) -> bool | None:
         """Whether all bands hold on their readings; None if that is inconclusive anywhere."""
-        return self.result.standing.holds if self.converged else None
+        return self.standing.holds if self.converged else None
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
@@ -102,27 +125,67 @@ class Fit(Advice):
     @property
     def remarks(self) -> tuple[str, ...]:
         """What to know of the record, the priors and the fit, one line each."""
-        return self.result.remarks
+        written = self.folder.numbers()
+        if "result" in self.__dict__ or not written:
+            return self.result.remarks
+        now = versions(self.problem.posterior.engine)
+        changed = version_remarks(self.chain.attributes().get("versions"), now)
+        return tuple(dict.fromkeys([*changed, *written["remarks"]]))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The remarks, what does not hold, and a sampling that has not converged."""
+        unconverged = f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
+        lines = (*self.remarks, *self.standing.said)
+        return lines if self.converged else (*lines, unconverged)
 
     @cached_property
     def result(self) -> Result:
         """The run in numbers and arrays, as the report is made of."""
-        return assemble(self.problem, self.chain, self.outcome)
+        return self._loaded or assemble(self.problem, self.chain, self.outcome)
+
+    @cached_property
+    def _loaded(self) -> Result | None:
+        return load_result(self.folder.result, self.problem, self.chain)
+
+    @cached_property
+    def flat_draws(self) -> FloatArray:
+        """All draws, (draws, free), parameters in their own units."""
+        drawn = draws(self.problem.posterior, self.chain)
+        return drawn.reshape(-1, drawn.shape[-1])
+
+    @property
+    def log_likelihood(self) -> FloatArray:
+        """The log likelihood of each draw, nats, (steps, ensembles, walkers)."""
+        prior, log_density = self.problem.posterior.prior, log_densities(self.chain)
+        _, log_prior = prior.constrain(prior.unconstrain(self.flat_draws))
+        return log_density - log_prior.reshape(log_density.shape)
+
+    @property
+    def resuming(self) -> str:
+        """The command that resumes the run, with twice the steps that it had."""
+        return f"bwbayes resume {self.folder.path} --steps {2 * self.problem.config.sampling.steps}"
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """The run's numbers, as its ``summary.json`` holds them."""
+        return summary(self.result) | {
+            "seed": self.problem.config.seed,
+            "go_on": None if self.converged else self.resuming,
+            "wall_s": self.seconds,
+            "versions": versions(self.problem.posterior.engine),
+            "data_sha256": self.problem.sha256,
+        }
 
     @cached_property
     def posterior(self) -> Any:
-        """The draws and their densities as arviz has them, an xarray.DataTree.
-
-        Its attribute ``converged`` is 1 or 0.
-        """
-        density = log_likelihood(self.problem.posterior, self.result)
-        return posterior_tree(self.result, density, self.problem.records)
+        """The draws as arviz has them, an xarray.DataTree; its ``converged`` is 1 or 0."""
+        return posterior_tree(self.result, self.log_likelihood, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
         """The draws (chain, draw) of each free parameter, in its own unit; converged or not."""
-        drawn: xarray.Dataset = self.posterior["posterior"].to_dataset()
-        return drawn
+        return cast("xarray.Dataset", self.posterior["posterior"].to_dataset())
 
     @property
     def summary(self) -> Any:
@@ -151,32 +214,20 @@ class Fit(Advice):
             The sampling has not converged.
         """
         result = self._converged()
+        scores, verdicts = result.scores, result.verdicts
         return {
-            one.name: Prediction.of(one, result.scores.get(one.name), result.verdicts.get(one.name))
-            for one in result.bands
+            bands.name: Prediction.of(bands, scores.get(bands.name), verdicts.get(bands.name))
+            for bands in result.bands
         }
 
     @property
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted, and where there is no reading. Those of several records
-        are those of their bands: ``fit.bands["step_10"].residuals``.
-
-        Raises
-        ------
-        NotConvergedError
-            The sampling has not converged.
-        InputError
-            Several records were fitted.
+        nan where nothing was predicted or read. Of several records this raises an InputError: take
+        ``fit.bands[NAME].residuals``.
         """
-        import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
-
-        values = residuals_along(self.problem, self.bands)
-        time = ("time", self.problem.record.time, {"units": "s"})
-        return xr.DataArray(
-            values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
-        )
+        return residuals_along(self.problem, self.bands)
 
     @property
     def loops(self) -> Loops | None:
@@ -212,9 +263,8 @@ class Fit(Advice):
         window
             Start and stop in s of the part that is predicted and judged; by default all of it.
         from_rest, own_offset, lead_in, lead_in_from, after, of
-            What is known of its start, as of a config's [validation.NAME]; see
-            :class:`bwbayes.Start`. With ``after`` what comes after the lead-in is a
-            forecast.
+            What is known of its start, as of a config's [validation.NAME]. With ``after`` what
+            comes after the lead-in is a forecast.
 
         Raises
         ------
@@ -228,19 +278,37 @@ class Fit(Advice):
         InputWarning
             A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
         """
-        result = self._converged()
-        other = record
-        if not isinstance(other, Record):
-            name = name or Path(other).stem
-            other = read_record(other, need_displacement=False)
+        self.require_converged()
+        if not isinstance(record, Record):
+            name = name or Path(record).stem
+            record = read_record(record, need_displacement=False)
         hold = self.problem.config.model.hold
-        known = None if hold == "auto" else hold
-        start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
+        interpolation = None if hold == "auto" else hold
+        start = Start(from_rest, own_offset, lead_in, lead_in_from, interpolation, after)
         name = name or "prediction"
-        made = predict_another(self.problem, result.flat_draws, other, start, name, window, of)
-        warn([f"{name}: {remark}" for remark in made.remarks], 3)
-        warn(Standing.of([made.verdict] if made.verdict else []).said, 3)
-        return made
+        prediction = predict_another(self.problem, self.flat_draws, record, start, name, window, of)
+        standing = Standing.of([prediction.verdict] if prediction.verdict else [])
+        warn([*(f"{name}: {remark}" for remark in prediction.remarks), *standing.said], 3)
+        return prediction
+
+    compensate = at_work(compensate_fit)
+    design = at_work(design_fit)
+    export = at_work(export_fit)
+    track = at_work(track_fit)
+
+    def compare(
+        self,
+        *others: Fit,
+        future: bool = True,
+        workers: int | None = None,
+        executor: Any = None,
+    ) -> Comparison:
+        """Compare this fit with others of the same readings, to tell which model to take.
+
+        Options and errors are as in :func:`bwbayes.compare`, which fits models, too.
+        """
+        fits = by_name((fit.name, fit) for fit in (self, *others))
+        return compare_fits(fits, future=future, workers=workers, executor=executor)
 
     def resume(
         self,
@@ -252,15 +320,24 @@ class Fit(Advice):
         executor: Any = None,
         progress: bool = True,
     ) -> Fit:
-        """Go on sampling, with a new target or budget, and return what comes of it.
+        """Continue the sampling, with a new target or budget, and return what comes of it.
 
-        Parameters and errors are as in :func:`bwbayes.resume_run`.
+        Parameters and errors are as in :func:`bwbayes.resume`.
         """
-        made = carried_on(
-            self.folder, self._scratch, progress, workers, ess, steps, engine, executor
+        from bwbayes.app.running import run  # noqa: PLC0415  # which makes fits
+
+        fit = run.resume(
+            self.folder,
+            console_of(progress),
+            workers=workers,
+            ess=ess,
+            steps=steps,
+            engine=engine,
+            files=self._scratch is None,
+            backend=executor,
         )
-        warn(to_know(made), 3)
-        return made
+        warn(fit.notes, 3)
+        return fit.knowing(_scratch=self._scratch)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the run to a folder of its own, all that ``bwbayes run`` writes, and return it.
@@ -270,82 +347,51 @@ class Fit(Advice):
         InputError
             The folder exists and ``overwrite`` is not given, or it cannot be written.
         """
-        made = RunFolder.create(Path(folder), self.problem, overwrite)
-        with made.locked():
-            shutil.copyfile(self.folder.chain, made.chain)
-            write_files(made, self.problem, self.result, self.seconds)
-        return made.path
+        from bwbayes.app.running import run  # noqa: PLC0415  # which makes fits
+
+        copied = RunFolder.create(Path(folder), self.problem, overwrite)
+        with copied.locked():
+            shutil.copyfile(self.folder.chain, copied.chain)
+            run.write_files(self, copied)
+        return copied.path
+
+    def require_converged(self) -> None:
+        """Refuse a sampling that has not converged.
+
+        Raises
+        ------
+        NotConvergedError
+            It has not.
+        """
+        if not self.converged:
+            call = "fit.resume(" if self._scratch else f"bwbayes.resume({str(self.folder.path)!r}, "
+            raise NotConvergedError(
+                f"not converged: {self.outcome.stop_reason}; intervals are withheld; resume with "
+                f"`{call}steps={2 * self.problem.config.sampling.steps})`, and look at the traces"
+            )
 
     def _converged(self) -> Result:
         """Return the result, or refuse."""
-        require_converged(self)
+        self.require_converged()
         return self.result
 
     @property
     def _title(self) -> str:
-        name = self.problem.config.name or ", ".join(
-            record.origin for record in self.problem.records.values()
-        )
-        if not self.converged:
-            return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
-        return f"{name}: converged, validation {self.result.standing.status}"
+        origins = [record.origin for record in self.problem.records.values()]
+        name = self.problem.config.name or ", ".join(origins)
+        if self.converged:
+            return f"{name}: converged, validation {self.standing.status}"
+        return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
 
     def __repr__(self) -> str:
         return head(str(self))
 
     def __str__(self) -> str:
-        said = StringIO()
-        console = Console(file=said, width=110, force_jupyter=False, color_system=None)
-        console.print(self._title, highlight=False, markup=False, soft_wrap=True)
-        show_result(self.result, None, console)
-        return said.getvalue().rstrip()
+        return f"{self._title}\n{as_text(self.report())}"
 
     def _repr_html_(self) -> str:
-        scores = self.result.scores
-        return template("fit.html.j2").render(
-            title=self._title,
-            standing=self.result.standing,
-            parameter_columns=PARAMETER_COLUMNS,
-            parameters=list(parameter_rows(self.result)),
-            score_columns=list(SCORE_COLUMNS),
-            scores=[
-                (name, self.verdicts[name].status, *score_texts(one))
-                for name, one in scores.items()
-            ],
-            remarks=self.remarks,
-        )
+        return fragment(replace(self.report(), title=self._title))
 
-
-def carried_on(
-    folder: RunFolder,
-    scratch: Scratch | None,
-    progress: bool,
-    workers: int | None,
-    ess: float | None = None,
-    steps: int | None = None,
-    engine: Engine | None = None,
-    how: Any = None,
-) -> Fit:
-    """Finish a run; in a temporary folder, without the files that ``save`` writes."""
-    run: Run = go_on(
-        folder,
-        console_of(progress),
-        workers=workers,
-        ess=ess,
-        steps=steps,
-        engine=engine,
-        files=scratch is None,
-        how=how,
-    )
-    made = Fit(run.problem, run.chain, run.outcome, folder, run.seconds, scratch)
-    # It is known already, and a cached property is a plain attribute.
-    made.__dict__["result"] = run.result
-    return made
-
-
-def to_know(made: Fit) -> list[str]:
-    """Return what the command line would print of a finished run."""
-    lines = [*made.remarks, *made.result.standing.said]
-    if not made.converged:
-        lines.append(f"NOT CONVERGED: {made.outcome.stop_reason}; intervals are withheld")
-    return lines
+    def report(self) -> Report:
+        """Return what the page of the run says."""
+        return run_report(self.result, self.numbers)

@@ -9,24 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
-
-from bwbayes.app.figures import draw_alone
-from bwbayes.app.figures.chain import draw_corner, draw_ranks, draw_trace
-from bwbayes.app.figures.coverage import draw_coverage
-from bwbayes.app.figures.innovations import draw_innovations
-from bwbayes.app.figures.loop import draw_loop
-from bwbayes.app.figures.loops import draw_loops
-from bwbayes.app.figures.record import draw_record
-from bwbayes.app.figures.spectrum import draw_spectrum
-from bwbayes.app.figures.style import STYLE
-from bwbayes.app.figures.tracking import draw_tracking
 from bwbayes.app.problem.problem import Problem
-from bwbayes.control.tracking import Tracking
+from bwbayes.control.tracked import CONTROLLERS, Tracking
 from bwbayes.errors import InputError, suggestion
+from bwbayes.report.figures import drawn
+from bwbayes.report.figures.chain import draw_corner, draw_ranks, draw_trace
+from bwbayes.report.figures.coverage import draw_coverage
+from bwbayes.report.figures.innovations import draw_innovations
+from bwbayes.report.figures.loop import draw_loop
+from bwbayes.report.figures.loops import draw_loops
+from bwbayes.report.figures.record import record_drawings
+from bwbayes.report.figures.series import draw_bands
+from bwbayes.report.figures.spectrum import draw_spectrum
+from bwbayes.report.figures.tracking import draw_tracking
+from bwbayes.report.report import Figure
 from bwbayes.results.bands import Bands
 from bwbayes.results.result import Result
 from bwbayes.shown import brief
@@ -55,58 +52,58 @@ class Plots:
         """
         problem, name = self.problem, self._record(name)
         training = problem.posterior.alone(name).only.training
-        every = draw_record(problem.records[name], training, problem.findings[name])
-        return _named(every, kind)
+        drawings = record_drawings(problem.records[name], training, problem.findings[name])
+        return drawn(_named(drawings, kind))
 
     def loop(self, *names: str) -> Figure:
         """Draw displacement against voltage with its bands, and its tip enlarged.
 
         By default for all that was predicted with the fit, or for the bands of these names.
         """
-        return _drawn(draw_loop, [self._bands(name) for name in names] or self.converged().bands)
+        return drawn(draw_loop, [self._bands(name) for name in names] or self.converged().bands)
 
     def loops(self) -> Figure:
         """Draw the major and a minor loop and the initial curve, measured."""
-        return _drawn(draw_loops, self.converged().loops)
+        return drawn(draw_loops, self.converged().loops)
 
     def bands(self, name: str | None = None) -> Figure:
         """Draw the bands of one window or record along time, by default the first fitted one."""
-        return draw_alone(self._bands(name or self.converged().bands[0].name))
+        return drawn(draw_bands, self._bands(name or self.converged().bands[0].name))
 
     def coverage(self) -> Figure:
         """Draw how much the bands cover against what they promise, and the readings' PIT."""
         result = self.converged()
-        return _drawn(draw_coverage, result.bands, result.scores)
+        return drawn(draw_coverage, result.bands, result.scores)
 
     def innovations(self, name: str | None = None) -> Figure:
         """Draw whether innovations, what each reading adds, are white, normal, of one size.
 
         Of several records in the one of this name, by default the first.
         """
-        return _drawn(draw_innovations, self.converged().innovations[self._record(name)])
+        return drawn(draw_innovations, self.converged().innovations[self._record(name)])
 
     def spectrum(self, name: str | None = None) -> Figure:
         """Draw the residual's spectrum with its lines, beside the noise model's.
 
         Of several records in the one of this name, by default the first.
         """
-        return _drawn(draw_spectrum, self.converged().innovations[self._record(name)])
+        return drawn(draw_spectrum, self.converged().innovations[self._record(name)])
 
     def corner(self) -> Figure:
         """Draw each parameter of the posterior, and each pair of them."""
-        return _drawn(draw_corner, self.converged())
+        return drawn(draw_corner, self.converged())
 
     def trace(self) -> Figure:
         """Draw each ensemble's mean and spread, step by step."""
-        return _drawn(draw_trace, self.result)
+        return drawn(draw_trace, self.result)
 
     def ranks(self) -> Figure:
         """Draw how the ranks of each ensemble's draws are spread."""
-        return _drawn(draw_ranks, self.result)
+        return drawn(draw_ranks, self.result)
 
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
-        return draw_tracking(tracked)
+        return drawn(draw_tracking, tracked.to_pandas(), CONTROLLERS)
 
     def _record(self, name: str | None) -> str:
         """Return the name of a training record, by default of the first."""
@@ -115,16 +112,11 @@ class Plots:
         return name or next(iter(self.problem.records))
 
     def _bands(self, name: str) -> Bands:
-        every = {one.name: one for one in self.converged().bands}
-        return _named(every, name)
+        by_name = {bands.name: bands for bands in self.converged().bands}
+        return _named(by_name, name)
 
 
-def _named[T](every: Mapping[str, T], name: str) -> T:
-    if name not in every:
-        raise InputError(f"plot: no {name!r} here; {suggestion(name, every)}")
-    return every[name]
-
-
-def _drawn(draw: Callable[..., Figure], *what: Any) -> Figure:
-    with mpl.rc_context(STYLE):
-        return draw(*what)
+def _named[T](items: Mapping[str, T], name: str) -> T:
+    if name not in items:
+        raise InputError(f"plot: no {name!r} here; {suggestion(name, items)}")
+    return items[name]

@@ -1,57 +1,64 @@
-"""A finished run to be put to work: its draws, its validation, and the voltages it may use."""
+"""A fit that has converged put to work, and the voltages it may use."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Concatenate
 
 import numpy as np
 
+from bwbayes.app.fit.surroundings import warn
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import finished, going_on
-from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.model.operator import Span
-from bwbayes.results.standing import Standing
-from bwbayes.sampling.sampler import draws
 
-__all__ = ["RunDraws", "command_limits", "drawn", "limits_of", "refuse_existing"]
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
 
-
-class RunDraws(NamedTuple):
-    """What a run that has converged gives to whatever builds on it.
-
-    ``problem`` is what was fitted; ``flat`` its draws, (draws, free), parameters in their own
-    units; ``standing`` how its validation came out, which goes along.
-    """
-
-    problem: Problem
-    flat: FloatArray
-    standing: Standing = Standing()
+__all__ = ["at_work", "command_limits", "limits_of", "opened"]
 
 
-def drawn(path: Path) -> RunDraws:
-    """Return what the run in a folder gives.
+def at_work[**P, R](job: Callable[Concatenate[Fit, P], R]) -> Callable[Concatenate[Fit, P], R]:
+    """Make a job the method of a fit: it needs convergence, and warns as a command prints."""
+    options = [*signature(job).parameters][1:]
+
+    @wraps(job)
+    def method(fit: Fit, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        for name in kwargs:
+            if name not in options:
+                raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")
+        fit.require_converged()
+        warn(fit.standing.said, 3)
+        product = job(fit, *args, **kwargs)
+        warn(getattr(product, "remarks", ()), 3)
+        return product
+
+    return method
+
+
+def opened(path: Path) -> Fit:
+    """Return the fit in a folder, if it is finished and has converged.
 
     Raises
     ------
     NotConvergedError
         The sampling has not converged.
     InputError
-        No such run.
+        No such run, or it is not finished.
     """
+    from bwbayes.app.running.run import finished  # noqa: PLC0415  # fits can do what jobs do
+
     folder = RunFolder.open(path)
-    problem, chain, outcome = finished(folder)
-    if not outcome.converged:
-        raise NotConvergedError(
-            f"{path}: {outcome.stop_reason}; go on with `{going_on(path, problem)}`"
-        )
-    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
-    return RunDraws(problem, flat, folder.standing())
+    fit = finished(folder)
+    fit.require_converged()
+    return fit.knowing(standing=folder.standing())
 
 
-def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
+def limits_of(problem: Problem, limits: tuple[float, float] | None) -> Span:
     """Return the voltages that may be used: those given, or those of all that was fitted, V.
 
     Raises
@@ -60,29 +67,16 @@ def limits_of(problem: Problem, given: tuple[float, float] | None) -> Span:
         They are not two voltages, the lower one first.
     """
     ranges = np.array([record.range_voltage for record in problem.records.values()])
-    low, high = given or (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
+    low, high = limits or (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
     return Span(low, high)
 
 
-def command_limits(problem: Problem, given: tuple[float, float] | None) -> Span:
+def command_limits(problem: Problem, limits: tuple[float, float] | None) -> Span:
     """Return the voltages that a command may use: those given, or zero and all fitted ones, V.
 
     Errors are those of :func:`limits_of`.
     """
-    low, high = limits_of(problem, given)
-    return Span(low, high) if given else Span(min(low, 0.0), max(high, 0.0))
-
-
-def refuse_existing(files: list[Path], overwrite: bool) -> None:
-    """Refuse to replace a file, unless that is asked for.
-
-    Raises
-    ------
-    InputError
-        One of them exists.
-    """
-    for target in files:
-        if target.exists() and not overwrite:
-            raise InputError(f"{target}: exists; choose another folder, or give `overwrite=True`")
+    low, high = limits_of(problem, limits)
+    return Span(low, high) if limits else Span(min(low, 0.0), max(high, 0.0))

@@ -1,7 +1,7 @@
 """Simulation-based calibration of a config's posterior, from first replicate to last file.
 
 :func:`start` makes the folder: the config with every prior an explicit number, the same for all
-replicates. :func:`carry_on` makes whatever replicates are missing, side by side, writes a line for
+replicates. :func:`resume` makes whatever replicates are missing, side by side, writes a line for
 each, and judges them all. Each replicate depends on the config, the seed and its number alone, so
 it does not matter in how many pieces or with how many workers a calibration is done. Replicates of
 another config or record are refused.
@@ -14,29 +14,30 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
-from bwbayes.app.figures import save
-from bwbayes.app.figures.calibration import draw_calibration
+from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.calibration_report import render
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import ReplicateProgress
+from bwbayes.app.running.progress import CountProgress
 from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
-from bwbayes.results.calibration import Calibration, judge, summary
-from bwbayes.results.outputs import write_summary
+from bwbayes.report.calibration import calibration_report
+from bwbayes.report.saving import save
+from bwbayes.results.calibration import Calibration, judge
 from bwbayes.results.replicates import RANKED, Entry, Experiment, replicates
 from bwbayes.results.simulated import OtherRecord
 
-__all__ = ["carry_on", "experiment", "start"]
+__all__ = ["experiment", "resume", "start"]
 
 # Draws of the prior that show whether there is one.
 TRIED = 64
@@ -99,13 +100,13 @@ def experiment(problem: Problem) -> Experiment:
     return Experiment(problem.posterior, problem.plan, windows, others, belongs=belongs)
 
 
-def carry_on(
+def resume(
     folder: CalibrationFolder,
     console: Console,
     *,
     workers: int | None = None,
     count: int | None = None,
-    how: str | Executor | None = None,
+    backend: str | Executor | None = None,
 ) -> Calibration:
     """Make the missing replicates, judge all, and write the calibration's files.
 
@@ -120,7 +121,7 @@ def carry_on(
         result does not depend on it.
     count
         A new number of replicates, if given; none is thrown away.
-    how
+    backend
         Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
@@ -139,11 +140,23 @@ def carry_on(
         # It is written last, as the sign that all is done; now there is more to do.
         _clear(folder)
         if missing:
-            _make(folder, common, problem.config.seed, missing, entries, workers, console, how)
+            _make(folder, common, problem.config.seed, missing, entries, workers, console, backend)
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
-        calibration = judge(ordered, generator(problem.config.seed, "ranks"))
-        _write(folder, problem, calibration)
+        provenance = {
+            "seed": problem.config.seed,
+            "data_sha256": problem.sha256,
+            "versions": versions(problem.posterior.engine),
+        }
+        calibration = replace(
+            judge(ordered, generator(problem.config.seed, "ranks")),
+            name=problem.config.name or "calibration",
+            parameters=problem.parameters,
+            facts=_facts(problem, provenance),
+            provenance=provenance,
+        )
+        # Nothing in its files depends on when or how it was computed.
+        save(calibration_report(calibration), folder.path, "calibration", pictures="figures")
     return calibration
 
 
@@ -160,21 +173,23 @@ def _make(
     entries: dict[int, Entry],
     workers: int | None,
     console: Console,
-    how: str | Executor | None,
+    backend: str | Executor | None,
 ) -> None:
     """Add the missing replicates to the entries, and write each as soon as it is done."""
     count = min(workers or os.cpu_count() or 1, len(missing))
     unconverged = sum(not entry["converged"] for entry in entries.values())
     # Processes, also for the compiled engine: most of a replicate's time goes into Python.
     with (
-        executor(count, how=how) as pool,
-        ReplicateProgress(console, len(entries), len(missing), unconverged) as progress,
+        executor(count, backend=backend) as pool,
+        CountProgress(
+            console, "replicate", len(entries), len(missing), {"not converged": unconverged}
+        ) as progress,
     ):
         together = side_by_side(pool, workers, len(missing))
-        for made in replicates(common, seed, missing, pool, together):
-            entry = entries[made.number] = made.entry()
+        for replicate in replicates(common, seed, missing, pool, together):
+            entry = entries[replicate.number] = replicate.entry()
             _append(folder, json.dumps(entry).encode() + b"\n")
-            progress(made.converged)
+            progress("" if replicate.converged else "not converged")
 
 
 def _append(folder: CalibrationFolder, line: bytes) -> None:
@@ -190,10 +205,10 @@ def _read(
 ) -> tuple[_Request, dict[int, Entry]]:
     """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        os.truncate(folder.replicates, whole)
-    first, *others = content[:whole].splitlines() or [b""]
+    end = content.rfind(b"\n") + 1
+    if end < len(content):
+        os.truncate(folder.replicates, end)
+    first, *others = content[:end].splitlines() or [b""]
     request = _request(folder, first, identity)
     entries: dict[int, Entry] = {}
     for number, line in enumerate(others, start=2):
@@ -247,18 +262,29 @@ def _clear(folder: CalibrationFolder) -> None:
     shutil.rmtree(folder.path / "figures", ignore_errors=True)
 
 
-def _write(folder: CalibrationFolder, problem: Problem, calibration: Calibration) -> None:
-    """Write all files of a calibration; the summary last, as the sign that all is done.
-
-    Nothing in it depends on when or how it was computed.
-    """
-    numbers = summary(calibration) | {
-        "seed": problem.config.seed,
-        "data_sha256": problem.sha256,
-        "versions": versions(problem.posterior.engine),
-    }
-    figures = draw_calibration(calibration, problem.parameters)
-    pictures = save(figures, folder.path / "figures")
-    page = render(problem, calibration, numbers, pictures)
-    (folder.path / "calibration.html").write_text(page, encoding="utf-8")
-    write_summary(folder.summary, numbers)
+def _facts(problem: Problem, provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    model, plan = problem.config.model, problem.plan
+    held_out = [window for v in problem.validations.values() for window in v.windows]
+    judged = sum(window.stop - window.start for window in held_out)
+    windows = [window for dataset in problem.posterior.datasets for window in dataset.training]
+    fitted = sum(window.stop - window.start for window in windows)
+    return [
+        *(
+            (
+                "voltage" if len(problem.records) == 1 else f"voltage, {name}",
+                f"{record.origin}: {record.samples} samples every {record.interval:g} s",
+            )
+            for name, record in problem.records.items()
+        ),
+        ("fitted, held out", f"{fitted} samples, {judged} samples"),
+        ("model", in_words(model)),
+        ("noise", model.noise),
+        (
+            "sampling",
+            f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
+            f"at most {plan.most_steps} steps",
+        ),
+        ("seed", str(provenance["seed"])),
+        ("data, SHA-256", str(provenance["data_sha256"])),
+        ("versions", ", ".join(f"{name} {text}" for name, text in provenance["versions"].items())),
+    ]

@@ -1,6 +1,6 @@
 """A campaign: one posterior for each record of a folder, and what they say together.
 
-:func:`start` makes the folder; :func:`carry_on` fits the records whose runs have not ended, side by
+:func:`start` makes the folder; :func:`resume` fits the records whose runs have not ended, side by
 side, and writes table and page over all of them. A record's run depends on the config, the seed and
 the record alone, and the tables on the runs alone, so it does not matter in how many pieces or with
 how many workers a campaign is done, and records that come later are fitted by themselves.
@@ -19,23 +19,20 @@ from pathlib import Path
 from rich.console import Console
 
 from bwbayes.app.config.config import checked, dump, load
-from bwbayes.app.figures import save
-from bwbayes.app.figures.campaign import draw_campaign
 from bwbayes.app.problem.problem import generator
-from bwbayes.app.report.campaign_report import render
-from bwbayes.app.running.campaign_folder import CampaignFolder, Finished, Origin, records_in
-from bwbayes.app.running.campaign_result import CampaignResult, Row, summary, table
+from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_in
+from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.one_record import SPECIMEN, Ended, Task, fit_one
-from bwbayes.app.running.progress import CampaignProgress
+from bwbayes.app.running.progress import CountProgress
 from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.population.population import FEWEST, population
 from bwbayes.population.specimen import Specimen
-from bwbayes.results.outputs import write_summary
+from bwbayes.report.saving import save
 from bwbayes.results.replicates import as_done
 from bwbayes.results.standing import Standing
 
-__all__ = ["carry_on", "config_text", "start"]
+__all__ = ["config_text", "resume", "start"]
 
 
 def config_text(path: Path) -> str:
@@ -96,12 +93,12 @@ def start(
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
-def carry_on(
+def resume(
     folder: CampaignFolder,
     console: Console,
     *,
     workers: int | None = None,
-    how: str | Executor | None = None,
+    backend: str | Executor | None = None,
 ) -> CampaignResult:
     """Fit the records that are missing, and write table and page over all.
 
@@ -114,7 +111,7 @@ def carry_on(
     workers
         Records side by side, in processes if more than one; by default as many as cores. The result
         does not depend on it.
-    how
+    backend
         Which executor, as in :func:`~bwbayes.app.running.workers.executor`. The machines of a
         cluster must all see the campaign's folder and that of the records by the same path.
 
@@ -124,18 +121,19 @@ def carry_on(
         The folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        origin, finished = folder.origin(), folder.finished()
+        origin = folder.origin()
         files = records_in(Path(origin.records))
         refused = _namesakes(files)
         fitted = [file for file in files if file.name not in refused]
-        missing = [file for file in fitted if not folder.is_done(file, finished)]
+        missing = [file for file in fitted if not folder.is_done(file)]
         folder.summary.unlink(missing_ok=True)
         if missing:
             done = len(fitted) - len(missing)
-            refused |= _fit(folder, origin, missing, done, workers, console, how)
+            refused |= _fit(folder, origin, missing, done, workers, console, backend)
         console.print("combining the records ...", highlight=False)
         campaign = _together(folder, files, refused)
-        _write(folder, campaign)
+        # Nothing in its files depends on when or how it was computed.
+        save(campaign.report(folder.path.name), folder.path, "campaign", pictures="figures")
     return campaign
 
 
@@ -156,7 +154,7 @@ def _fit(
     done: int,
     workers: int | None,
     console: Console,
-    how: str | Executor | None,
+    backend: str | Executor | None,
 ) -> dict[str, str]:
     """Fit records side by side, note each that is done, and return the refusals by file name."""
     config = folder.config.read_text(encoding="utf-8")
@@ -175,17 +173,17 @@ def _fit(
     count = min(workers or os.cpu_count() or 1, len(tasks))
     refused: dict[str, str] = {}
     with (
-        executor(count, how=how) as pool,
-        CampaignProgress(console, done, len(missing)) as progress,
+        executor(count, backend=backend) as pool,
+        CountProgress(
+            console, "record", done, len(missing), {"not converged": 0, "refused": 0}
+        ) as progress,
     ):
-        one: Ended
+        outcome: Ended
         together = side_by_side(pool, workers, len(tasks))
-        for one in as_done(pool, together, fit_one, ((task,) for task in tasks)):
-            if one.refusal:
-                refused[names[one.name]] = one.refusal
-            else:
-                folder.note(Finished(name=one.name, file=one.file, summary=one.summary))
-            progress("refused" if one.refusal else "" if one.converged else "not converged")
+        for outcome in as_done(pool, together, fit_one, ((task,) for task in tasks)):
+            if outcome.refused:
+                refused[names[outcome.name]] = outcome.short
+            progress("refused" if outcome.refused else outcome.short)
     return refused
 
 
@@ -212,22 +210,8 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
     path = folder.run(file.stem)
     numbers = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     if not numbers["converged"]:
-        reason = f"{numbers['stop_reason']}; go on with `{numbers['go_on']}`"
+        reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
         return Row(file.stem, file.name, "not converged", reason, numbers)
     standing = Standing.read(numbers)
     status = standing.status if standing.holds else f"validation {standing.status}"
     return Row(file.stem, file.name, status, "; ".join(standing.lines), numbers)
-
-
-def _write(folder: CampaignFolder, campaign: CampaignResult) -> None:
-    """Write the campaign's files; the summary last, as the sign that all is done.
-
-    Nothing in them depends on when or how it was computed.
-    """
-    draft = folder.table.with_suffix(".partial")
-    draft.write_text(table(campaign), encoding="utf-8")
-    draft.replace(folder.table)
-    pictures = save(draw_campaign(campaign), folder.path / "figures")
-    page = render(folder.path.name, campaign, pictures)
-    folder.page.write_text(page, encoding="utf-8")
-    write_summary(folder.summary, summary(campaign))

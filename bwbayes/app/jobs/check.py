@@ -6,25 +6,32 @@ shows to be wrong with it, each with the line of config that deals with it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
+from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.figures import save
-from bwbayes.app.figures.record import draw_record
-from bwbayes.app.figures.style import unit_text
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.page import Table, picture, template
-from bwbayes.app.report.words import symbol
-from bwbayes.app.screen import show_priors
+from bwbayes.app.running.explaining import explained, lines
 from bwbayes.data import Record
-from bwbayes.inference import conflict, pointfit
-from bwbayes.results import identifiability
+from bwbayes.diagnosis import conflict
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference import pointfit
+from bwbayes.report.priors import priors_table
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Picture,
+    Report,
+    Section,
+    Text,
+    remarks_banner,
+)
+from bwbayes.report.saving import save
+from bwbayes.results import identifiability, innovations
 
-__all__ = ["check", "write_page"]
+__all__ = ["check"]
 
 CAPTIONS = {
     "time": (
@@ -37,8 +44,8 @@ CAPTIONS = {
 }
 
 
-def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
-    """Check a config and its record, fit a point, and write ``out/check.html``.
+def check(config: Config, folder: Path, out: Path) -> tuple[Problem, Report]:
+    """Check a config and its record, fit a point, write ``out/check.html``; return its report.
 
     Parameters
     ----------
@@ -46,8 +53,6 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
         The config; its files are relative to `folder`.
     out
         The page's folder, made if need be; an existing page is replaced.
-    console
-        Shows the record, what is wrong with it, priors and point fit.
 
     Raises
     ------
@@ -62,64 +67,96 @@ def check(config: Config, folder: Path, out: Path, console: Console) -> Problem:
     fitted = dict(zip(posterior.names, free[0], strict=True))
     likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
     # The findings are remarks too, but here they come with what to do.
-    shown = {f"{name}: {one}" for name, every in findings.items() for one in every}
+    shown = {f"{name}: {finding}" for name, issues in findings.items() for finding in issues}
     remarks = [remark for remark in problem.remarks if remark not in shown]
-    remarks += conflict.conflicts(posterior.prior, likely, problem.defaults)
-    untold = identifiability.remarks(posterior, point, likely)
-    page = write_page(out, problem, [*remarks, *untold], fitted)
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True)
-
-    for name, record in problem.records.items():
-        say(f"{name}: " + escape("; ".join(fact for _, fact in _facts(record))))
-        for one in findings[name]:
-            say(f"{escape(one.kind)}: {escape(one.text)}\n    what to do: {escape(one.remedy)}")
-        if not findings[name]:
-            say("nothing wrong shows in the record")
-    show_priors(posterior.prior, console, fitted)
-    for remark in remarks:
-        say(f"note: {escape(remark)}")
-    for text in untold:
-        say(f"warning: {escape(text)}")
-    say(f"pictures: {escape(str(page))}")
-    return problem
+    remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
+    untold = [*map(str, identifiability.undetermined(posterior, point, likely))]
+    explanations: list[str] = []
+    for name, alone, theta in posterior.each(free):
+        odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))
+        explanations += lines(explained(problem, name, point.optima, thorough=odd))
+    report = _report(problem, remarks, untold, explanations, fitted)
+    save(report, out, "check", pictures="figures")
+    return problem, report
 
 
-def write_page(
-    out: Path,
+def _report(
     problem: Problem,
     remarks: Sequence[str],
+    warnings: Sequence[str],
+    explanations: Sequence[str],
     fitted: Mapping[str, float],
-) -> Path:
-    """Write the page and its pictures to a folder, and return the page's path."""
-    figures, facts, several = {}, [], len(problem.records) > 1
+) -> Report:
+    """Return what to know of a record and a config, with pictures of the record."""
+    several = len(problem.records) > 1
+    facts = [
+        (f"{subject}, {name}" if several else subject, fact)
+        for name, record in problem.records.items()
+        for subject, fact in _facts(record)
+    ]
+    name = problem.config.name or problem.record.origin
+    about = "; ".join(f"{subject} {fact}" if several else fact for subject, fact in facts)
+    warned = Banner("note", "Warnings", items=warnings, label="warning")
+    better = Banner("note", "Explanations", items=explanations, label="note")
+    return Report(
+        title=f"{name}, check",
+        heading=f"Check: {name}",
+        about=about,
+        banners=[
+            _findings([finding for issues in problem.findings.values() for finding in issues]),
+            *remarks_banner(remarks),
+            *[warned] * bool(warnings),
+            *[better] * bool(explanations),
+        ],
+        blocks=[
+            Text(about, on="screen"),
+            *_pictures(problem),
+            Section(
+                "Priors and point fit",
+                [
+                    priors_table(problem.posterior.prior, fitted),
+                    Text(
+                        Markup(
+                            "The point fit is the most probable set of parameters; it says nothing "
+                            "of how sure they are. <code>bwbayes run</code> does."
+                        ),
+                        note=True,
+                    ),
+                ],
+                folded=False,
+            ),
+            Section("The record", [Facts(facts)], folded=False),
+        ],
+    )
+
+
+def _findings(findings: Sequence[Finding]) -> Banner:
+    """Return what is wrong with the records, and what to do about it."""
+    if not findings:
+        nothing = (
+            "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
+        )
+        return Banner("good", "Nothing wrong shows", [nothing])
+    item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
+    items = [item.format(finding.kind, finding.text, finding.fix) for finding in findings]
+    return Banner("note", "Problems of the record", items=items, label="problem", name="findings")
+
+
+def _pictures(problem: Problem) -> Iterator[Picture]:
+    """Yield the pictures of each record."""
+    from bwbayes.report.figures.record import record_drawings  # noqa: PLC0415  # slow to load
+
     for name, record in problem.records.items():
         training = problem.posterior.alone(name).only.training
-        for kind, figure in draw_record(record, training, problem.findings[name]).items():
-            figures[f"{kind}_{name}" if several else kind] = figure
-        for subject, fact in _facts(record):
-            facts.append((f"{subject}, {name}" if several else subject, fact))
-    pictures = save(figures, out / "figures")
-    page = template("check.html.j2").render(
-        name=problem.config.name or problem.record.origin,
-        findings=[one for every in problem.findings.values() for one in every],
-        remarks=remarks,
-        about="; ".join(f"{subject} {fact}" if several else fact for subject, fact in facts),
-        known=facts,
-        pictures=[picture(png, name, *_caption(name)) for name, png in pictures.items()],
-        parameters=_table(problem, fitted),
-    )
-    path = out / "check.html"
-    path.write_text(page, encoding="utf-8")
-    return path
-
-
-def _caption(name: str) -> tuple[str, str]:
-    """Return title and text of a figure; of several records its name is that of its record too."""
-    kind, _, record = name.partition("_")
-    title, text = CAPTIONS[kind]
-    return (f"{title}: {record}" if record else title), text
+        for kind, draw in record_drawings(record, training, problem.findings[name]).items():
+            title, text = CAPTIONS[kind]
+            several = len(problem.records) > 1
+            yield Picture(
+                f"{kind}_{name}" if several else kind,
+                f"{title}: {name}" if several else title,
+                text,
+                draw,
+            )
 
 
 def _facts(record: Record) -> list[tuple[str, str]]:
@@ -131,18 +168,3 @@ def _facts(record: Record) -> list[tuple[str, str]]:
         ("voltage", f"{low:.4g} to {high:.4g} V ({record.voltage_is})"),
         ("readings", f"{record.readings} readings" + (f", {missing} missing" if missing else "")),
     ]
-
-
-def _table(problem: Problem, fitted: Mapping[str, float]) -> Table:
-    rows = [
-        (
-            parameter.description,
-            symbol(parameter).html,
-            str(parameter.prior) if parameter.prior else f"fixed at {parameter.fixed:g}",
-            f"{fitted[parameter.name]:.5g}" if parameter.name in fitted else "",
-            unit_text(parameter.unit),
-        )
-        for parameter in problem.parameters
-    ]
-    titles = ("Parameter", "Symbol", "Prior or value", "Point fit", "Unit")
-    return Table("priors", "Parameters", titles, rows)

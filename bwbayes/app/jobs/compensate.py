@@ -1,105 +1,39 @@
-"""``bwbayes compensate``: the voltage for a displacement, and what is promised of it.
+"""The voltage for a displacement, and its predicted error: ``fit.compensate()``.
 
-Into a folder of its own go the command as a record file, ``command.csv``, which a signal generator
-can play; the numbers, ``compensation.json``; everything along time, ``compensation.csv``; and a
-page with pictures, ``compensation.html``.
+Its files are the command as a record, ``command.csv``, which a signal generator can play; the
+numbers, ``compensation.json``; everything along time, ``compensation.csv``; and a page with
+pictures, ``compensation.html``.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bwbayes.app.figures import save_one
-from bwbayes.app.figures.compensation import draw_compensation, draw_compensations
-from bwbayes.app.jobs.at_work import RunDraws, command_limits, refuse_existing
+from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.app.problem.problem import generator
-from bwbayes.app.report.compensation_report import render
-from bwbayes.control.compensation import compensate
+from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.predicted import Choice, Compensation
 from bwbayes.control.wished import SHAPES, Reference, shaped
-from bwbayes.data.io.formats import read_reference, write_record
+from bwbayes.data.io.formats import read_reference
+from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.linear import parse_hold
-from bwbayes.results.extrapolation import beyond_training
-from bwbayes.results.outputs import write_summary
 from bwbayes.results.prediction import thinned
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["Compensated", "compensate_draws", "reference_of"]
-
-FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.html")
+__all__ = ["compensate", "reference_of"]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Compensated(Compensation):
-    """A command, its predicted errors, and how to look at it and keep it.
-
-    ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
-    ``smoothed``; ``compensated`` what it does, ``linear`` what a command without compensation does:
-    the ``rms`` and ``largest`` error (draws,), um, with ``bands`` of the displacement. ``between``
-    is how far the displacement leaves straight lines between samples, um, and ``difference`` the
-    largest difference, V, from the other ``command`` that could have been taken.
-    """
-
-    @classmethod
-    def of(cls, made: Compensation) -> Self:
-        """Return a compensation that can be drawn and saved."""
-        return cls(**{one.name: getattr(made, one.name) for one in fields(Compensation)})
-
-    def plot(self) -> Figure:
-        """Draw reference, prediction and error along time."""
-        return draw_compensation(self)
-
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write all files to a folder, and return them.
-
-        Raises
-        ------
-        InputError
-            A file that exists, unless it may be replaced, or that cannot be written.
-        """
-        where = Path(folder)
-        command, numbers, table, page = files = [where / name for name in FILES]
-        refuse_existing(files, overwrite)
-        try:
-            where.mkdir(parents=True, exist_ok=True)
-            write_record(self.record, command)
-            write_summary(numbers, self.summary)
-            self.to_pandas().to_csv(table, index=False, float_format="%.9g")
-            pictures = {}
-            for name, figure in draw_compensations(self).items():
-                picture = where / f"{name}.png"
-                save_one(figure, picture)
-                pictures[name] = picture.read_bytes()
-            page.write_text(render(self, pictures), encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{where}: {error.strerror}; choose another place") from None
-        return files
-
-    def __repr__(self) -> str:
-        after, before = self.compensated.numbers(self.limit), self.linear.numbers(self.limit)
-        low, high = after["rms_um"]["95"]
-        text = (
-            f"compensation for {self.reference.name}: rms error {after['rms_um']['mean']:.3g} um "
-            f"(95 %: {low:.3g} to {high:.3g}), without compensation "
-            f"{before['rms_um']['mean']:.3g} um"
-        )
-        if self.limit is not None:
-            within = after["probability_below_limit"]
-            text += f"; stays below {self.limit:g} um with a probability of {within:.2f}"
-        return "\n".join([*self.standing.said, text])
-
-
-def compensate_draws(
-    run: RunDraws,
+def compensate(
+    fit: Fit,
     reference: Any,
     *,
     command: Choice = "mean",
@@ -118,15 +52,22 @@ def compensate_draws(
     middle: float | None = None,
     periods: float | None = None,
     levels: int | None = None,
-) -> Compensated:
-    """Return the command for a reference from draws, with what is promised of it.
+) -> Compensation:
+    """Return the voltage for a displacement, and its predicted error.
+
+    ``fit.compensate("triangle", amplitude=30, frequency=1)`` is what
+    ``bwbayes compensate FOLDER triangle --amplitude 30 --frequency 1`` writes.
 
     Parameters
     ----------
-    run
+    fit
         What is built on; of several records the first, and a thousand of the draws.
     reference
-        As of :func:`reference_of`.
+        What the displacement is to be: one of the shapes ``"sine"``, ``"triangle"``,
+        ``"staircase"`` and ``"raster"``; a file with time and displacement; displacements
+        (samples,), um; or the ``reference`` of an earlier command. 0 um is where the actuator
+        stands at zero volts as the command begins: there a command begins too, and a reference
+        that begins elsewhere gets a way from there before it.
     command
         ``"mean"``, the inverse of the mean model; or ``"expected"``, the voltage whose squared
         error, expected over the draws, is least.
@@ -154,15 +95,22 @@ def compensate_draws(
 
     Raises
     ------
+    NotConvergedError
+        The sampling has not converged.
     InputError
-        A reference that cannot be read or reached.
+        A reference that cannot be used or reached.
+
+    Warns
+    -----
+    InputWarning
+        A reference that was smoothed or led to, a command beyond what was fitted.
     """
-    problem, flat, standing = run
+    problem, flat = fit.problem, fit.flat_draws
     span = command_limits(problem, voltage)
     fastest = math.inf if slew is None else slew
     limits = Limits(span.low, span.high, fastest, current, capacitance)
     alone = next(iter(problem.posterior.each(flat)))
-    asked = reference_of(
+    desired = reference_of(
         reference,
         problem.record.interval,
         interval=interval,
@@ -174,11 +122,11 @@ def compensate_draws(
         levels=levels,
     )
     seed = problem.config.seed
-    made = compensate(
+    compensation = compensated(
         alone.posterior,
         thinned(alone.draws, generator(seed, "draws")),
-        asked,
-        generator(seed, f"compensate {asked.name}"),
+        desired,
+        generator(seed, f"compensate {desired.name}"),
         command=command,
         hold=parse_hold(hold),
         from_rest=from_rest,
@@ -186,17 +134,17 @@ def compensate_draws(
         nearest=nearest,
         limit=limit,
     )
-    far = beyond_training(alone.posterior, made.voltage, asked.interval)
-    remarks = (*made.remarks, *(one.line for one in far))
-    return Compensated.of(replace(made, remarks=remarks, standing=standing))
+    extrapolations = beyond_training(alone.posterior, compensation.voltage, desired.interval)
+    remarks = (*compensation.remarks, *(finding.note for finding in extrapolations))
+    return replace(compensation, remarks=remarks, standing=fit.standing)
 
 
-def reference_of(given: Any, default: float, **options: Any) -> Reference:
+def reference_of(requested: Any, default: float, **options: Any) -> Reference:
     """Return a reference: one that is made already, a shape, a file's, or displacements.
 
     Parameters
     ----------
-    given
+    requested
         A reference; the name of a shape; a file; or displacements (samples,), um.
     default
         Sampling interval, s, where neither the file nor ``options`` say it.
@@ -211,37 +159,38 @@ def reference_of(given: Any, default: float, **options: Any) -> Reference:
     """
     options = {name: value for name, value in options.items() if value is not None}
     shapes = ", ".join(SHAPES)
-    if isinstance(given, str) and given in SHAPES:
+    if isinstance(requested, str) and requested in SHAPES:
         for name, unit in (("amplitude", "um"), ("frequency", "Hz")):
             if name not in options:
-                raise InputError(f"{given}: has no {name}; give it, in {unit}")
-        return shaped(given, **{"interval": default, **options})
+                raise InputError(f"{requested}: has no {name}; give it, in {unit}")
+        return shaped(requested, **{"interval": default, **options})
     kind, allowed = "displacements take", {"smoothed", "interval"}
-    if isinstance(given, Reference):
+    if isinstance(requested, Reference):
         kind, allowed = "one that is made already takes", set()
-    elif isinstance(given, str | Path):
+    elif isinstance(requested, str | Path):
         kind, allowed = "a file takes", {"smoothed"}
     for name in options:
         if name not in allowed:
             raise InputError(f"reference: {kind} no {name}; leave it out, or give one of {shapes}")
-    if isinstance(given, Reference):
-        return given
+    if isinstance(requested, Reference):
+        return requested
     smoothed = options.get("smoothed", 0.0)
-    if isinstance(given, str | Path):
-        path = Path(given)
-        if isinstance(given, str) and not path.suffix and not path.exists():
+    if isinstance(requested, str | Path):
+        path = Path(requested)
+        if isinstance(requested, str) and not path.suffix and not path.exists():
             raise InputError(
-                f"reference: {given!r} is neither a shape nor a file; {suggestion(given, SHAPES)}"
+                f"reference: {requested!r} is neither a shape nor a file; "
+                f"{suggestion(requested, SHAPES)}"
             )
         values, interval = read_reference(path)
         return Reference(values, interval, path.stem, smoothed)
     try:
-        values = np.asarray(given, dtype=np.float64)
+        values = np.asarray(requested, dtype=np.float64)
     except (TypeError, ValueError):
         values = np.empty(())
     if values.ndim == 0:
         raise InputError(
-            f"reference: {type(given).__name__} is none; give one of {shapes}, a file, or "
+            f"reference: {type(requested).__name__} is none; give one of {shapes}, a file, or "
             "displacements in um"
         )
     return Reference(values, options.get("interval", default), smoothed=smoothed)

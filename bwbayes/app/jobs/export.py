@@ -1,4 +1,4 @@
-"""``bwbayes export``: the posterior's mean model for a controller, as JSON and as C.
+"""The posterior's mean model for a controller, as JSON and as C: ``fit.export()``.
 
 Two files come of it: ``model.json`` has the parts, all coefficients with units, and the linear part
 as matrices; ``actuator.c`` is the model and its inverse, one sample a call. In both 0 um is where
@@ -10,44 +10,44 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from bwbayes.app.jobs.at_work import RunDraws, command_limits, drawn, refuse_existing
+from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.control.exported import Exported, exported
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold, parse_hold
+from bwbayes.report.saving import refuse_existing
 
-__all__ = ["at_rate", "export", "export_draws"]
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
+
+__all__ = ["FILES", "at_rate", "export"]
+
+FILES = ("model.json", "actuator.c")
 
 # Fastest sampling of a controller, Hz.
 LARGEST_RATE = 1e7
 
 
-def export(path: Path, out: Path | None = None, **options: Any) -> tuple[Exported, list[Path]]:
-    """Write the mean model of the run in a folder, by default to ``export`` in it.
-
-    Options, errors and what is returned are as of :func:`export_draws`; a run that has not
-    converged is refused.
-    """
-    return export_draws(drawn(path), out or path / "export", **options)
-
-
-def export_draws(
-    run: RunDraws,
-    folder: Path,
+def export(
+    fit: Fit,
+    folder: str | Path,
     *,
     voltage: tuple[float, float] | None = None,
     rate: float | None = None,
     hold: str = "zoh",
     overwrite: bool = False,
-) -> tuple[Exported, list[Path]]:
-    """Write the mean model of draws for a controller; return it, and the files.
+) -> Exported:
+    """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
+
+    0 um is where the demagnetized actuator stands at zero volts. What is returned has the
+    ``linear`` part as a discrete ``scipy.signal`` system.
 
     Parameters
     ----------
-    run
-        What is built on.
+    fit
+        What is built on; of several records the first.
     folder
         Where the files go.
     voltage
@@ -64,21 +64,32 @@ def export_draws(
 
     Raises
     ------
+    NotConvergedError
+        The sampling has not converged.
     InputError
         A hysteresis that has no step of bounded time, options that make no sense, or files that
         exist or cannot be written.
     """
-    problem, flat, standing = run
+    problem, flat = fit.problem, fit.flat_draws
     posterior = problem.posterior
     # Of several records the first: what belongs to a record matters little to a controller.
-    one = posterior.datasets[0]
-    theta = one.table.actuator(posterior.table.of(posterior.prior.theta(flat), one.name))
-    actuator = at_rate(one.actuator, rate, parse_hold(hold))
+    dataset = posterior.datasets[0]
+    theta = dataset.table.actuator(posterior.table.of(posterior.prior.theta(flat), dataset.name))
+    actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    made = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
-    made = replace(made, standing=standing)
-    return made, _written(made, folder, overwrite)
+    model = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
+    model = replace(model, standing=fit.standing)
+    numbers, code = (Path(folder) / name for name in FILES)
+    refuse_existing([numbers, code], overwrite=overwrite)
+    try:
+        numbers.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(model.numbers(), indent=2, allow_nan=False)
+        numbers.write_text(f"{text}\n", encoding="utf-8")
+        code.write_text(model.c_code(), encoding="ascii")
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
+    return model
 
 
 def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
@@ -93,17 +104,3 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
         raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")
     interval = actuator.interval if rate is None else 1 / rate
     return replace(actuator, interval=interval, hold=hold)
-
-
-def _written(made: Exported, folder: Path, overwrite: bool) -> list[Path]:
-    """Write the two files, and return them."""
-    numbers, code = folder / "model.json", folder / "actuator.c"
-    refuse_existing([numbers, code], overwrite)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(made.numbers(), indent=2, allow_nan=False)
-        numbers.write_text(f"{text}\n", encoding="utf-8")
-        code.write_text(made.c_code(), encoding="ascii")
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
-    return [numbers, code]

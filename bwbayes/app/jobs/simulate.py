@@ -45,8 +45,8 @@ def simulate(
         An unknown signal, impossible values, or a file that exists already or cannot be written.
     """
     parameters = out.with_name(f"{out.stem}.truth.json")
-    beside = out.with_name(f"{out.stem}.truth{out.suffix}")
-    for path in (out, beside, parameters):
+    truth_file = out.with_name(f"{out.stem}.truth{out.suffix}")
+    for path in (out, truth_file, parameters):
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists; choose another name, or give `overwrite=True`")
     amplitude, frequency, duration = sine
@@ -60,4 +60,4 @@ def simulate(
         parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
-    return [out, *([beside] if beside.exists() else []), parameters]
+    return [out, *([truth_file] if truth_file.exists() else []), parameters]

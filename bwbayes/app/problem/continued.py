@@ -61,119 +61,123 @@ def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[
     for root in records:
         if config.records[root].continues is not None:
             continue
-        chain, made = [_Part(root, 0.0)], records[root]
+        chain, record = [_Part(root, 0.0)], records[root]
         while (name := after.get(chain[-1].name)) is not None:
             _require_next(config, chain[-1].name, name, records)
-            end = made.start + made.duration
+            end = record.start + record.duration
             chain.append(_Part(name, end - records[name].start))
-            made = _put_together(made, records[name])
-        wholes[root] = made
+            record = _put_together(record, records[name])
+        wholes[root] = record
         tables[root] = _table(config, chain, records)
-        parts |= {part.name: (root, part.shift) for part in chain}
-    validation = {name: _moved(one, parts) for name, one in config.validation.items()}
+        parts |= {link.name: (root, link.shift) for link in chain}
+    validation = {name: _moved(held_out, parts) for name, held_out in config.validation.items()}
     return config.model_copy(update={"record": tables, "validation": validation}), wholes
 
 
 def _after(config: Config) -> dict[str, str]:
     """Return which record comes after which, by the name of the one before."""
     after: dict[str, str] = {}
-    for name, one in config.records.items():
-        if one.continues is None:
+    for name, source in config.records.items():
+        if source.continues is None:
             continue
-        place, others = f"{place_of(name)}.continues", [n for n in config.records if n != name]
-        if one.continues == name:
-            raise InputError(f"{place}: the record itself; name the one measured before it")
-        if one.continues not in others:
-            hint = suggestion(one.continues, others) if others else "remove it"
-            raise InputError(f"{place}: no other record {one.continues!r}; {hint}")
-        if one.continues in after:
+        key, others = f"{place_of(name)}.continues", [n for n in config.records if n != name]
+        if source.continues == name:
+            raise InputError(f"{key}: the record itself; name the one measured before it")
+        if source.continues not in others:
+            hint = suggestion(source.continues, others) if others else "remove it"
+            raise InputError(f"{key}: no other record {source.continues!r}; {hint}")
+        if source.continues in after:
             raise InputError(
-                f"{place}: {after[one.continues]} continues {one.continues}, too; one record can"
+                f"{key}: {after[source.continues]} continues {source.continues} too; one record can"
             )
-        if one.from_rest:
-            raise InputError(f"{place}: it starts where {one.continues} ends; remove its from_rest")
-        if one.file is None:
-            raise InputError(f"{place}: the stand starts every signal at rest; give files")
-        after[one.continues] = name
+        if source.from_rest:
+            raise InputError(
+                f"{key}: it starts where {source.continues} ends; remove its from_rest"
+            )
+        if source.file is None:
+            raise InputError(f"{key}: the stand starts every signal at rest; give files")
+        after[source.continues] = name
     for name in after.values():
-        seen, at = [name], config.records[name].continues
-        while at is not None and at not in seen:
-            seen.append(at)
+        visited, at = [name], config.records[name].continues
+        while at is not None and at not in visited:
+            visited.append(at)
             at = config.records[at].continues
         if at is not None:
-            circle = ", ".join([*seen[seen.index(at) :], at])
+            circle = ", ".join([*visited[visited.index(at) :], at])
             raise InputError(f"{place_of(name)}.continues: a circle ({circle}); one is the first")
     return after
 
 
 def _require_next(config: Config, before: str, name: str, records: Mapping[str, Record]) -> None:
     """Refuse a record that cannot go on where another ends."""
-    place, one, other = f"{place_of(name)}.continues", records[before], records[name]
-    if not np.isclose(one.interval, other.interval, rtol=ROUNDED, atol=0):
+    key, first, other = f"{place_of(name)}.continues", records[before], records[name]
+    if not np.isclose(first.interval, other.interval, rtol=ROUNDED, atol=0):
         raise InputError(
-            f"{place}: sampled every {other.interval:g} s, {before} every {one.interval:g} s; "
+            f"{key}: sampled every {other.interval:g} s, {before} every {first.interval:g} s; "
             "remove it, they are two records"
         )
-    if one.voltage_is != other.voltage_is:
+    if first.voltage_is != other.voltage_is:
         raise InputError(
-            f"{place}: its voltage is the {other.voltage_is}, that of {before} the "
-            f"{one.voltage_is}; see voltage_is, or remove it"
+            f"{key}: its voltage is the {other.voltage_is}, that of {before} the "
+            f"{first.voltage_is}; see voltage_is, or remove it"
         )
     if config.records[before].stop is not None:
-        raise InputError(f"{place}: {before} is cut by its stop; remove one of them")
-    end = one.start + one.duration
+        raise InputError(f"{key}: {before} is cut by its stop; remove one of them")
+    end = first.start + first.duration
     # A clock of its own begins where that of the record before did, or earlier.
-    own_clock = other.start <= one.start + one.interval / 2
-    if not own_clock and abs(other.start - end) > one.interval / 2:
+    own_clock = other.start <= first.start + first.interval / 2
+    if not own_clock and abs(other.start - end) > first.interval / 2:
         raise InputError(
-            f"{place}: begins at {other.start:g} s, {before} ends at {end:g} s; a record can only "
+            f"{key}: begins at {other.start:g} s, {before} ends at {end:g} s; a record can only "
             "be continued at once"
         )
 
 
-def _put_together(one: Record, other: Record) -> Record:
+def _put_together(first: Record, other: Record) -> Record:
     """Return the record of two, the second right after the first."""
-    assert one.displacement is not None
+    assert first.displacement is not None
     assert other.displacement is not None
     truth = None
-    if one.truth is not None and other.truth is not None:
-        truth = np.concatenate([one.truth, other.truth])
+    if first.truth is not None and other.truth is not None:
+        truth = np.concatenate([first.truth, other.truth])
     return replace(
-        one,
-        voltage=np.concatenate([one.voltage, other.voltage]),
-        displacement=np.concatenate([one.displacement, other.displacement]),
+        first,
+        voltage=np.concatenate([first.voltage, other.voltage]),
+        displacement=np.concatenate([first.displacement, other.displacement]),
         truth=truth,
-        origin=f"{one.origin}, then {other.origin}",
+        origin=f"{first.origin}, then {other.origin}",
     )
 
 
 def _table(config: Config, chain: Sequence[_Part], records: Mapping[str, Record]) -> RecordConfig:
     """Return what a config says of a whole: windows and outliers of all parts, on one clock."""
-    given = [config.records[part.name] for part in chain]
+    sources = [config.records[link.name] for link in chain]
     train = outliers = None
-    if any(one.train is not None for one in given):
+    if any(source.train is not None for source in sources):
         train = [
-            [edge + part.shift for edge in window]
-            for part, one in zip(chain, given, strict=True)
-            for window in one.train or [list(whole(records[part.name]))]
+            [edge + link.shift for edge in window]
+            for link, source in zip(chain, sources, strict=True)
+            for window in source.train or [list(whole(records[link.name]))]
         ]
-    if all(one.outliers is not None for one in given):
+    if all(source.outliers is not None for source in sources):
         outliers = [
-            time + part.shift
-            for part, one in zip(chain, given, strict=True)
-            for time in one.outliers or ()
+            time + link.shift
+            for link, source in zip(chain, sources, strict=True)
+            for time in source.outliers or ()
         ]
-    remarks = [text for one in given for text in one.remarks or ()] or None
+    remarks = [text for source in sources for text in source.remarks or ()] or None
     changes = {"train": train, "outliers": outliers, "remarks": remarks, "continues": None}
-    return given[0].model_copy(update=changes)
+    return sources[0].model_copy(update=changes)
 
 
-def _moved(one: ValidationConfig, parts: Mapping[str, tuple[str, float]]) -> ValidationConfig:
+def _moved(
+    validation: ValidationConfig, parts: Mapping[str, tuple[str, float]]
+) -> ValidationConfig:
     """Return a validation of the whole for one of a part."""
-    if one.of is None:
-        return one
-    root, shift = parts[one.of]
-    window = one.window
-    if window is not None and not one.another:
-        window = [[edge + shift for edge in part] for part in window]
-    return one.model_copy(update={"of": root, "window": window})
+    if validation.of is None:
+        return validation
+    root, shift = parts[validation.of]
+    window = validation.window
+    if window is not None and not validation.another:
+        window = [[edge + shift for edge in edges] for edges in window]
+    return validation.model_copy(update={"of": root, "window": window})

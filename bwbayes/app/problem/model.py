@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -21,11 +20,11 @@ __all__ = ["actuator_of", "explicit_model", "in_words"]
 
 
 def actuator_of(
-    model: ActuatorConfig, record: Record, every: Sequence[Record] | None = None
+    model: ActuatorConfig, record: Record, records: Sequence[Record] | None = None
 ) -> Actuator:
     """Put the actuator together that a config asks for; ``auto`` and ``true`` ask the record.
 
-    Gain and creep count from the voltages of ``every`` record of the actuator; by default there is
+    Gain and creep count from the voltages of all ``records`` of the actuator; by default there is
     none but this.
 
     Raises
@@ -36,18 +35,20 @@ def actuator_of(
     hold: Hold = "zero" if record.voltage_is == "command" else "first"
     if isinstance(model, ModelConfig) and model.hold != "auto":
         hold = model.hold
-    every = every or [record]
+    records = records or [record]
     span = Span(
-        min(float(np.min(one.voltage)) for one in every),
-        max(float(np.max(one.voltage)) for one in every),
+        min(float(np.min(recorded.voltage)) for recorded in records),
+        max(float(np.max(recorded.voltage)) for recorded in records),
     )
+    stated = {name: getattr(model, name) for name in OPTIONS}
+    options = {name: tuple(v) if isinstance(v, list) else v for name, v in stated.items()}
     return Actuator(
         model.dynamics,
         hold,
         record.interval,
-        made("model.hysteresis", model.hysteresis, HYSTERESIS, _options(model), Operator),
+        made("model.hysteresis", model.hysteresis, HYSTERESIS, options, Operator),
         PolynomialGain(tuple(model.gain), span) if model.gain else None,
-        _creep(model, every, span),
+        _creep(model, records, span),
         span,
     )
 
@@ -58,30 +59,24 @@ def explicit_model(model: ModelConfig, actuator: Actuator) -> ModelConfig:
     The hold stays: another record has its own.
     """
     times = list(actuator.creep.times) if actuator.creep else False
-    return model.model_copy(update={"creep": times, **_chosen(actuator.hysteresis)})
+    operator = actuator.hysteresis
+    chosen = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
+    options = {name: list(v) if isinstance(v, tuple) else v for name, v in chosen.items()}
+    return model.model_copy(update={"creep": times, **options})
 
 
-def _creep(model: ActuatorConfig, every: Sequence[Record], span: Span) -> Creep | None:
+def _creep(model: ActuatorConfig, records: Sequence[Record], span: Span) -> Creep | None:
     """Return the creep that a config asks for, if any; ``true`` asks the records."""
     if model.creep is False or model.creep == []:
         if model.creep_growth:
             raise InputError("model.creep_growth: there is no creep; give creep = true with it")
         return None
-    shortest, longest = min(one.interval for one in every), max(one.duration for one in every)
+    shortest, longest = (
+        min(record.interval for record in records),
+        max(record.duration for record in records),
+    )
     times = creep_times(shortest, longest) if model.creep is True else model.creep
     return Creep(tuple(times), model.creep_growth, span)
-
-
-def _options(model: ActuatorConfig) -> dict[str, object]:
-    """Return what the config says of the hysteresis operator beside its name."""
-    given = {name: getattr(model, name) for name in OPTIONS}
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
-
-
-def _chosen(operator: Operator) -> dict[str, Any]:
-    """Return the options that an operator has, by name, as a config has them."""
-    chosen = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in chosen.items()}
 
 
 def in_words(model: ModelConfig) -> str:

@@ -64,9 +64,9 @@ def parameters_of(
 def _given(config: Config, column: Column) -> ParameterConfig:
     """Return what a config says of a column of θ: of it alone, or of all records' together."""
     name = column.declaration.name
-    given = config.parameters.get(column.name, config.parameters.get(name))
-    if given is not None:
-        return given
+    stated = config.parameters.get(column.name, config.parameters.get(name))
+    if stated is not None:
+        return stated
     if name == "initial":
         names = [column.record] if column.record else list(config.records)
         rested = [config.records[record].from_rest for record in names]
@@ -96,16 +96,18 @@ def contexts_of(
         name: ranges_of(record.voltage, readings_of(record), record.interval, training[name])
         for name, record in records.items()
     }
-    varied = [one for one in ranges.values() if one.voltage > 0 and one.displacement > 0]
+    varied = [
+        extents for extents in ranges.values() if extents.voltage > 0 and extents.displacement > 0
+    ]
     if not varied:
-        (place,) = [place_of(name) for name in list(records)[:1]]
-        raise InputError(f"{place}.train: voltage or displacement is constant there; widen it")
-    every = joined(varied)
-    contexts = {"": Context(every, dict(_stated(config)))}
-    for name, one in ranges.items():
+        (table,) = [place_of(name) for name in list(records)[:1]]
+        raise InputError(f"{table}.train: voltage or displacement is constant there; widen it")
+    pooled = joined(varied)
+    contexts = {"": Context(pooled, dict(_stated(config)))}
+    for name, extents in ranges.items():
         # A record whose voltage stands still says where its sensor is, and nothing else.
-        known = one if one in varied else replace(every, middle=one.middle)
-        contexts[name] = Context(known, dict(_stated(config, name)))
+        extent = extents if extents in varied else replace(pooled, middle=extents.middle)
+        contexts[name] = Context(extent, dict(_stated(config, name)))
     return contexts
 
 
@@ -122,13 +124,13 @@ def readings_of(record: Record) -> FloatArray:
 
 def _stated(config: Config, record: str = "") -> Iterator[tuple[str, float | Distribution]]:
     """Yield what the config states of parameters, also of a record's own: values, and priors."""
-    mine = f"[{record}]"
-    for name, given in config.parameters.items():
-        known = name.removesuffix(mine)
-        if given.prior is not None:
-            yield known, _distribution(name, given.prior)
-        elif given.fixed is not None:
-            yield known, given.fixed
+    suffix = f"[{record}]"
+    for name, stated in config.parameters.items():
+        plain = name.removesuffix(suffix)
+        if stated.prior is not None:
+            yield plain, _distribution(name, stated.prior)
+        elif stated.fixed is not None:
+            yield plain, stated.fixed
 
 
 def every_declaration() -> list[Declaration]:
@@ -138,15 +140,14 @@ def every_declaration() -> list[Declaration]:
     noises = (make(interval=1.0).declarations for make in NOISES.values())
     crept = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
     others = PolynomialGain().parameters, crept.parameters, (OFFSET,)
-    return [d for part in (*operators, *filters, *others, *noises) for d in part]
+    return [d for declared in (*operators, *filters, *others, *noises) for d in declared]
 
 
 def _require_known(
-    table: str, given: Collection[str], declarations: Collection[Declaration]
+    table: str, stated: Collection[str], declarations: Collection[Declaration]
 ) -> None:
-    known = {d.name for d in declarations}
-    for name in given:
-        if name not in known:
+    for name in stated:
+        if name not in {d.name for d in declarations}:
             if name in {d.name for d in every_declaration()}:
                 raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
             aliases = {alias: d.name for d in declarations for alias in d.aliases}
@@ -156,12 +157,12 @@ def _require_known(
             )
 
 
-def _parameter(column: Column, given: ParameterConfig, context: Context) -> Parameter:
+def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Parameter:
     """Put what the config says of a parameter before what its part declares."""
     name, declared, record = column
-    prior, fixed = None, given.fixed
-    if given.prior is not None:
-        prior = _distribution(name, given.prior)
+    prior, fixed = None, stated.fixed
+    if stated.prior is not None:
+        prior = _distribution(name, stated.prior)
     elif fixed is None:
         default = declared.default(context)
         if default is None:
@@ -173,19 +174,19 @@ def _parameter(column: Column, given: ParameterConfig, context: Context) -> Para
             fixed = default
     _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
     unit = declared.unit_in(context.stated)
-    if given.unit is not None and re.sub("[µμ]", "u", given.unit) != unit:
+    if stated.unit is not None and re.sub("[µμ]", "u", stated.unit) != unit:
         raise InputError(
-            f"parameters.{name}.unit: its numbers are in {unit}, not {given.unit}; convert them"
+            f"parameters.{name}.unit: its numbers are in {unit}, not {stated.unit}; convert them"
         )
     return Parameter(
         name,
-        given.unit or unit,
-        given.label or labelled(declared.label, record),
-        given.description or declared.description + (f" of {record}" if record else ""),
+        stated.unit or unit,
+        stated.label or labelled(declared.label, record),
+        stated.description or declared.description + (f" of {record}" if record else ""),
         prior,
         fixed,
-        -np.inf if given.lower is None else given.lower,
-        np.inf if given.upper is None else given.upper,
+        -np.inf if stated.lower is None else stated.lower,
+        np.inf if stated.upper is None else stated.upper,
         declared,
         record,
     )

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
-from bwbayes.app.config.config import ALONE, Config, RecordConfig
+from bwbayes.app.config.config import ALONE, Config, ParameterConfig, RecordConfig
 from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, explicit_model
 from bwbayes.app.problem.parameters import (
@@ -40,7 +41,9 @@ from bwbayes.app.problem.records import (
 from bwbayes.app.problem.stand import recoverable
 from bwbayes.arrays import IntArray
 from bwbayes.data import Record
-from bwbayes.data.inspection import Finding, isolated_outliers
+from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import Engine, choose
@@ -48,9 +51,9 @@ from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.table import JointTable
+from bwbayes.inference.table import JointTable, ParameterTable
 from bwbayes.model.distributions import Distribution
-from bwbayes.results.extrapolation import Extrapolation, beyond_training
+from bwbayes.model.registry import OPTIONS
 from bwbayes.results.prediction import Start
 from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
@@ -109,8 +112,8 @@ class Problem:
         """A digest of all that was measured: that of the record, or of several with their names."""
         if len(self.records) == 1:
             return self.record.sha256
-        every = {name: record.sha256 for name, record in self.records.items()}
-        return sha256(json.dumps(every).encode()).hexdigest()
+        digests = {name: record.sha256 for name, record in self.records.items()}
+        return sha256(json.dumps(digests).encode()).hexdigest()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -120,10 +123,10 @@ class Problem:
     @property
     def others(self) -> dict[str, Record]:
         """The records that are predicted, by name, besides those that are fitted."""
-        every = {name: one.record for name, one in self.validations.items()}
-        return {name: record for name, record in every.items() if record is not None}
+        records = {name: validation.record for name, validation in self.validations.items()}
+        return {name: record for name, record in records.items() if record is not None}
 
-    def extrapolations(self, name: str) -> list[Extrapolation]:
+    def extrapolations(self, name: str) -> list[Finding]:
         """Return in what the drive of the band of that name leaves the training data."""
         validation = self.validations.get(name)
         if validation is None:
@@ -132,6 +135,39 @@ class Problem:
         windows = validation.windows
         window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
         return beyond_training(self.posterior, record.voltage, record.interval, window)
+
+    def reconfigured(
+        self, changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
+    ) -> Posterior:
+        """Return the posterior of the record with other values of keys of [model]."""
+        windows = {
+            dataset.name: Windows(dataset.training, {}) for dataset in self.posterior.datasets
+        }
+        config = self.changed(self.config, changes, parameters)
+        return _posterior(config, self.records, windows)[0]
+
+    def changed(
+        self,
+        config: Config,
+        changes: Mapping[str, object],
+        parameters: Mapping[str, Mapping[str, Any]],
+    ) -> Config:
+        """Return a config of these records with other values of keys of [model].
+
+        Parameters that both models have keep their priors; others have those of ``parameters``, or
+        the default ones.
+        """
+        options = dict.fromkeys(OPTIONS if "hysteresis" in changes else ())
+        model = config.model.model_copy(update={**options, **changes})
+        actuator = actuator_of(model, self.record, list(self.records.values()))
+        units = {
+            declared.name: declared.unit
+            for declared in ParameterTable(actuator, self.posterior.datasets[0].noise).declarations
+        }
+        added = {name: ParameterConfig(**stated) for name, stated in parameters.items()}
+        stated = {**added, **config.parameters}
+        shared = {n: p for n, p in stated.items() if n in units and p.unit in (None, units[n])}
+        return config.model_copy(update={"model": model, "parameters": shared, "truth": {}})
 
     def windows(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record by the names of their bands, fitted ones first.
@@ -144,8 +180,8 @@ class Problem:
 
     def held_out(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record that were held out, by name."""
-        every = self.validations.items()
-        return {name: v.windows for name, v in every if v.windows and v.of == record}
+        validations = self.validations.items()
+        return {name: v.windows for name, v in validations if v.windows and v.of == record}
 
 
 def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
@@ -162,62 +198,68 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        given = records or {}
-        fitted, stand = training_records(config, folder, given)
+        in_memory = records or {}
+        fitted, stand = training_records(config, folder, in_memory)
         config, fitted = joined(config, fitted)
         windows = {name: windows_of(config, name, record) for name, record in fitted.items()}
         require_different(fitted, windows)
         others = {
-            name: other_record(config, name, folder, fitted, given.get(name))
+            name: other_record(config, name, folder, fitted, in_memory.get(name))
             for name, validation in config.validation.items()
             if validation.another
         }
-    said = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
-    noted = [text for one in config.records.values() for text in one.remarks or ()]
-    said = list(dict.fromkeys([*noted, *said]))
+    warned = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    noted = [text for source in config.records.values() for text in source.remarks or ()]
+    warned = list(dict.fromkeys([*noted, *warned]))
     findings = {
         name: tuple(
-            one
-            for one in findings_of(
+            finding
+            for finding in findings_of(
                 record, [*windows[name].training, *chain(*windows[name].held_out.values())]
             )
-            if len(fitted) == 1 or one.kind not in MADE_UP_FOR
+            if len(fitted) == 1 or finding.kind not in MADE_UP_FOR
         )
         for name, record in fitted.items()
     }
-    remarks = [*said]
-    remarks += [f"{name}: {finding}" for name, every in findings.items() for finding in every]
+    remarks = [*warned]
+    remarks += [f"{name}: {finding}" for name, issues in findings.items() for finding in issues]
     remarks += [text for name, other in others.items() for text in unlike(config, name, other)]
-    aside = {name: one.outliers for name, one in config.records.items()}
+    aside = {name: source.outliers for name, source in config.records.items()}
     unjudged = [name for name, times in aside.items() if times is None]
     if config.model.outliers and unjudged:
         # Their ranges would make the default priors, so these are made anew without them.
-        every = dict(fitted)
+        complete = dict(fitted)
 
         def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
-            fitted.update({n: every[n].without(rows[n]) for n in unjudged if n in rows})
+            fitted.update({n: complete[n].without(rows[n]) for n in unjudged if n in rows})
             return _posterior(config, fitted, windows)[0]
 
         spoilt = outliers(
             posterior_without,
             generator(config.seed, "outliers"),
-            {name: isolated_outliers(every[name], ends=True) for name in unjudged},
+            {name: isolated_outliers(complete[name], ends=True) for name in unjudged},
         )
         for name in unjudged:
-            aside[name] = every[name].time[spoilt[name]].tolist()
-            fitted[name] = every[name].without(spoilt[name])
+            aside[name] = complete[name].time[spoilt[name]].tolist()
+            fitted[name] = complete[name].without(spoilt[name])
     posterior, defaults = _posterior(config, fitted, windows)
-    several = len(fitted) > 1
     remarks += [
-        (f"{name}: " if several else "") + _set_aside(times)
+        (f"{name}: " if len(fitted) > 1 else "") + _set_aside(times, fitted[name])
         for name, times in aside.items()
         if times is not None
     ]
-    validations = _validations(config, windows, others)
-    first = posterior.datasets[0]
-    truth = (recoverable(stand, first.actuator) if stand else {}) | config.truth
+    validations = {}
+    for name, v in config.validation.items():
+        of = v.of or next(iter(windows))
+        if v.another:
+            judged = None if v.window is None else (v.window[0][0], v.window[0][1])
+            validations[name] = Validation((), others[name], start_of(config, name), judged, of)
+        else:
+            validations[name] = Validation(windows[of].held_out[name], of=of)
+    simulated = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
+    truth = simulated | config.truth
     problem = Problem(
-        _explicit(config, posterior, truth, aside, said),
+        _explicit(config, posterior, truth, aside, warned),
         fitted,
         posterior,
         _plan(config, posterior),
@@ -227,7 +269,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         findings,
     )
     for name in validations:
-        remarks += [f"{name}: {one.line}" for one in problem.extrapolations(name)]
+        remarks += [f"{name}: {finding.note}" for finding in problem.extrapolations(name)]
     return replace(problem, remarks=tuple(remarks))
 
 
@@ -251,7 +293,7 @@ def _posterior(
         )
     chosen = tuple(config.model.per_record), tuple(config.model.shared)
     table = JointTable(datasets[0].table, tuple(records), *chosen)
-    training = {name: one.training for name, one in windows.items()}
+    training = {name: window.training for name, window in windows.items()}
     contexts = contexts_of(config, records, training)
     parameters = parameters_of(config, table, contexts)
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
@@ -268,53 +310,40 @@ def _posterior(
     return Posterior(tuple(datasets), prior, engine, table), defaults
 
 
-def _validations(
-    config: Config, windows: Mapping[str, Windows], others: Mapping[str, Record]
-) -> dict[str, Validation]:
-    validations = {}
-    for name, v in config.validation.items():
-        of = v.of or next(iter(windows))
-        if v.another:
-            judged = None if v.window is None else (v.window[0][0], v.window[0][1])
-            start = start_of(config, name)
-            validations[name] = Validation((), others[name], start, judged, of)
-        else:
-            validations[name] = Validation(windows[of].held_out[name], of=of)
-    return validations
-
-
 # Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
 WALKERS: Mapping[Engine, int] = {"numba": 64, "numpy": 32}
 
 
 def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
-    given, prior = config.sampling, posterior.prior
+    settings, prior = config.sampling, posterior.prior
     # Six more than the least: complementary halves must span all directions.
-    least = 2 * prior.dimensions
-    walkers = given.walkers or max(least + 6, WALKERS[posterior.engine])
-    if walkers < least:
+    fewest = 2 * prior.dimensions
+    walkers = settings.walkers or max(fewest + 6, WALKERS[posterior.engine])
+    if walkers < fewest:
         raise InputError(
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
-            f"use at least {least}"
+            f"use at least {fewest}"
         )
-    samples = sum(one.readings.samples for one in posterior.datasets)
+    samples = sum(dataset.readings.samples for dataset in posterior.datasets)
+    places = best_places(walkers, samples)
     return SamplingPlan(
-        ess=given.ess,
-        ensembles=given.ensembles,
+        ess=settings.ess,
+        ensembles=settings.ensembles,
         walkers=walkers,
-        block=given.block,
-        most_steps=given.steps,
-        most_pilot_steps=given.pilot_steps,
-        together=best_together(given.ensembles, walkers, samples),
-        places=best_places(walkers, samples),
+        block=settings.block,
+        most_steps=settings.steps,
+        most_pilot_steps=settings.pilot_steps,
+        together=best_together(settings.ensembles, walkers, samples),
+        least_pilot_steps=100 if places > 1 else 50,
+        places=places,
     )
 
 
-def _set_aside(times: Sequence[float]) -> str:
+def _set_aside(times: Sequence[float], record: Record) -> str:
     """Say which readings were set aside as outliers."""
     if not times:
         return "no reading is an isolated outlier: none was set aside"
-    first = ", ".join(f"{time:g}" for time in times[:MOST_TIMES])
+    first = ", ".join(record.clock(time) for time in times[:MOST_TIMES])
     more = f" and {len(times) - MOST_TIMES} more" if len(times) > MOST_TIMES else ""
     plural = "s" if len(times) > 1 else ""
     return f"{len(times)} reading{plural} set aside as isolated outliers, at {first} s{more}"
@@ -332,13 +361,13 @@ def _explicit(
     records = {
         name: RecordConfig(
             file=f"records/{name}.h5",
-            train=one.train,
-            from_rest=one.from_rest,
+            train=source.train,
+            from_rest=source.from_rest,
             outliers=outliers[name],
             # Said while all were read: the first has them.
             remarks=remarks or None if name == next(iter(config.records)) else None,
         )
-        for name, one in config.records.items()
+        for name, source in config.records.items()
     }
     validation = {
         name: v.model_copy(

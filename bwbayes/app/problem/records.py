@@ -19,7 +19,6 @@ from bwbayes.app.config.config import (
 from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.stand import planned, stand_of
 from bwbayes.data import Record, read_record
-from bwbayes.data.inspection import Finding, inspect
 from bwbayes.data.io.formats import require_readable
 from bwbayes.data.record import Window
 from bwbayes.data.teststand import VirtualTestStand
@@ -32,6 +31,8 @@ from bwbayes.data.waveforms import (
     Waveform,
     signal,
 )
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
 from bwbayes.results.prediction import Start
 
@@ -82,7 +83,7 @@ def sampled_waveform(drive: str | SignalConfig) -> Waveform:
 
 
 def training_records(
-    config: Config, folder: Path, given: Mapping[str, Record]
+    config: Config, folder: Path, in_memory: Mapping[str, Record]
 ) -> tuple[dict[str, Record], VirtualTestStand | None]:
     """Return the training records by name, and the stand that made some, if one did.
 
@@ -92,7 +93,7 @@ def training_records(
     commands: dict[str, Waveform] = {}
     for name, source in config.records.items():
         if source.file is not None:
-            read[name] = _read(source, folder, given.get(name), place_of(name))
+            read[name] = _read(source, folder, in_memory.get(name), place_of(name))
         else:
             assert source.signal is not None
             commands[name] = sampled_waveform(source.signal)
@@ -101,8 +102,8 @@ def training_records(
     for name, waveform in commands.items():
         assert stand is not None
         purpose = "record" if name == ALONE else f"record {name}"
-        made = stand.run(waveform, generator(config.seed, purpose))
-        read[name] = _named(made, config.records[name].signal)
+        simulated = stand.run(waveform, generator(config.seed, purpose))
+        read[name] = _named(simulated, config.records[name].signal)
     records = {
         name: _cut(config.records[name], record, place_of(name)) for name, record in read.items()
     }
@@ -111,13 +112,13 @@ def training_records(
     return records, stand
 
 
-def _cut(source: RecordConfig, record: Record, place: str) -> Record:
+def _cut(source: RecordConfig, record: Record, table: str) -> Record:
     """Leave out the readings that a config leaves out."""
     if source.outliers:
         rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
         if rows.min() < 0 or rows.max() >= record.samples:
             end = record.start + record.duration
-            raise InputError(f"{place}.outliers: a time outside of {record.start:g} to {end:g} s")
+            raise InputError(f"{table}.outliers: a time outside of {record.start:g} to {end:g} s")
         record = record.without(rows.astype(np.int64))
     if source.exclude is not None:
         record = record.exclude([(window[0], window[1]) for window in source.exclude])
@@ -130,11 +131,11 @@ def _cut(source: RecordConfig, record: Record, place: str) -> Record:
 
 
 def _read(
-    source: RecordConfig | ValidationConfig, folder: Path, given: Record | None, place: str
+    source: RecordConfig | ValidationConfig, folder: Path, in_memory: Record | None, table: str
 ) -> Record:
     """Return the record that is given, or else read the source's file."""
-    if given is not None:
-        return replace(given, voltage_is=source.voltage_is or given.voltage_is)
+    if in_memory is not None:
+        return replace(in_memory, voltage_is=source.voltage_is or in_memory.voltage_is)
     assert source.file is not None
     try:
         return read_record(
@@ -145,7 +146,7 @@ def _read(
             fs=source.fs,
         )
     except ColumnsError as error:
-        raise error.within(place) from None
+        raise error.within(table) from None
 
 
 def other_record(
@@ -153,13 +154,13 @@ def other_record(
     name: str,
     folder: Path,
     training: Mapping[str, Record],
-    given: Record | None,
+    in_memory: Record | None,
 ) -> Record:
     """Return the record of a validation: from memory, a file, or the virtual stand."""
     source = config.validation[name]
     if source.file is not None:
-        record = _read(source, folder, given, f"validation.{name}")
-        if given is not None:
+        record = _read(source, folder, in_memory, f"validation.{name}")
+        if in_memory is not None:
             require_readable(record, f"validation.{name}")
     else:
         assert source.signal is not None
@@ -213,7 +214,7 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
     InputError
         A window outside of the record, windows that overlap, or one without a reading.
     """
-    source, place = config.records[name], place_of(name)
+    source, table = config.records[name], place_of(name)
     held_out = {
         f"validation.{n}.window": sorted((window[0], window[1]) for window in v.window)
         for n, v in config.validation.items()
@@ -223,8 +224,8 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
         train = [whole(record)]
     else:
         train = [(window[0], window[1]) for window in source.train]
-    given = {f"{place}.train": train, **held_out}
-    for where, window in [(key, window) for key in given for window in given[key]]:
+    named = {f"{table}.train": train, **held_out}
+    for where, window in [(key, window) for key in named for window in named[key]]:
         try:
             record.window_slice(*window)
         except InputError as error:
@@ -232,18 +233,18 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
     try:
         split = record.split(train, [window for windows in held_out.values() for window in windows])
     except InputError as error:
-        raise InputError(str(error).replace("record.train", f"{place}.train")) from None
+        raise InputError(str(error).replace("record.train", f"{table}.train")) from None
     slices = {
         where: tuple(record.window_slice(*window) for window in windows)
         for where, windows in held_out.items()
     }
-    for where, parts in {f"{place}.train": split.training, **slices}.items():
-        for part in parts:
-            if not record.has_reading[part].any():
-                begin, end = record.time[part][[0, -1]]
+    for where, parts in {f"{table}.train": split.training, **slices}.items():
+        for stretch in parts:
+            if not record.has_reading[stretch].any():
+                begin, end = record.time[stretch][[0, -1]]
                 raise InputError(
                     f"{where}: no readings from {record.clock(begin)} to {record.clock(end)} s; "
-                    f"choose another window, or see start, exclude and decimate in [{place}]"
+                    f"choose another window, or see start, exclude and decimate in [{table}]"
                 )
     names = [where.removeprefix("validation.").removesuffix(".window") for where in slices]
     return Windows(split.training, dict(zip(names, slices.values(), strict=True)))
@@ -257,13 +258,13 @@ def require_different(records: Mapping[str, Record], windows: Mapping[str, Windo
     InputError
         The same measurement is fitted twice, in windows that overlap.
     """
-    for (name, one), (other, two) in combinations(records.items(), 2):
+    for (name, first), (other, second) in combinations(records.items(), 2):
         overlap = any(
             a.start < b.stop and b.start < a.stop
             for a in windows[name].training
             for b in windows[other].training
         )
-        if overlap and one.sha256 == two.sha256:
+        if overlap and first.sha256 == second.sha256:
             raise InputError(
                 f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
                 "would count twice; remove one, or give them other windows"
@@ -277,9 +278,9 @@ def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]
         record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
     ]
     return tuple(
-        one
-        for one in inspect(record)
-        if any(one.start < stop and start < one.stop for start, stop in times)
+        finding
+        for finding in inspect(record)
+        if any(finding.start < stop and start < finding.stop for start, stop in times)
     )
 
 
@@ -287,9 +288,9 @@ def unlike(config: Config, name: str, record: Record) -> Iterator[str]:
     """Yield what is wrong with the record of a file that is predicted."""
     if config.validation[name].file is None:
         return
-    for one in inspect(record):
-        if one.kind == "switch-on transient":
-            remedy = f"lead_in_from = {one.stop:.3g} under [validation.{name}]"
-            yield f"{name}: {one.kind}: {one.text}; {remedy}"
-        elif one.kind not in ("one amplitude", "few readings"):
-            yield f"{name}: {one}"
+    for finding in inspect(record):
+        if finding.kind == "switch-on transient":
+            fix = f"lead_in_from = {record.clock(finding.stop)} under [validation.{name}]"
+            finding = replace(finding, fix=fix)  # noqa: PLW2901  # nothing here is fitted
+        if finding.kind not in ("one amplitude", "few readings"):
+            yield f"{name}: {finding}"

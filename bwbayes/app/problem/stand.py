@@ -50,11 +50,13 @@ def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
 
     Parts that differ may have parameters of the same name.
     """
-    made, other = stand.actuator, set[str]()
+    simulated, other = stand.actuator, set[str]()
     # Whether Bouc-Wen hysteresis is passive says where its parameters may lie, not what they mean.
-    alike = isinstance(made.hysteresis, BoucWen) and isinstance(fitted.hysteresis, BoucWen)
-    if not alike and made.hysteresis != fitted.hysteresis:
+    both_bouc_wen = isinstance(simulated.hysteresis, BoucWen) and isinstance(
+        fitted.hysteresis, BoucWen
+    )
+    if not both_bouc_wen and simulated.hysteresis != fitted.hysteresis:
         other |= {declared.name for declared in fitted.hysteresis.parameters}
-    if made.creep and fitted.creep and made.creep.times != fitted.creep.times:
+    if simulated.creep and fitted.creep and simulated.creep.times != fitted.creep.times:
         other |= {declared.name for declared in fitted.creep.parameters}
     return {name: value for name, value in stand.parameters().items() if name not in other}

@@ -1,17 +1,15 @@
 """The folder of a campaign: its config, a run's folder for each record, and what is finished.
 
 ``records/NAME/`` is the run of the record ``NAME.csv`` (or another suffix), as ``bwbayes run``
-leaves it. ``campaign.jsonl`` says which folder of records it is about, and then has a line for each
-run that came to its end: the digests of the record's file and of the run's summary. So a campaign
-can be continued from any moment on; a record that was changed is fitted again, and a run that was
-resumed by itself is looked at again.
+leaves it, with the digests of the record's file and of the run's summary in ``ended.json`` once it
+came to its end. ``origin.json`` says which folder of records the campaign is about. So it can be
+continued from any moment on; a record that was changed is fitted again, and a run that was resumed
+by itself is looked at again.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Mapping
+import json
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -20,15 +18,18 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from bwbayes.app.running.lock import only_writer
+from bwbayes.app.running.lock import drafted, only_writer
 from bwbayes.data.io.formats import SUFFIXES
 from bwbayes.errors import InputError
 
-__all__ = ["CampaignFolder", "Finished", "Origin", "digest", "records_in"]
+__all__ = ["ENDED", "CampaignFolder", "Origin", "digest", "ended", "records_in"]
+
+# What a run's folder has once it came to its end.
+ENDED = "ended.json"
 
 
 class Origin(BaseModel):
-    """The first line: the folder of the records, the folder that the config's files are in.
+    """Where it began: the folder of the records, the folder that the config's files are in.
 
     ``pictures`` tells whether every run draws its figures.
     """
@@ -38,16 +39,6 @@ class Origin(BaseModel):
     records: str
     where: str
     pictures: bool
-
-
-class Finished(BaseModel):
-    """A run that came to its end, of a record's file with this digest, with this summary."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str
-    file: str
-    summary: str
 
 
 @dataclass(frozen=True)
@@ -62,9 +53,9 @@ class CampaignFolder:
         return self.path / "campaign.toml"
 
     @property
-    def journal(self) -> Path:
-        """What was begun, and a line for each finished run."""
-        return self.path / "campaign.jsonl"
+    def mark(self) -> Path:
+        """Where it began."""
+        return self.path / "origin.json"
 
     @property
     def summary(self) -> Path:
@@ -107,30 +98,18 @@ class CampaignFolder:
         """
         folder = cls(path)
         if path.exists() and not overwrite:
-            begun = cls.open(path)
-            if begun.config.read_text(encoding="utf-8") != config or begun.origin() != origin:
+            existing = cls.open(path)
+            if existing.config.read_text(encoding="utf-8") != config or existing.origin() != origin:
                 raise InputError(
                     f"{path}: is a campaign of another config or other records; choose another "
                     "folder, or give `overwrite=True`"
                 )
-            return begun
-        if path.exists() and any(path.iterdir()) and not folder.journal.is_file():
+            return existing
+        if path.exists() and any(path.iterdir()) and not folder.mark.is_file():
             raise InputError(f"{path}: is not a campaign's folder; choose another")
-        draft = path.absolute().with_name(f".{path.name}.partial")
-        try:
-            shutil.rmtree(draft, ignore_errors=True)
-            (draft / "records").mkdir(parents=True)
-            made = cls(draft)
-            made.config.write_text(config, encoding="utf-8")
-            made.journal.write_text(origin.model_dump_json() + "\n", encoding="utf-8")
-            if path.exists():
-                shutil.rmtree(path)
-            draft.rename(path)
-        except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{path}: {reason}; choose another folder") from None
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
+        with drafted(path, "campaign") as draft:
+            cls(draft).config.write_text(config, encoding="utf-8")
+            cls(draft).mark.write_text(origin.model_dump_json(), encoding="utf-8")
         return folder
 
     @classmethod
@@ -143,66 +122,33 @@ class CampaignFolder:
             There is no campaign.
         """
         folder = cls(path)
-        if not (folder.journal.is_file() and folder.config.is_file()):
+        if not (folder.mark.is_file() and folder.config.is_file()):
             raise InputError(f"{path}: no campaign here; give the folder of one")
         return folder
 
     def origin(self) -> Origin:
-        """Return what was begun.
+        """Return where it began.
 
         Raises
         ------
         InputError
-            The journal does not say it.
+            The folder does not say it.
         """
-        first, *_ = self.journal.read_bytes().splitlines() or [b""]
         try:
-            return Origin.model_validate_json(first)
+            return Origin.model_validate_json(self.mark.read_bytes())
         except ValidationError:
             raise InputError(
-                f"{self.journal}: does not say which records it is about; start again with "
+                f"{self.mark}: does not say which records it is about; start again with "
                 "`overwrite=True`"
             ) from None
 
-    def finished(self) -> dict[str, Finished]:
-        """Return the runs that came to their end, by record; cut off half a line.
-
-        Raises
-        ------
-        InputError
-            A line does not tell of such a run.
-        """
-        content = self.journal.read_bytes()
-        whole = content.rfind(b"\n") + 1
-        if whole < len(content):
-            os.truncate(self.journal, whole)
-        every: dict[str, Finished] = {}
-        for number, line in enumerate(content[:whole].splitlines()[1:], start=2):
-            try:
-                one = Finished.model_validate_json(line)
-            except ValidationError:
-                raise InputError(
-                    f"{self.journal}:{number}: is not a finished run; delete this line"
-                ) from None
-            every[one.name] = one
-        return every
-
-    def note(self, one: Finished) -> None:
-        """Write a line so that it survives a crash."""
-        with self.journal.open("ab") as file:
-            file.write(one.model_dump_json().encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-
-    def is_done(self, file: Path, finished: Mapping[str, Finished]) -> bool:
+    def is_done(self, file: Path) -> bool:
         """Tell whether a record's run has ended, and is about the file as it is now."""
-        one, summary = finished.get(file.stem), self.run(file.stem) / "summary.json"
-        return (
-            one is not None
-            and summary.is_file()
-            and digest(summary) == one.summary
-            and digest(file) == one.file
-        )
+        run = self.run(file.stem)
+        try:
+            return (run / ENDED).read_text(encoding="utf-8") == ended(digest(file), run)
+        except (OSError, UnicodeError):
+            return False
 
     def locked(self) -> AbstractContextManager[None]:
         """Hold the folder as its only writer, as :func:`only_writer` does."""
@@ -234,8 +180,10 @@ def records_in(folder: Path) -> list[Path]:
 
 
 def digest(file: Path) -> str:
-    """Return the SHA-256 of a file; of one that cannot be read, nothing."""
-    try:
-        return sha256(file.read_bytes()).hexdigest()
-    except OSError:
-        return ""
+    """Return the SHA-256 of a file."""
+    return sha256(file.read_bytes()).hexdigest()
+
+
+def ended(record: str, run: Path) -> str:
+    """Return what the folder of a run that ended says: digests of its record and summary, JSON."""
+    return json.dumps({"record": record, "summary": digest(run / "summary.json")})

@@ -15,9 +15,9 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
-from bwbayes.app.figures import Drawing, drawings, picture_of, prepare, save_pictures
-from bwbayes.app.report.page import PagePlots
-from bwbayes.app.running.workers import Processes, ended
+from bwbayes.app.running.workers import processes
+from bwbayes.report.figures import Drawing, drawings, picture_of, prepare, save_pictures
+from bwbayes.report.page import PagePlots
 from bwbayes.results.result import Result
 
 __all__ = ["Beside", "beside"]
@@ -43,9 +43,9 @@ class Beside:
     def pictures(self, result: Result, folder: Path) -> dict[str, bytes]:
         """Wait until all are drawn, write them to the folder, and return PNG by name."""
         self.draw(result)
-        every = {name: self._picture(name, draw) for name, draw in drawings(result).items()}
-        save_pictures(every, folder)
-        return every
+        images = {name: self._picture(name, draw) for name, draw in drawings(result).items()}
+        save_pictures(images, folder)
+        return images
 
     def plots(self, result: Result) -> PagePlots:
         """Wait until the plots to zoom and hover are made, and return them."""
@@ -62,18 +62,18 @@ class Beside:
 
 
 @contextmanager
-def beside(workers: int | None, *, asked: bool) -> Iterator[Beside | None]:
-    """Give what draws beside, if that is ``asked`` for and more than one worker may work."""
-    if not asked or 1 in (workers, os.cpu_count()):
+def beside(workers: int | None, *, enabled: bool) -> Iterator[Beside | None]:
+    """Give what draws beside, if that is ``enabled`` and more than one worker may work."""
+    if not enabled or 1 in (workers, os.cpu_count()):
         yield None
         return
     # What is loaded here need not be loaded there, where a process may be copied while it runs.
     copied = sys.platform == "linux" and threading.active_count() == 1
-    with ended(Processes(1, "fork" if copied else "spawn")) as pool:
+    with processes(1, "fork" if copied else "spawn") as pool:
         yield Beside(pool)
 
 
 def _plots_of(result: Result) -> PagePlots:
-    from bwbayes.app.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
+    from bwbayes.report.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
 
     return interactive.made(result)

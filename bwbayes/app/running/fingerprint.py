@@ -116,16 +116,16 @@ def _values(config: Config) -> dict[str, object]:
     return {"coordinates": COORDINATES} | {
         key: value
         for key, value in _flat(config.model_dump(exclude_none=True))
-        if not any(key == one or key.startswith(f"{one}.") for one in FREE_TO_CHANGE)
+        if not any(key == free or key.startswith(f"{free}.") for free in FREE_TO_CHANGE)
         and not SOURCE.fullmatch(key)
         and not (key.startswith("parameters.") and key.endswith(NAMES_FOR_PEOPLE))
     }
 
 
-def _flat(table: Mapping[str, object], place: str = "") -> Iterator[tuple[str, object]]:
+def _flat(table: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yield keys with their tables' names before them, and values; a prior counts as one."""
     for name, value in table.items():
-        key = f"{place}{name}"
+        key = f"{prefix}{name}"
         if isinstance(value, Mapping) and name != "prior":
             yield from _flat(value, f"{key}.")
         else:

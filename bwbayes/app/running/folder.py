@@ -8,15 +8,14 @@ refuses a second writer.
 from __future__ import annotations
 
 import json
-import shutil
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
-from bwbayes.app.config.config import dump
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.running.lock import only_writer
+from bwbayes.app.config.config import dump, load
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.running.lock import drafted, only_writer
 from bwbayes.data import write_record
 from bwbayes.errors import InputError
 from bwbayes.results.standing import Standing
@@ -30,17 +29,17 @@ class RunFolder:
 
     path: Path
 
-    # What it holds, the file that only such a folder has at its start, and what begins it and goes
-    # on with it.
+    # What it holds, the file that only such a folder has at its start, and what begins and resumes
+    # it.
     KIND: ClassVar[str] = "run"
     MARK: ClassVar[str | None] = None
     BEGIN: ClassVar[str] = "bwbayes.fit(RECORD, folder={path!r})"
-    GO_ON: ClassVar[str] = "bwbayes.resume_run({path!r})"
+    RESUME: ClassVar[str] = "bwbayes.resume({path!r})"
 
     @property
     def resuming(self) -> str:
-        """What goes on with it, for messages."""
-        return f"`{self.GO_ON.format(path=str(self.path))}`"
+        """What resumes it, for messages."""
+        return f"`{self.RESUME.format(path=str(self.path))}`"
 
     @property
     def config(self) -> Path:
@@ -53,9 +52,25 @@ class RunFolder:
         return self.path / "chain.h5"
 
     @property
+    def result(self) -> Path:
+        """What was worked out of the chain."""
+        return self.path / "result.npz"
+
+    @property
     def summary(self) -> Path:
         """The run's numbers."""
         return self.path / "summary.json"
+
+    def problem(self) -> Problem:
+        """Return what its config and records say."""
+        return resolve(load(self.config), self.path)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the numbers of its summary; none as long as it is not finished."""
+        if not self.summary.is_file():
+            return {}
+        numbers: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
+        return numbers
 
     def standing(self) -> Standing:
         """Return whether the bands of the run hold.
@@ -66,8 +81,8 @@ class RunFolder:
             The run is not finished.
         """
         if not self.summary.is_file():
-            raise InputError(f"{self.path}: is not finished; resume it: {self.resuming}")
-        return Standing.read(json.loads(self.summary.read_text(encoding="utf-8")))
+            raise InputError(f"{self.path}: is not finished; resume with {self.resuming}")
+        return Standing.read(self.numbers())
 
     @classmethod
     def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
@@ -78,35 +93,29 @@ class RunFolder:
         InputError
             It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
-        if path.name == "..":
-            raise InputError(f"{path}: is not a valid folder name; choose another")
-        if path.exists():
-            if not overwrite:
-                raise InputError(
-                    f"{path}: exists; go on with {cls(path).resuming}, choose another folder, or "
-                    "give `overwrite=True`"
-                )
-            if not cls(path)._may_go():
-                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
-        draft = path.absolute().with_name(f".{path.name}.partial")
-        try:
-            shutil.rmtree(draft, ignore_errors=True)
-            (draft / "records").mkdir(parents=True)
+        cls.require_free(path, overwrite)
+        with drafted(path, cls.KIND) as draft:
             for name, record in {**problem.records, **problem.others}.items():
                 write_record(record, draft / f"records/{name}.h5")
             (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
             if cls.MARK:
                 (draft / cls.MARK).write_bytes(mark)
-            if path.exists():
-                with cls(path).locked():
-                    shutil.rmtree(path)
-            draft.rename(path)
-        except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{path}: {reason}; choose another folder") from None
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
         return cls(path)
+
+    @classmethod
+    def require_free(cls, path: Path, overwrite: bool) -> None:
+        """Refuse a place where a new run cannot be made, as :meth:`create` does."""
+        if path.name == "..":
+            raise InputError(f"{path}: is not a valid folder name; choose another")
+        if path.exists():
+            if not overwrite:
+                raise InputError(
+                    f"{path}: exists; resume with {cls(path).resuming}, choose another folder, "
+                    "or give `overwrite=True`"
+                )
+            empty = path.is_dir() and not any(path.iterdir())
+            if not (empty or cls(path)._is_of_its_kind()):
+                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -118,29 +127,23 @@ class RunFolder:
             There is no run.
         """
         folder = cls(path)
-        if folder.config.is_file() and folder._has_records() and folder._is_of_its_kind():
+        if folder._is_of_its_kind():
             return folder
         where = f"{path}: no {cls.KIND} here"
         if path.is_file():
             raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
-        if folder.config.is_file() and folder._has_records():
+        if folder._has_records():
             raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
         raise InputError(f"{where}; start one with `{cls.BEGIN.format(path=str(path))}`")
 
     def _has_records(self) -> bool:
         """Tell a folder that was made from one that holds a config alone."""
-        return any((self.path / "records").glob("*.h5"))
+        return self.config.is_file() and any((self.path / "records").glob("*.h5"))
 
     def _is_of_its_kind(self) -> bool:
-        """Tell a run's folder from a calibration's."""
+        """Tell a run's folder from a calibration's, and from what is neither."""
         is_calibration = (self.path / CalibrationFolder.MARK).is_file()
-        return is_calibration == (self.MARK is not None)
-
-    def _may_go(self) -> bool:
-        """Tell whether nothing of another kind would be lost with this folder."""
-        empty = self.path.is_dir() and not any(self.path.iterdir())
-        its_own = self.config.is_file() and self._has_records() and self._is_of_its_kind()
-        return empty or its_own
+        return self._has_records() and is_calibration == (self.MARK is not None)
 
     def locked(self) -> AbstractContextManager[None]:
         """Hold the folder as its only writer, as :func:`only_writer` does."""
@@ -154,7 +157,7 @@ class CalibrationFolder(RunFolder):
     KIND: ClassVar[str] = "calibration"
     MARK: ClassVar[str] = "replicates.jsonl"
     BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out {path}"
-    GO_ON: ClassVar[str] = "bwbayes calibrate --resume {path}"
+    RESUME: ClassVar[str] = "bwbayes calibrate --resume {path}"
 
     @property
     def replicates(self) -> Path:

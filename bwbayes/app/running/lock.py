@@ -1,7 +1,8 @@
-"""One writer at a time: a folder is held by the process that writes it."""
+"""Folders come whole or not at all, and one process at a time writes them."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from bwbayes.errors import InputError
 
-__all__ = ["only_writer"]
+__all__ = ["drafted", "only_writer"]
 
 
 @contextmanager
@@ -35,3 +36,28 @@ def only_writer(path: Path, kind: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextmanager
+def drafted(path: Path, kind: str) -> Iterator[Path]:
+    """Give a draft of a folder, with ``records`` in it; it takes the folder's place when whole.
+
+    Raises
+    ------
+    InputError
+        It cannot be written, or another process is writing the one that it replaces.
+    """
+    draft = path.absolute().with_name(f".{path.name}.partial")
+    try:
+        shutil.rmtree(draft, ignore_errors=True)
+        (draft / "records").mkdir(parents=True)
+        yield draft
+        if path.exists():
+            with only_writer(path, kind):
+                shutil.rmtree(path)
+        draft.rename(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: {reason}; choose another folder") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)

@@ -18,10 +18,10 @@ from rich.console import Console
 from bwbayes.app.config.config import Config, load, parse
 from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.campaign_folder import digest
+from bwbayes.app.running.campaign_folder import ENDED, digest, ended
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import go_on, load_run, numbers_of
+from bwbayes.app.running.run import resume
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.specimen import specimen_of
 from bwbayes.results.outputs import write_summary
@@ -63,13 +63,11 @@ class Task:
 
 @dataclass(frozen=True)
 class Ended:
-    """What came of a record: the digests of its file and of the run's summary, or a refusal."""
+    """What came of a record: ``short`` says why it was refused, or that it did not converge."""
 
     name: str
-    file: str = ""
-    summary: str = ""
-    converged: bool = False
-    refusal: str = ""
+    short: str = ""
+    refused: bool = False
 
 
 def fit_one(task: Task) -> Ended:
@@ -84,24 +82,25 @@ def fit_one(task: Task) -> Ended:
             return _fitted(task)
         except InputError as error:
             # Of a file in the folder of the records its name says enough.
-            return Ended(task.name, refusal=str(error).replace(f"{task.file.parent}{os.sep}", ""))
+            return Ended(task.name, str(error).replace(f"{task.file.parent}{os.sep}", ""), True)
         # One record must not end the others, whatever is wrong with it.
         except Exception as error:
-            return Ended(task.name, refusal=one_line(f"{type(error).__name__}: {error}"))
+            return Ended(task.name, one_line(f"{type(error).__name__}: {error}"), True)
 
 
 def _fitted(task: Task) -> Ended:
-    file = digest(task.file)
+    record = digest(task.file)
     problem = resolve(_config(task), task.where)
     folder = _folder(task.run, problem)
-    run = go_on(folder, Console(quiet=True), workers=1, files=task.pictures)
+    fit = resume(folder, Console(quiet=True), workers=1, files=task.pictures)
     if not task.pictures:
-        write_summary(folder.summary, numbers_of(folder, run.problem, run.result, run.seconds))
-    if run.outcome.converged:
-        free = run.result.flat_draws
-        source = generator(run.problem.config.seed, "specimen")
-        specimen_of(task.name, run.problem.posterior, free, source).save(task.run / SPECIMEN)
-    return Ended(task.name, file, digest(folder.summary), run.outcome.converged)
+        write_summary(folder.summary, fit.numbers)
+    if fit.converged:
+        source = generator(fit.problem.config.seed, "specimen")
+        specimen = specimen_of(task.name, fit.problem.posterior, fit.flat_draws, source)
+        specimen.save(task.run / SPECIMEN)
+    (task.run / ENDED).write_text(ended(record, task.run), encoding="utf-8")
+    return Ended(task.name, "" if fit.converged else "not converged")
 
 
 def _config(task: Task) -> Config:
@@ -110,10 +109,10 @@ def _config(task: Task) -> Config:
         config = parse(task.config, "campaign.toml")
         config = config.with_record(task.file)
     else:
-        made = propose(task.file, task.where)
-        if made.pointless is not None:
-            raise InputError(f"{task.file}: {made.pointless}")
-        config = made.config
+        proposal = propose(task.file, task.where)
+        if proposal.pointless is not None:
+            raise InputError(f"{task.file}: {proposal.pointless.error}")
+        config = proposal.config
     return config.model_copy(update={"name": task.name})
 
 
@@ -122,11 +121,11 @@ def _folder(path: Path, problem: Problem) -> RunFolder:
     folder = RunFolder(path)
     if path.exists():
         try:
-            begun = RunFolder.open(path)
+            existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            kept = fingerprint(load(begun.config)) == fingerprint(problem.config)
-            if kept and load_run(begun).record.sha256 == problem.record.sha256:
-                return begun
+            same_posterior = fingerprint(load(existing.config)) == fingerprint(problem.config)
+            if same_posterior and existing.problem().record.sha256 == problem.record.sha256:
+                return existing
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)

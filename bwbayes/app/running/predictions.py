@@ -8,28 +8,30 @@ on the data alone: the same record under another name gets the same bands.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
-from html import escape
-from io import StringIO
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from rich.console import Console
 
-from bwbayes.app.figures import draw_alone
 from bwbayes.app.problem.problem import Problem, generator
-from bwbayes.app.screen import show_scores, show_standing
 from bwbayes.arrays import FloatArray
+from bwbayes.data.io.grid import clock
 from bwbayes.data.record import Record
+from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import InputError, suggestion
-from bwbayes.results import innovations
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.untried import with_creep
+from bwbayes.report.figures import drawn
+from bwbayes.report.page import fragment
+from bwbayes.report.report import Figure, Report
+from bwbayes.report.run import prediction_report
+from bwbayes.report.screen import as_text
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.results.drift import Drift
-from bwbayes.results.extrapolation import beyond_training
-from bwbayes.results.innovations import Innovations
 from bwbayes.results.prediction import (
     Start,
     forecast,
@@ -37,17 +39,14 @@ from bwbayes.results.prediction import (
     predict_windows,
     thinned,
 )
-from bwbayes.results.result import Result
 from bwbayes.results.scores import Scores, as_summary, score
-from bwbayes.results.standing import Standing
-from bwbayes.results.transient import Transient
 from bwbayes.results.verdict import Background, Verdict, assess
 from bwbayes.shown import head
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    import xarray
 
-__all__ = ["Prediction", "Swallowed", "judged", "predict_another", "predictions", "scoring"]
+__all__ = ["Prediction", "judged", "predict_another", "predictions", "scoring"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,8 +71,8 @@ class Prediction(Bands):
         remarks: tuple[str, ...] = (),
     ) -> Self:
         """Return bands together with what is known of them."""
-        known = {one.name: getattr(bands, one.name) for one in fields(Bands)}
-        return cls(**known, scores=scores, verdict=verdict, remarks=remarks)
+        values = {item.name: getattr(bands, item.name) for item in fields(Bands)}
+        return cls(**values, scores=scores, verdict=verdict, remarks=remarks)
 
     @property
     def holds(self) -> bool | None:
@@ -95,7 +94,9 @@ class Prediction(Bands):
 
     def plot(self) -> Figure:
         """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
-        return draw_alone(self)
+        from bwbayes.report.figures.series import draw_bands  # noqa: PLC0415  # slow to load
+
+        return drawn(draw_bands, self)
 
     def numbers(self) -> dict[str, object]:
         """Return what ``bwbayes predict`` writes beside the bands: scores, verdict, remarks."""
@@ -115,25 +116,24 @@ class Prediction(Bands):
         return head(str(self))
 
     def __str__(self) -> str:
-        said = StringIO()
-        console = Console(file=said, width=100, force_jupyter=False, color_system=None)
-        console.print(self._title, highlight=False, markup=False, soft_wrap=True)
-        if self.scores is not None and self.verdict is not None:
-            show_standing(Standing.of([self.verdict]), console)
-            show_scores({self.name: self.scores}, console, {self.name: self.verdict})
-        for remark in (*self.remarks, *(self.verdict.notes if self.verdict else ())):
-            console.print(f"note: {remark}", highlight=False, markup=False, soft_wrap=True)
-        return said.getvalue().rstrip()
+        return "\n".join([self._title, as_text(self.report(), width=100)]).rstrip()
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+        return fragment(replace(self.report(), title=self._title))
+
+    def report(self) -> Report:
+        """Return how the prediction turned out, and what to know of it."""
+        notes = self.verdict.notes if self.verdict else ()
+        return prediction_report(self.name, self.scores, self.verdict, [*self.remarks, *notes])
 
     @property
     def _title(self) -> str:
         width = float(np.mean(self.upper["sensor", 95] - self.lower["sensor", 95]))
         return (
-            f"prediction {self.name}: {self.time.size} samples from {self.time[0]:g} to "
-            f"{self.time[-1] + self.interval:g} s; the 95 % sensor band is {width:.3g} um wide"
+            f"prediction {self.name}: {self.time.size} samples from "
+            f"{clock(self.time[0], self.interval)} to "
+            f"{clock(self.time[-1] + self.interval, self.interval)} s; "
+            f"the 95 % sensor band is {width:.3g} um wide"
         )
 
 
@@ -172,16 +172,16 @@ def predict_another(
         A lead-in or window that does not fit into the record.
     """
     posterior, seed = problem.posterior, problem.config.seed
-    far = beyond_training(posterior, record.voltage, record.interval)
+    beyond = beyond_training(posterior, record.voltage, record.interval)
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"predict {record.sha256}")
     of = training_record(problem, of)
-    alone, its = posterior.alone(of), posterior.its(chosen, of)
-    bands = predict_record(alone, its, record, start, source, name, window)
+    alone, own_draws = _reaching(problem, chosen, of, record, beyond)
+    bands = predict_record(alone, own_draws, record, start, source, name, window)
     background = Background.of(posterior, flat)
-    verdict = assess(bands, background, beyond=far)
+    verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, scoring(seed, bands), background.extent)
-    return Prediction.of(bands, scores, verdict, tuple(one.line for one in far))
+    return Prediction.of(bands, scores, verdict, tuple(finding.note for finding in beyond))
 
 
 def predict_after(
@@ -193,33 +193,58 @@ def predict_after(
     first. All else is as in :func:`predict_another`; see
     :func:`~bwbayes.results.prediction.forecast`.
     """
-    posterior, seed, of = problem.posterior, problem.config.seed, training_record(problem, of)
+    seed, of = problem.config.seed, training_record(problem, of)
     record = problem.records[of]
-    whole = np.concatenate([record.voltage, voltage])
-    far = beyond_training(posterior, whole, record.interval, slice(record.samples, None))
+    joined = np.concatenate([record.voltage, voltage])
+    after = slice(record.samples, None)
+    beyond = beyond_training(problem.posterior, joined, record.interval, after)
     chosen = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
-    alone, its = posterior.alone(of), posterior.its(chosen, of)
-    bands = forecast(alone, its, record, voltage, source, name)
-    return Prediction.of(bands, remarks=tuple(one.line for one in far))
+    longer = replace(record, voltage=joined, displacement=None, truth=None)
+    alone, own_draws = _reaching(problem, chosen, of, longer, beyond)
+    bands = forecast(alone, own_draws, record, voltage, source, name)
+    return Prediction.of(bands, remarks=tuple(finding.note for finding in beyond))
 
 
-def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> FloatArray:
-    """Return readings less the mean of the bands along the training record, (samples,), um.
+def _reaching(
+    problem: Problem, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
+) -> tuple[Posterior, FloatArray]:
+    """Return posterior and draws of a training record, to predict another record.
+
+    They have creep where that is slower or longer than what was fitted, so that the band grows with
+    what the training did not show.
+    """
+    posterior = problem.posterior
+    if any(one.kind in ("slow", "duration") for one in beyond):
+        source = generator(problem.config.seed, f"creep {record.sha256}")
+        posterior, draws = with_creep(posterior, draws, record.duration, source)
+    return posterior.alone(of), posterior.its(draws, of)
+
+
+def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> xarray.DataArray:
+    """Return readings less the mean of the bands along the training record, (time,), um.
+
+    nan where nothing was predicted, and where there is no reading. Those of several records are
+    those of their bands: ``fit.bands["step_10"].residuals``.
 
     Raises
     ------
     InputError
         Several records were fitted.
     """
+    import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
+
     if len(problem.records) > 1:
         raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
     values = np.full(problem.record.samples, np.nan)
     for name, windows in problem.windows(*problem.records).items():
-        whole = slice(windows[0].start, windows[-1].stop)
+        span = slice(windows[0].start, windows[-1].stop)
         residuals = bands[name].residuals
-        values[whole] = np.where(np.isfinite(residuals), residuals, values[whole])
-    return values
+        values[span] = np.where(np.isfinite(residuals), residuals, values[span])
+    time = ("time", problem.record.time, {"units": "s"})
+    return xr.DataArray(
+        values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
+    )
 
 
 def training_record(problem: Problem, name: str | None) -> str:
@@ -236,57 +261,50 @@ def training_record(problem: Problem, name: str | None) -> str:
     return name or next(iter(problem.records))
 
 
-def predictions(problem: Problem, result: Result) -> tuple[Bands, ...]:
-    """Predict the training windows of all records and everything held out."""
+def predictions(problem: Problem, flat: FloatArray, *, training: bool = True) -> tuple[Bands, ...]:
+    """Predict everything held out, and the ``training`` windows of all records, from flat draws."""
     posterior, seed = problem.posterior, problem.config.seed
-    chosen = thinned(result.flat_draws, generator(seed, "draws"))
+    chosen = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
-    for name, alone, its in posterior.each(chosen):
-        record, windows = problem.records[name], problem.windows(name)
-        # By content: the same record under another name gets the same bands.
-        source = generator(seed, f"predict {record.sha256}")
-        bands += predict_windows(alone, its, record, windows, source)
+    for name, alone, own_draws in posterior.each(chosen):
+        windows = problem.windows(name) if training else problem.held_out(name)
+        if windows:
+            record = problem.records[name]
+            # By content: the same record under another name gets the same bands.
+            source = generator(seed, f"predict {record.sha256}")
+            bands += predict_windows(alone, own_draws, record, windows, source)
     for name, other in problem.validations.items():
         if other.record is not None:
             source = generator(seed, f"predict {other.record.sha256}")
-            alone, its = posterior.alone(other.of), posterior.its(chosen, other.of)
+            beyond = problem.extrapolations(name)
+            alone, own_draws = _reaching(problem, chosen, other.of, other.record, beyond)
             bands.append(
-                predict_record(alone, its, other.record, other.start, source, name, other.judged)
+                predict_record(
+                    alone, own_draws, other.record, other.start, source, name, other.judged
+                )
             )
     return tuple(bands)
-
-
-class Swallowed(NamedTuple):
-    """What a fit has followed that the actuator did not do, if anything."""
-
-    transient: Transient | None
-    drift: Drift | None
 
 
 def judged(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
-    series: Mapping[str, Innovations],
-    followed: Mapping[str, Swallowed],
+    explanations: Mapping[str, Sequence[Explanation]],
 ) -> dict[str, Verdict]:
     """Judge all bands that have readings, by name.
 
-    ``series`` and ``followed`` are by the name of the training record.
+    ``explanations`` are by the name of the training record.
     """
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
-    for one in bands:
-        far = problem.extrapolations(one.name)
-        record = records.get(one.name) if one.training else None
-        start, transient, drift = None, None, None
-        # Of several training windows the first one holds the start.
-        if record and one.time[0] <= series[record].time[0] <= one.time[-1]:
-            start = innovations.odd_start(series[record])
-            transient, drift = followed[record]
-        verdict = assess(one, background, start=start, transient=transient, drift=drift, beyond=far)
+    for predicted in bands:
+        fitted = predicted.training
+        explained = explanations.get(records[predicted.name], ()) if fitted else ()
+        beyond = problem.extrapolations(predicted.name)
+        verdict = assess(predicted, background, explanations=explained, beyond=beyond)
         if verdict is not None:
-            verdicts[one.name] = verdict
+            verdicts[predicted.name] = verdict
     return verdicts
 
 

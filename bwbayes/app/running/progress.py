@@ -7,7 +7,7 @@ then. Quiet means nothing at all.
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections.abc import Mapping
 from typing import Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
 
-__all__ = ["CampaignProgress", "Progress", "ReplicateProgress"]
+__all__ = ["CountProgress", "Progress"]
 
 # Seconds between lines where there is no terminal.
 PAUSE = 10.0
@@ -52,45 +52,29 @@ class _Line:
             self.console.print(line, highlight=False, soft_wrap=True)
 
 
-class ReplicateProgress(_Line):
-    """Watches the replicates of a calibration, of which ``done`` are there and some missing."""
+class CountProgress(_Line):
+    """Watches replicates or records (``kind``), of which ``done`` are there and some missing.
 
-    def __init__(self, console: Console, done: int, missing: int, unconverged: int = 0) -> None:
+    ``short`` counts those that came to less than they should, by what they are.
+    """
+
+    def __init__(
+        self, console: Console, kind: str, done: int, missing: int, short: Mapping[str, int]
+    ) -> None:
         super().__init__(console)
-        self.before = self.done = done
-        self.total = done + missing
-        self.unconverged = unconverged
+        self.kind, self.before, self.done = kind, done, done
+        self.total, self.short = done + missing, dict(short)
 
-    def __call__(self, converged: bool) -> None:
-        """Take note of a finished replicate."""
+    def __call__(self, short: str = "") -> None:
+        """Take note of a finished one, and of what it is short of, if anything."""
         self.done += 1
-        self.unconverged += not converged
+        if short:
+            self.short[short] += 1
         rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
+        counts = "   ".join(f"{name} {count}" for name, count in self.short.items())
         self.show(
-            f"replicate {self.done} of {self.total}   {60 * rate:.1f} a minute   "
-            f"ETA {_minutes((self.total - self.done) / rate)}   "
-            f"not converged {self.unconverged}"
-        )
-
-
-class CampaignProgress(_Line):
-    """Watches the records of a campaign, of which ``done`` are there and some missing."""
-
-    def __init__(self, console: Console, done: int, missing: int) -> None:
-        super().__init__(console)
-        self.before = self.done = done
-        self.total = done + missing
-        self.short = Counter[str]()
-
-    def __call__(self, short: str) -> None:
-        """Take note of a record that came to its end, and of what it is short of, if anything."""
-        self.done += 1
-        self.short[short] += 1
-        rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
-        self.show(
-            f"record {self.done} of {self.total}   {60 * rate:.1f} a minute   "
-            f"ETA {_minutes((self.total - self.done) / rate)}   "
-            f"not converged {self.short['not converged']}   refused {self.short['refused']}"
+            f"{self.kind} {self.done} of {self.total}   {60 * rate:.1f} a minute   "
+            f"ETA {_minutes((self.total - self.done) / rate)}   {counts}"
         )
 
 
@@ -124,17 +108,15 @@ class Progress(_Line):
             return f"{phase:9} {steps:6.0f} steps   {rate:6.0f} models/s   ensembles are converging"
         check = self.check
         fewest = float(np.min([check.ess_bulk, check.ess_tail]))
+        # It counts down to the end that was forecast at the last check.
+        remaining = "unknown" if self.end is None else _minutes(self.end - time.monotonic())
         cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
             f"sampling  {check.steps:6d} steps   {rate:6.0f} models/s   "
-            f"ETA {self._remaining()}   acceptance {check.acceptance:.2f}   "
+            f"ETA {remaining}   acceptance {check.acceptance:.2f}   "
             f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}   "
             f"{cover}"
         )
-
-    def _remaining(self) -> str:
-        """Count down to the end that was forecast at the last check."""
-        return "unknown" if self.end is None else _minutes(self.end - time.monotonic())
 
     def _forecast(self) -> float | None:
         """Guess the end from the effective draws per step so far and the autocorrelation time.
@@ -149,12 +131,14 @@ class Progress(_Line):
         needed = max(needed, LENGTH * float(np.max(self.check.autocorrelation)))
         if not np.isfinite(needed):
             return None
-        each = self.plan.block / self.plan.ensembles
-        left = min(needed, self.plan.most_steps) - self.check.steps - self.since * each
+        steps_a_block = self.plan.block / self.plan.ensembles
+        remaining = (
+            min(needed, self.plan.most_steps) - self.check.steps - self.since * steps_a_block
+        )
         now = time.monotonic()
-        return now + max(left, 0) * (now - self.begun) / (self.done * each)
+        return now + max(remaining, 0) * (now - self.begun) / (self.done * steps_a_block)
 
 
 def _minutes(seconds: float) -> str:
-    minutes, rest = divmod(max(round(seconds), 0), 60)
-    return f"{minutes}:{rest:02d}"
+    minutes, remainder = divmod(max(round(seconds), 0), 60)
+    return f"{minutes}:{remainder:02d}"

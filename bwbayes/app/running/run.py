@@ -1,6 +1,6 @@
 """A run, from a config or from where it was interrupted, to its last file.
 
-:func:`start` makes the run's folder; :func:`carry_on` does whatever is left to do in one: point
+:func:`start` makes the run's folder; :func:`resume` does whatever is left to do in one: point
 fit, sampling, prediction, files. Each stage draws from a random stream of its own and stores what
 the next one needs, so it does not matter in how many pieces a run is done.
 """
@@ -13,62 +13,34 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.figures import draw_all, save
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.report.report import render
-from bwbayes.app.running.assembling import assemble
+from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.drawing import Beside, beside
 from bwbayes.app.running.fingerprint import fingerprint, require_same, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import judged, predictions
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.workers import executor, one_thread
-from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.report.figures import save_pictures
+from bwbayes.report.page import render
+from bwbayes.report.saving import draw_pictures
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
-from bwbayes.results.result import Result, summary
+from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import Outcome, first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = [
-    "Run",
-    "assemble",
-    "carry_on",
-    "finished",
-    "go_on",
-    "judged",
-    "load_run",
-    "numbers_of",
-    "predictions",
-    "redraw",
-    "start",
-    "versions",
-    "write_files",
-]
-
-
-class Run(NamedTuple):
-    """A run whose sampling has come to an end: its problem, chain and outcome.
-
-    ``seconds`` is the wall time that it took, and ``result`` what came of it.
-    """
-
-    problem: Problem
-    chain: ChainFile
-    outcome: Outcome
-    result: Result
-    seconds: float
+__all__ = ["begin", "draw", "finished", "redraw", "resume", "start", "write_files"]
 
 
 def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
@@ -82,29 +54,39 @@ def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) ->
     return RunFolder.create(out, resolve(config, where), overwrite)
 
 
-def load_run(folder: RunFolder) -> Problem:
-    """Return the problem of a run's folder."""
-    return resolve(load(folder.config), folder.path)
+def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
+    """Return a run's problem and its MAP estimate, which is worked out if it is not there yet.
+
+    Raises
+    ------
+    InputError
+        The folder's files do not fit together, or another process is writing them.
+    """
+    with folder.locked(), one_thread():
+        problem = folder.problem()
+        with _chain(folder, problem, Console(quiet=True), None) as chain:
+            return problem, chain.point
 
 
-def carry_on(
-    folder: RunFolder,
-    console: Console,
-    *,
-    workers: int | None = None,
-    ess: float | None = None,
-    steps: int | None = None,
-    engine: Engine | None = None,
-    how: str | Executor | None = None,
-    apart: bool = False,
-    show: Callable[[Problem], None] | None = None,
-) -> Result:
-    """Finish a run and write its files, as :func:`go_on` does; return the result."""
-    to = partial(go_on, ess=ess, steps=steps, engine=engine)
-    return to(folder, console, workers=workers, how=how, apart=apart, show=show).result
+def draw(folder: RunFolder) -> Fit:
+    """Sample a run to its end, from wherever it stands, and work nothing out of it yet.
+
+    Raises
+    ------
+    InputError
+        The folder's files do not fit together, or another process is writing them.
+    """
+    with folder.locked(), one_thread():
+        problem = folder.problem()
+        with (
+            _chain(folder, problem, Console(quiet=True), None) as chain,
+            executor(1, problem.posterior.engine) as pool,
+        ):
+            outcome = sample(problem.posterior, problem.plan, chain, pool)
+        return Fit(problem, chain, folder).knowing(outcome=outcome)
 
 
-def go_on(
+def resume(
     folder: RunFolder,
     console: Console,
     *,
@@ -113,11 +95,12 @@ def go_on(
     steps: int | None = None,
     engine: Engine | None = None,
     files: bool = True,
-    how: str | Executor | None = None,
-    apart: bool = False,
+    backend: str | Executor | None = None,
+    background: bool = False,
     show: Callable[[Problem], None] | None = None,
-) -> Run:
-    """Finish a run.
+    answer: Callable[[Fit], None] | None = None,
+) -> Fit:
+    """Finish a run, from wherever it stands.
 
     Parameters
     ----------
@@ -130,47 +113,55 @@ def go_on(
     ess, steps
         A new target and budget, if given.
     engine
-        Go on with this engine, whatever the chain was begun with: the same posterior, but from
+        Resume with this engine, whatever the chain was begun with: the same posterior, but from
         here on not the same bits.
     files
         Write what a run leaves besides its config, records and chain.
-    how
+    backend
         Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
-    apart
-        Draw in a process of its own, if there may be several: sooner, and the same pictures.
+    background
+        Draw in a process of its own, if there may be several: sooner, and the same figures.
     show
         Is called with the problem before anything is done with it.
+    answer
+        Is called with the fit before its files are written.
 
     Raises
     ------
     InputError
         The folder's files do not fit together, or another process is writing them.
     """
-    begun = time.monotonic()
+    start_time = time.monotonic()
     # First of all: it goes on from this process as it is now.
-    with beside(workers, asked=apart and files) as artist, folder.locked(), one_thread():
-        if any(one is not None for one in (ess, steps, engine)):
-            _retarget(folder, ess, steps, engine)
-        problem = load_run(folder)
+    with beside(workers, enabled=background and files) as artist, folder.locked(), one_thread():
+        targets = {"ess": ess, "steps": steps, "engine": engine}
+        _retarget(folder, {name: value for name, value in targets.items() if value is not None})
+        problem = folder.problem()
         if show is not None:
             show(problem)
         with (
             _chain(folder, problem, console, engine) as chain,
-            executor(workers, problem.posterior.engine, how) as pool,
+            executor(workers, problem.posterior.engine, backend) as pool,
             Progress(console, problem.plan) as progress,
         ):
             # It is written last, as the sign that all is done; now there is more to do.
             folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
-        console.print("predicting and drawing ..." if files else "predicting ...", highlight=False)
+        console.print(_effort(problem, chain, outcome), highlight=False)
+        console.print("computing predictions ...", highlight=False)
         result = assemble(problem, chain, outcome, artist)
-        seconds = time.monotonic() - begun
+        fit = Fit(problem, chain, folder, time.monotonic() - start_time).knowing(
+            outcome=outcome, result=result, standing=result.standing
+        )
+        if answer is not None:
+            answer(fit)
         if files:
-            write_files(folder, problem, result, seconds, artist)
-    return Run(problem, chain, outcome, result, seconds)
+            console.print("writing figures and files ...", highlight=False)
+            write_files(fit, folder, artist)
+    return fit
 
 
-def redraw(folder: RunFolder) -> Result:
+def redraw(folder: RunFolder) -> Fit:
     """Write the files of a finished run again, from its chain.
 
     Raises
@@ -180,32 +171,26 @@ def redraw(folder: RunFolder) -> Result:
     """
     with folder.locked(), one_thread():
         if not folder.summary.is_file():
-            raise InputError(
-                f"{folder.path}: the run is not finished; go on with {folder.resuming}"
-            )
-        seconds = json.loads(folder.summary.read_text(encoding="utf-8"))["wall_s"]
-        problem, chain, outcome = finished(folder)
-        result = assemble(problem, chain, outcome)
-        write_files(folder, problem, result, seconds)
-    return result
+            raise InputError(f"{folder.path}: is not finished; resume with {folder.resuming}")
+        fit = finished(folder)
+        write_files(fit, folder)
+    return fit
 
 
-def finished(folder: RunFolder) -> tuple[Problem, ChainFile, Outcome]:
-    """Read a run's problem and chain, and judge the chain as it stands.
+def finished(folder: RunFolder) -> Fit:
+    """Return the fit that a run's folder holds, as far as its chain goes.
 
     Raises
     ------
     InputError
         The chain is missing, damaged or still in its pilot.
     """
-    problem = load_run(folder)
+    problem = folder.problem()
     chain = ChainFile.read(folder.chain)
     _require_its_own(folder.chain, problem, chain.attributes())
     if chain.blocks("sampling") == 0:
-        raise InputError(f"{folder.path}: no draws yet; go on with {folder.resuming}")
-    as_it_stands = replace(problem.plan, most_steps=chain.steps("sampling"))
-    with executor(1) as pool:
-        return problem, chain, sample(problem.posterior, as_it_stands, chain, pool)
+        raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
+    return Fit(problem, chain, folder, folder.numbers().get("wall_s", 0.0))
 
 
 def _chain(
@@ -215,17 +200,17 @@ def _chain(
     posterior, config = problem.posterior, problem.config
     if folder.chain.exists():
         chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
-        begun, now = chain.attributes()["engine"], posterior.engine
-        if begun != now:
+        first_engine, now = chain.attributes()["engine"], posterior.engine
+        if first_engine != now:
             if requested is None:
                 chain.close()
                 raise InputError(
-                    f"{folder.chain}: was sampled with the {begun} engine, not {now}; set "
-                    f'engine = "{begun}" in {folder.config}, or resume with `engine="{now}"`'
+                    f"{folder.chain}: was sampled with the {first_engine} engine, not {now}; set "
+                    f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
                 )
-            console.print(f"going on with the {now} engine a chain begun with {begun}")
+            console.print(f"resuming with the {now} engine a chain begun with {first_engine}")
         return chain
-    console.print("point fit ...", highlight=False)
+    console.print("computing the MAP estimate ...", highlight=False)
     point = pointfit.fit(posterior, generator(config.seed, "point fit"))
     attributes: dict[str, str | int] = {
         "config": dump(config),
@@ -248,14 +233,22 @@ def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int
     require_same(noted.get("posterior"), problem.config, path)
 
 
-def _retarget(
-    folder: RunFolder, ess: float | None, steps: int | None, engine: Engine | None
-) -> None:
-    config = load(folder.config)
-    changes = {"ess": ess, "steps": steps, "engine": engine}
-    sampling = config.sampling.model_copy(
-        update={name: value for name, value in changes.items() if value is not None}
+def _effort(problem: Problem, chain: ChainFile, outcome: Outcome) -> str:
+    """Say how many models all effective draws took, those of the phases before them included."""
+    steps = sum(chain.steps(phase) for phase in PHASES)
+    models = steps * problem.plan.ensembles * problem.plan.walkers
+    fewest = float(np.min([outcome.check.ess_bulk, outcome.check.ess_tail]))
+    return (
+        f"sampled {models} models, {models / fewest:.1f} for each of {fewest:.0f} effective draws"
     )
+
+
+def _retarget(folder: RunFolder, targets: Mapping[str, object]) -> None:
+    """Write new targets of the sampling, if there are any, into the folder's config."""
+    if not targets:
+        return
+    config = load(folder.config)
+    sampling = config.sampling.model_copy(update=targets)
     text = dump(config.model_copy(update={"sampling": sampling}))
     parse(text, "resume")  # refuses what a config cannot say
     draft = folder.config.with_suffix(".partial")
@@ -263,52 +256,27 @@ def _retarget(
     draft.replace(folder.config)
 
 
-def log_likelihood(posterior: Posterior, result: Result) -> FloatArray:
-    """Return the log likelihood of each draw, nats, shaped as ``result.log_density``."""
-    prior = posterior.prior
-    _, log_prior = prior.constrain(prior.unconstrain(result.flat_draws))
-    return result.log_density - log_prior.reshape(result.log_density.shape)
-
-
-def going_on(path: Path, problem: Problem) -> str:
-    """Return the command that goes on with a run, with twice the budget that it had."""
-    return f"bwbayes resume {path} --steps {2 * problem.config.sampling.steps}"
-
-
-def numbers_of(
-    folder: RunFolder, problem: Problem, result: Result, seconds: float
-) -> dict[str, object]:
-    """Return a run's numbers as its summary holds them."""
-    return summary(result) | {
-        "seed": problem.config.seed,
-        "go_on": None if result.outcome.converged else going_on(folder.path, problem),
-        "wall_s": seconds,
-        "versions": versions(problem.posterior.engine),
-        "data_sha256": problem.sha256,
-    }
-
-
-def write_files(
-    folder: RunFolder,
-    problem: Problem,
-    result: Result,
-    seconds: float,
-    artist: Beside | None = None,
-) -> None:
-    """Write all files of a run; the summary last, as the sign that all is done."""
+def write_files(fit: Fit, folder: RunFolder, artist: Beside | None = None) -> None:
+    """Write all files of a run into a folder; the summary last, as the sign that all is done."""
+    fit = fit.knowing(folder=folder)
+    result, numbers = fit.result, fit.numbers
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
     if artist is not None:
         artist.draw(result)
-    numbers = numbers_of(folder, problem, result, seconds)
-    density = log_likelihood(problem.posterior, result)
-    write_posterior(folder.path / "posterior.nc", result, density, problem.records)
+    records = fit.problem.records
+    write_posterior(folder.path / "posterior.nc", result, fit.log_likelihood, records)
     (folder.path / "bands.csv").unlink(missing_ok=True)
     if result.bands:
         write_bands(folder.path / "bands.csv", result.bands)
     if artist is None:
-        page = render(result, numbers, save(draw_all(result), figures))
+        from bwbayes.report.figures import interactive  # noqa: PLC0415  # bokeh is slow to load
+
+        pictures, plots = draw_pictures(fit.report()), interactive.made(result)
+        save_pictures(pictures, figures)
     else:
-        page = render(result, numbers, artist.pictures(result, figures), artist.plots(result))
+        pictures, plots = artist.pictures(result, figures), artist.plots(result)
+    save_result(folder.result, fit.problem, fit.chain, result)
+    page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

@@ -1,7 +1,8 @@
 """Where ensembles, replicates and records are worked on: here, in processes, or on a cluster.
 
-Matrix products here are small and the ensembles already share the cores, so the linear algebra
-library is kept to one thread: more would only wait for each other, and could change the last bits.
+The executors are those of ``concurrent.futures`` and of ``distributed``. Matrix products here are
+small and the ensembles already share the cores, so the linear algebra library is kept to one
+thread: more would only wait for each other, and could change the last bits.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any, Literal
@@ -25,19 +25,16 @@ from threadpoolctl import threadpool_limits
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 
-__all__ = ["KINDS", "Processes", "ended", "executor", "one_thread", "side_by_side"]
+__all__ = ["KINDS", "ByValue", "executor", "one_thread", "processes", "side_by_side"]
 
 
 # What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
 KINDS = ("local", "threads", "processes", "dask")
 
-# Times that a call is made before it is taken for what ends its processes.
-TRIES = 3
-
 
 @contextmanager
 def executor(
-    workers: int | None = None, engine: Engine = "numpy", how: str | Executor | None = None
+    workers: int | None = None, engine: Engine = "numpy", backend: str | Executor | None = None
 ) -> Iterator[Executor]:
     """Give an executor with that many workers, by default one a core.
 
@@ -48,7 +45,7 @@ def executor(
     engine
         Compiled code runs in threads of this process, side by side. Several workers with NumPy,
         which does not, are processes; a single one is this process itself.
-    how
+    backend
         "local", which is that; "threads" or "processes" whatever the engine; "dask", processes
         of this machine under a scheduler; "dask://HOST:PORT", the workers of a scheduler that runs
         already; or any executor with the methods of ``concurrent.futures``, or a
@@ -59,72 +56,85 @@ def executor(
     InputError
         Another word, or a cluster that does not answer.
     """
-    if how is not None and not isinstance(how, str):
-        yield _given(how)
+    if backend is not None and not isinstance(backend, str):
+        yield _given(backend)
         return
-    kind = how or "local"
+    kind = backend or "local"
+    count = workers or os.cpu_count() or 1
     if kind == "dask" or kind.startswith("dask://"):
         # Here, because few have dask, and it takes a second to load.
         from bwbayes.app.running.cluster import cluster  # noqa: PLC0415
 
         with cluster(kind.removeprefix("dask").removeprefix("://") or None, workers) as pool:
             yield pool
-        return
-    if kind not in KINDS:
-        known = ", ".join(KINDS)
-        raise InputError(f"executor: {kind!r} is unknown; write one of {known}, dask://HOST:PORT")
-    count = workers or os.cpu_count() or 1
-    if kind == "local":
-        kind = "processes" if count > 1 and engine == "numpy" else "threads"
-        count = count if engine == "numba" or kind == "processes" else 1
-    with ended(Processes(count) if kind == "processes" else ThreadPoolExecutor(count)) as own:
-        yield own
+    elif kind == "processes" or (kind == "local" and engine == "numpy" and count > 1):
+        with processes(count) as pool:
+            yield pool
+    elif kind in KINDS:
+        threads = ThreadPoolExecutor(1 if kind == "local" and engine == "numpy" else count)
+        try:
+            yield threads
+        finally:
+            threads.shutdown(cancel_futures=True)
+    else:
+        kinds = ", ".join(KINDS)
+        raise InputError(f"executor: {kind!r} is unknown; write one of {kinds}, dask://HOST:PORT")
 
 
 @contextmanager
-def ended(own: Executor) -> Iterator[Executor]:
-    """Give an executor, and end it when all is done, or at once if that is interrupted."""
+def processes(count: int, method: Literal["spawn", "fork"] = "spawn") -> Iterator[ByValue]:
+    """Give an executor with processes, which end at once if whoever has it is interrupted.
+
+    "spawn" starts Python in each; "fork" copies this process as it is, at once and with all that it
+    has loaded, which only a process without other threads may do.
+    """
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context(method), _settle)
     try:
-        yield own
+        with warnings.catch_warnings():
+            # Python warns of any thread; those of the linear algebra library stop for a fork.
+            warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)
+            _start(pool, count)
+        yield ByValue(pool)
     except BaseException:
         # Whoever is interrupted does not wait for the end of what nobody will read.
-        if isinstance(own, Processes):
-            own.kill()
+        for process in [*(pool._processes or {}).values()]:
+            process.kill()
         raise
     finally:
-        own.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
-def side_by_side(pool: Executor, workers: int | None, most: int) -> int:
+def side_by_side(pool: Executor, workers: int | None, calls: int) -> int:
     """Return how many calls are to be under way: those of a cluster, two for each worker."""
-    known = getattr(pool, "workers", None)
-    count = 2 * known if isinstance(known, int) else workers or os.cpu_count() or 1
-    return max(min(count, most), 1)
+    workers_there = getattr(pool, "workers", None)
+    count = 2 * workers_there if isinstance(workers_there, int) else workers or os.cpu_count() or 1
+    return max(min(count, calls), 1)
 
 
-def _given(how: Any) -> Executor:
+def _given(backend: Any) -> Executor:
     """Return an executor that somebody made; calls go to others than threads by value."""
-    if isinstance(how, ThreadPoolExecutor | _ByValue | Processes):
-        return how
-    if type(how).__module__.partition(".")[0] == "distributed" and hasattr(how, "scheduler"):
-        from bwbayes.app.running.cluster import Cluster  # noqa: PLC0415
+    if isinstance(backend, ThreadPoolExecutor | ByValue):
+        return backend
+    if hasattr(backend, "get_executor"):
+        from bwbayes.app.running.cluster import on_client  # noqa: PLC0415
 
-        return Cluster(how)
-    if hasattr(how, "workers") and isinstance(how, Executor):
-        return how
-    if not callable(getattr(how, "submit", None)):
+        return on_client(backend)
+    if not callable(getattr(backend, "submit", None)):
         raise InputError(
-            f"executor: {type(how).__name__} has no submit; give an executor of "
+            f"executor: {type(backend).__name__} has no submit; give an executor of "
             "concurrent.futures, or one of " + ", ".join(KINDS)
         )
-    return _ByValue(how)
+    return ByValue(backend)
 
 
-class _ByValue(Executor):
-    """Sends by value what pickle does not send: priors and bounds that parts declare in a line."""
+class ByValue(Executor):
+    """Sends by value what pickle does not send: priors and bounds that parts declare in a line.
 
-    def __init__(self, pool: Any) -> None:
-        self.pool = pool
+    ``workers`` is how many calls a cluster makes at the same time.
+    """
+
+    def __init__(self, pool: Any, workers: int | None = None) -> None:
+        self.pool, self.workers = pool, workers
 
     def submit[**P, T](self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Send a call by value."""
@@ -132,113 +142,10 @@ class _ByValue(Executor):
         return sent
 
 
-class Processes(Executor):
-    """Processes that are replaced when they die, and what they were at is done again.
-
-    Every call here is a pure function, or goes on from where it stands on disk, so a second time
-    gives the same. A call under which processes died ``TRIES`` times is given up.
-
-    Parameters
-    ----------
-    count
-        How many.
-    method
-        "spawn" starts Python in each; "fork" copies this process as it is, at once and with all
-        that it has loaded, which only a process without other threads may do. Those that replace
-        others are spawned.
-    """
-
-    def __init__(self, count: int, method: Literal["spawn", "fork"] = "spawn") -> None:
-        self.count = count
-        self.lock = threading.Lock()
-        self.closed = False
-        # Pools that broke are kept: Python's end of one waits for ever for its own lock if the last
-        # reference to it goes meanwhile.
-        self.broken: list[ProcessPoolExecutor] = []
-        self.pool = self._started(method)
-
-    @property
-    def processes(self) -> list[int]:
-        """The ids of the processes."""
-        return [*(self.pool._processes or {})]
-
-    def submit[**P, T](self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Send a call by value."""
-        future: Future[T] = Future()
-        self._send(future, cloudpickle.dumps(partial(fn, *args, **kwargs)), 1)
-        return future
-
-    def kill(self) -> None:
-        """End the processes at once; what they have on disk stays whole."""
-        with self.lock:
-            self.closed = True
-        for process in [*(self.pool._processes or {}).values()]:
-            process.kill()
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes when they have done what they are at."""
-        with self.lock:
-            self.closed = True
-        self.pool.shutdown(wait=wait, cancel_futures=cancel_futures)
-
-    def _started(self, method: str) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context(method)
-        pool = ProcessPoolExecutor(self.count, mp_context=context, initializer=_settle)
-        with warnings.catch_warnings():
-            # Python warns of any thread; those of the linear algebra library stop for a fork.
-            warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)
-            _start(pool, self.count)
-        return pool
-
-    def _replace(self, broken: ProcessPoolExecutor) -> None:
-        """Start processes in place of those, if nobody has."""
-        if self.pool is broken:
-            self.broken.append(broken)
-            self.pool = self._started("spawn")
-
-    def _send(self, future: Future[Any], call: bytes, tried: int) -> None:
-        """Make a call, once more if its process dies."""
-        with self.lock:
-            pool = self.pool
-            try:
-                made = pool.submit(_called, call)
-            except BrokenProcessPool:
-                if self.closed:
-                    raise
-                self._replace(pool)
-                pool = self.pool
-                made = pool.submit(_called, call)
-        made.add_done_callback(partial(self._done, future, call, tried, pool))
-
-    def _done(
-        self,
-        future: Future[Any],
-        call: bytes,
-        tried: int,
-        pool: ProcessPoolExecutor,
-        made: Future[Any],
-    ) -> None:
-        if made.cancelled():
-            future.cancel()
-            return
-        error = made.exception()
-        if isinstance(error, BrokenProcessPool) and tried < TRIES and not self.closed:
-            try:
-                with self.lock:
-                    self._replace(pool)
-                self._send(future, call, tried + 1)
-            except RuntimeError as broken:  # shut down meanwhile
-                future.set_exception(broken)
-        elif not future.set_running_or_notify_cancel():
-            pass
-        elif error is not None:
-            future.set_exception(error)
-        else:
-            future.set_result(made.result())
-
-
 def _called(call: bytes) -> Any:
-    return pickle.loads(call)()
+    """Make a call, with one thread for linear algebra as everywhere."""
+    with one_thread():
+        return pickle.loads(call)()
 
 
 def one_thread() -> AbstractContextManager[object]:

@@ -50,9 +50,9 @@ class Checked(TypedDict):
 
 def require_voltage_is(text: str) -> VoltageIs:
     """Return `text` if it says what a voltage column is, else raise an `InputError`."""
-    for known in get_args(VoltageIs):
-        if text == known:
-            return known  # type: ignore[no-any-return]
+    for kind in get_args(VoltageIs):
+        if text == kind:
+            return kind  # type: ignore[no-any-return]
     raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
 
 
@@ -137,11 +137,11 @@ def _check_lengths(table: FileTable) -> None:
 
 def _filled(values: FloatArray, places: IntArray, quantity: str) -> FloatArray:
     """Return a column on the whole grid: the voltage held in the gaps, all else missing there."""
-    whole = np.full(int(places[-1]) + 1, np.nan)
-    whole[places] = values
+    full = np.full(int(places[-1]) + 1, np.nan)
+    full[places] = values
     if quantity == "voltage":
-        whole = np.repeat(values, np.diff(places, append=places[-1] + 1))
-    return whole
+        full = np.repeat(values, np.diff(places, append=places[-1] + 1))
+    return full
 
 
 def _check_moving(table: FileTable, quantity: str, values: FloatArray) -> None:

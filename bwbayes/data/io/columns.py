@@ -100,14 +100,14 @@ class Naming:
         for key, table in (("columns", self.columns), ("units", self.units)):
             for quantity in table:
                 if quantity not in QUANTITIES:
-                    known = ", ".join(QUANTITIES)
-                    raise InputError(f"{key}: no quantity {quantity!r}; write {known}")
+                    allowed = ", ".join(QUANTITIES)
+                    raise InputError(f"{key}: no quantity {quantity!r}; write {allowed}")
         for quantity, unit in self.units.items():
             if power_of(unit.removeprefix("-"), quantity) is None:
-                known = ", ".join(_COMMON_UNITS[quantity])
+                allowed = ", ".join(_COMMON_UNITS[quantity])
                 raise InputError(
-                    f"units: {quantity} in {unit!r} is unknown; write {known}, or with another SI "
-                    "prefix"
+                    f"units: {quantity} in {unit!r} is unknown; write {allowed}, or with another "
+                    "SI prefix"
                 )
         if self.units.get("time", "").startswith("-"):
             raise InputError("units: time does not run backwards; remove the minus")
@@ -123,9 +123,9 @@ def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
     base, shift = _BASES[quantity]
     for written, prefix in _WRITTEN_PREFIXES.items():
-        rest = unit.lower().removeprefix(written)
-        if unit.lower().startswith(written) and rest in _WRITTEN_UNITS:
-            unit = prefix + _WRITTEN_UNITS[rest]
+        base_name = unit.lower().removeprefix(written)
+        if unit.lower().startswith(written) and base_name in _WRITTEN_UNITS:
+            unit = prefix + _WRITTEN_UNITS[base_name]
             break
     if unit.lower() in ("micron", "microns"):
         unit = "um"
@@ -142,7 +142,7 @@ def unit_in(name: str, quantity: str) -> str | None:
     ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+))\s*$", name)
     if ending is None:
         return None
-    unit = next(part for part in ending.groups() if part is not None).strip()
+    unit = next(group for group in ending.groups() if group is not None).strip()
     return unit if power_of(unit, quantity) is not None else None
 
 
@@ -170,8 +170,8 @@ def choose(
     by_unit = []
     for rank in (_by_own_name, _by_word, _by_unit):
         for quantity in (*QUANTITIES, "truth"):
-            taken = [series.name for series in chosen.values()]
-            fitting = [s for s in long if s.name not in taken and rank(s, quantity)]
+            chosen_names = [series.name for series in chosen.values()]
+            fitting = [s for s in long if s.name not in chosen_names and rank(s, quantity)]
             if quantity in settled or not fitting:
                 continue
             settled.add(quantity)
@@ -186,8 +186,8 @@ def choose(
     if columns or unknown:
         raise _open(source, naming, chosen, columns, unknown)
     if by_unit:
-        said = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
-        remark = f"{source.path}: taken by its unit: {said}; if not, say `columns`"
+        reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
+        remark = f"{source.path}: taken by its unit: {reasons}; if not, say `columns`"
         warnings.warn(one_line(remark), InputWarning, stacklevel=3)
     return {quantity: (chosen[quantity], unit) for quantity, unit in units.items() if unit}
 
@@ -196,9 +196,9 @@ def _named(source: Source, name: str, quantity: str) -> Series:
     """Return the series that a naming means."""
     exact = [s for s in source.series if s.name == name.strip()]
     ending = [s for s in source.series if s.label == name.strip()]
-    for some in (exact, ending):
-        if len(some) == 1:
-            return some[0]
+    for matches in (exact, ending):
+        if len(matches) == 1:
+            return matches[0]
     number = int(name) if name.strip().isdecimal() else 0
     if 1 <= number <= len(source.series) and not exact and not ending:
         return source.series[number - 1]
@@ -252,13 +252,13 @@ def _unit(series: Series, quantity: str, naming: Naming) -> str | None:
     return naming.units.get(quantity) or _stated(series, quantity)
 
 
-def _alike(some: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
+def _alike(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
     """Keep the series that stand beside those that are chosen, and are as long, if any do."""
     for key in ("group", "size"):
-        known = [getattr(series, key) for series in chosen.values() if series.name]
-        fitting = [s for s in some if known and getattr(s, key) == known[0]]
-        some = fitting or some
-    return some
+        values = [getattr(series, key) for series in chosen.values() if series.name]
+        fitting = [s for s in candidates if values and getattr(s, key) == values[0]]
+        candidates = fitting or candidates
+    return candidates
 
 
 def _open(
@@ -272,31 +272,37 @@ def _open(
     where = str(source.path)
     if source.first_line is not None and source.first_line > 1:
         where += f":{source.first_line - 1}"
-    taken = [series.name for series in chosen.values()]
+    if all(series.size == 1 for series in source.series):
+        raise InputError(f"{where}: no column has more than one number; give a row for each sample")
+    if np.isnan([_extent(series) for series in source.series[:_MOST_LOADED]]).all():
+        raise InputError(f"{where}: no column holds only numbers; export it as CSV")
+    chosen_names = [series.name for series in chosen.values()]
     sizes = {series.size for series in chosen.values()}
-    rest = [s for s in source.series if s.name not in taken and s.size in (sizes or {s.size})]
-    moving = [s for s in rest[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
-    rest = _alike(moving or rest, chosen)
+    candidates = [
+        s for s in source.series if s.name not in chosen_names and s.size in (sizes or {s.size})
+    ]
+    moving = [s for s in candidates[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
+    candidates = _alike(moving or candidates, chosen)
     guess_columns, guess_units = dict(naming.columns), dict(naming.units)
-    clocks = [s for s in rest[:_MOST_LOADED] if _rises(s)]
+    clocks = [s for s in candidates[:_MOST_LOADED] if _rises(s)]
     timeless = "time" in columns and not clocks
     if timeless:
         columns = [quantity for quantity in columns if quantity != "time"]
     for quantity in unknown:
         guess_units[quantity] = _COMMON_UNITS[quantity][0]
     for quantity in columns:
-        some = clocks if quantity == "time" else rest
-        fitting = [s for s in some if _stated(s, quantity)] or some
+        pool = clocks if quantity == "time" else candidates
+        fitting = [s for s in pool if _stated(s, quantity)] or pool
         if fitting:
             # One without a name goes by its number.
             guess_columns[quantity] = fitting[0].name.removeprefix("column ")
-            rest = [s for s in rest if s.name != fitting[0].name]
+            candidates = [s for s in candidates if s.name != fitting[0].name]
         if not fitting or _unit(fitting[0], quantity, naming) is None:
             guess_units.setdefault(quantity, _COMMON_UNITS[quantity][0])
     lost = [q for q in columns if q not in guess_columns]
-    there = _listed(source.series)
+    listing = _listed(source.series)
     if lost:
-        raise InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {there}")
+        raise InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {listing}")
     questions = [f"which column is the {', which the '.join(columns)}"] if columns else []
     if unknown:
         questions.append(
@@ -304,7 +310,7 @@ def _open(
         )
     if timeless:
         questions.append("what is the sampling rate, Hz (no column can be the time)")
-    problem = f"{where}: {', and '.join(questions)}? {there}"
+    problem = f"{where}: {', and '.join(questions)}? {listing}"
     return ColumnsError(problem, guess_columns, guess_units, fs=_COMMON_FS if timeless else None)
 
 
@@ -314,10 +320,10 @@ def _listed(series: Sequence[Series]) -> str:
     numbers = [s for s in series if np.isfinite(extents.get(s.name, (np.nan,))).all()]
     parts = []
     for size, _ in Counter(s.size for s in numbers).most_common():
-        alike = [s for s in numbers if s.size == size]
-        ranges = [(s.name, *extents[s.name]) for s in alike[:_MOST_LISTED]]
+        group = [s for s in numbers if s.size == size]
+        ranges = [(s.name, *extents[s.name]) for s in group[:_MOST_LISTED]]
         texts = [f"{name!r} ({low:.4g} to {high:.4g})" for name, low, high in ranges]
-        more = ", ..." if len(alike) > _MOST_LISTED else ""
+        more = ", ..." if len(group) > _MOST_LISTED else ""
         parts.append(f"{size} values each: {', '.join(texts)}{more}")
     return f"There are {'; '.join(parts)}" if parts else "There are no series of numbers"
 

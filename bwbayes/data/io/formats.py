@@ -22,10 +22,10 @@ from bwbayes.data.io.columns import QUANTITIES, Naming
 from bwbayes.data.io.hdf5 import is_hdf5, read_hdf5, write_hdf5
 from bwbayes.data.io.labview import read_tdms
 from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
+from bwbayes.data.io.memory import array_source
 from bwbayes.data.io.series import Source
 from bwbayes.data.io.table import FileTable, table_of
 from bwbayes.data.io.text import read_text, write_text
-from bwbayes.data.io.vectors import array_table
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning
 
@@ -86,7 +86,7 @@ def read_record(
     Warns
     -----
     InputWarning
-        If columns are ignored, a column is recognised by nothing but its unit, or a commanded
+        If columns are ignored, a column is recognized by nothing but its unit, or a commanded
         voltage is held where samples are missing.
     """
     path = Path(path)
@@ -174,19 +174,19 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (*_TEXT, *_BINARY):
-        known = ", ".join((*_TEXT, *_BINARY))
-        raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {known}")
+        suffixes = ", ".join((*_TEXT, *_BINARY))
+        raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {suffixes}")
     if suffix == ".mat":
-        _write_whole(path, lambda part: write_mat(record, part, mat_version))
+        _write_whole(path, lambda draft: write_mat(record, draft, mat_version))
     elif suffix not in _TEXT:
-        _write_whole(path, lambda part: write_hdf5(record, part))
+        _write_whole(path, lambda draft: write_hdf5(record, draft))
     else:
         truth_path = _truth_path(path)
         truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
-        _write_whole(path, lambda part: write_text(record, part))
+        _write_whole(path, lambda draft: write_text(record, draft))
         if record.truth is not None:
             truth = replace(record, displacement=record.truth)
-            _write_whole(truth_path, lambda part: write_text(truth, part))
+            _write_whole(truth_path, lambda draft: write_text(truth, draft))
 
 
 def require_readable(record: Record, where: str) -> None:
@@ -203,10 +203,12 @@ def require_readable(record: Record, where: str) -> None:
         "displacement": record.displacement,
         "truth": record.truth,
     }
-    table = array_table(where, arrays, {}, {"interval_s": repr(record.interval)})
+    source = array_source(where, arrays, {}, {"interval_s": repr(record.interval)})
+    need = record.displacement is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        checked(table, need_displacement=record.displacement is not None)
+        table = table_of(source, Naming(), QUANTITIES if need else ("time", "voltage"))
+        checked(table, need_displacement=need)
 
 
 def _truth_path(path: Path) -> Path:
@@ -225,13 +227,13 @@ def _with_truth(record: Record, path: Path) -> Record:
 
 def _write_whole(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        write(part)
-        with part.open("rb") as file:
+        write(draft)
+        with draft.open("rb") as file:
             os.fsync(file.fileno())
-        part.replace(path)
+        draft.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error}); choose another place") from error
     finally:
-        part.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from bwbayes.data.io.series import MAXIMUM_SAMPLES
 from bwbayes.data.io.table import FileColumn, FileTable, converted, scaled
 from bwbayes.errors import InputError, InputWarning
 
-__all__ = ["Grid", "decimals_of", "time_grid"]
+__all__ = ["Grid", "clock", "decimals_of", "time_grid"]
 
 _SHORTEST = 1e-12  # s
 # No measurement counts from its beginning for so long, s: it is a clock, whose first time is left
@@ -28,6 +28,11 @@ _LONGEST_WAIT = 1e6
 def decimals_of(interval: float) -> int:
     """Return how many decimals tell the times of neighboring samples apart."""
     return max(0, -math.floor(math.log10(interval))) if interval > 0 else 9
+
+
+def clock(time: float, interval: float) -> str:
+    """Return a time, s, with the decimals that tell samples an interval, s, apart."""
+    return f"{round(float(time), decimals_of(interval)):.15g}"
 
 
 class Grid(NamedTuple):
@@ -64,12 +69,12 @@ def time_grid(table: FileTable, held: bool) -> Grid:
         else:
             problem = f"time goes back from {before:{shown}} s to {after:{shown}} s; sort them"
         raise table.error(problem, "time", sample + 1)
-    usual = float(np.median(steps))
-    if usual < _SHORTEST:
-        problem = f"steps of {usual:.3g} s are absurdly small; check the unit"
+    typical = float(np.median(steps))
+    if typical < _SHORTEST:
+        problem = f"steps of {typical:.3g} s are absurdly small; check the unit"
         raise table.error(problem, "time")
     places = np.arange(time.size)
-    gaps = steps > 1.5 * usual
+    gaps = steps > 1.5 * typical
     if held and gaps.any():
         # The mean of the other steps, as the rounding of the times goes to nothing in it.
         counts = np.maximum(np.rint(steps / steps[~gaps].mean()), 1.0)
@@ -124,24 +129,24 @@ def _uneven(
 ) -> InputError:
     """Return the error that says where the times leave the grid, and by how much."""
     steps = np.diff(time)
-    usual = float(np.median(steps))
-    off = np.abs(steps - usual) > tolerance
+    typical = float(np.median(steps))
+    off = np.abs(steps - typical) > tolerance
     if not off.any():
         sample = int(np.argmax(deviation))
         problem = f"irregular sampling: {deviation[sample]:.3g} s off the uniform grid"
         return table.error(f"{problem}; resample it or print more decimals", "time", sample)
     sample = int(np.argmax(off)) + 1
     step, before = float(steps[sample - 1]), float(time[sample - 1])
-    if step > 1.5 * usual:
+    if step > 1.5 * typical:
         if held:
-            problem = f"gap of {step:.6g} s is not a whole number of intervals of {usual:.6g} s"
+            problem = f"gap of {step:.6g} s is not a whole number of intervals of {typical:.6g} s"
             return table.error(f"{problem}; resample it or cut the record", "time", sample)
-        missing = round(step / usual) - 1
-        after = f"{before:.{decimals_of(usual)}f} s"
+        missing = round(step / typical) - 1
+        after = f"{before:.{decimals_of(typical)}f} s"
         problem = f"gap of {step:.6g} s after {after}, about {missing} missing"
         advice = 'give the voltage there (the displacement may be nan), say voltage_is = "command"'
         return table.error(f"{problem}; {advice} if it was held, or cut the record", "time", sample)
-    problem = f"irregular sampling: {step:.6g} s after the sample before, {usual:.6g} s elsewhere"
+    problem = f"irregular sampling: {step:.6g} s after the sample before, {typical:.6g} s elsewhere"
     return table.error(f"{problem}; resample it on a uniform grid", "time", sample)
 
 

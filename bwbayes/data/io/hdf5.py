@@ -54,12 +54,12 @@ def read_hdf5(path: Path) -> Source:
             notes = {}
             for group in _groups(file, set()):
                 name = group.name.strip("/")
-                beside = f"{name}/" if name else ""
-                notes[beside] = {k: _text(group.attrs[k]) for k in _NOTES if k in group.attrs}
+                prefix = f"{name}/" if name else ""
+                notes[prefix] = {k: _text(group.attrs[k]) for k in _NOTES if k in group.attrs}
                 for leaf, dataset in _datasets(group):
                     unit = next((_text(dataset.attrs[k]) for k in _UNITS if k in dataset.attrs), "")
                     load = partial(_loaded, path, dataset.name)
-                    series += vectors(beside, leaf, dataset.shape, dataset.dtype, load, unit)
+                    series += vectors(prefix, leaf, dataset.shape, dataset.dtype, load, unit)
             return Source(path, tuple(series), notes)
     except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
         raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it again") from error

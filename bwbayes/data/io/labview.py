@@ -40,14 +40,14 @@ def plain_lvm(path: Path, text: str) -> tuple[str, dict[str, str]]:
     InputError
         There are no rows in it.
     """
-    whole, *parts = text.split(_END)
-    separator = "," if _keys(whole, ",").get("Separator") == ["Comma"] else "\t"
-    x_columns = _keys(whole, separator).get("X_Columns", ["One"])[0]
+    head, *parts = text.split(_END)
+    separator = "," if _keys(head, ",").get("Separator") == ["Comma"] else "\t"
+    x_columns = _keys(head, separator).get("X_Columns", ["One"])[0]
     if len(parts) < 2:
         raise InputError(f"{path}: no segment of samples in it; export it again")
-    keys, lines = _keys(parts[0], separator), [""] * f"{whole}{parts[0]}".count("\n")
-    for number, part in enumerate(parts[1:]):
-        rows = part.partition("\nChannels")[0].split("\n")[1:]
+    keys, lines = _keys(parts[0], separator), [""] * f"{head}{parts[0]}".count("\n")
+    for number, segment in enumerate(parts[1:]):
+        rows = segment.partition("\nChannels")[0].split("\n")[1:]
         names, *samples = [row for row in rows if row.strip(f" {separator}")]
         if number == 0:
             lines += ["", separator.join(_with_units(names.split(separator), keys, x_columns))]
@@ -67,8 +67,8 @@ def _keys(header: str, separator: str) -> dict[str, list[str]]:
 
 def _with_units(names: list[str], keys: Mapping[str, list[str]], x_columns: str) -> list[str]:
     """Return the names of columns with their channels' units."""
-    every = 2 if x_columns == "Multi" else 1
-    units = {1 + every * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
+    stride = 2 if x_columns == "Multi" else 1
+    units = {1 + stride * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
     if keys.get("X_Dimension", ["Time"])[0] == "Time":
         units[0] = "s"
     named = [f"{name} [{units[i]}]" if units.get(i) else name for i, name in enumerate(names)]

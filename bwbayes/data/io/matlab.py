@@ -115,12 +115,12 @@ def _walked(path: str, value: Any) -> Iterator[Series]:
         yield from vectors(group, leaf, value.shape, value.dtype, lambda: value)
         return
     for number, element in enumerate(value.ravel(order="F"), start=1):
-        place = f"{path}({number})" if value.size > 1 else path
+        element_path = f"{path}({number})" if value.size > 1 else path
         if value.dtype.names is None:
-            yield from _walked(place, element)
+            yield from _walked(element_path, element)
         else:
             for name in value.dtype.names:
-                yield from _walked(f"{place}.{name}", element[name])
+                yield from _walked(f"{element_path}.{name}", element[name])
 
 
 def _check_elements(data: bytes) -> None:

@@ -89,8 +89,8 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
     names = {q: column.name for q, column in columns.items()}
     others = [s.name for s in source.series if s.name not in names.values()]
     if others and source.first_line is not None:
-        some = ", ".join(others[:10]) + (", ..." if len(others) > 10 else "")
-        remark = f"{source.path}:{max(source.first_line - 1, 1)}: ignored columns: {some}"
+        shown = ", ".join(others[:10]) + (", ..." if len(others) > 10 else "")
+        remark = f"{source.path}:{max(source.first_line - 1, 1)}: ignored columns: {shown}"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     foreign = {q: name for q, name in names.items() if q in QUANTITIES and not is_own(name, q)}
     group = next(iter(chosen.values()))[0].group
@@ -113,8 +113,8 @@ def converted(table: FileTable, quantity: str) -> FloatArray:
         if np.isfinite(raw):
             problem = f"{raw:g} is absurdly large; check the unit in the column's name"
         else:
-            what = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
-            problem = f"{what}; {AT_EVERY_SAMPLE}"
+            fact = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
+            problem = f"{fact}; {AT_EVERY_SAMPLE}"
         raise table.error(problem, quantity, sample)
     return values
 

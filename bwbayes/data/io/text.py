@@ -169,22 +169,22 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def _layout(path: Path, lines: Sequence[str]) -> _Layout:
     """Find how the numbers stand in a text: most lines in its middle and at its end are such."""
-    middle = len(lines) // 2
-    probed = [*lines[middle : middle + _PROBED], *lines[-_PROBED:]]
+    center = len(lines) // 2
+    probed = [*lines[center : center + _PROBED], *lines[-_PROBED:]]
     rows = [line for line in probed if line.strip() and not line.startswith("#")]
-    best, found = 0.0, ("", 0, np.zeros(0, dtype=np.int64))
+    best, layout = 0.0, ("", 0, np.zeros(0, dtype=np.int64))
     for separator in _SEPARATORS:
         split = [_cells(line, separator) for line in rows]
         fields = Counter(map(len, split)).most_common(1)[0][0] if split else 0
         if fields < 2:
             continue
-        alike = [cells for cells in split if len(cells) == fields]
-        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in cells] for cells in alike])
-        share = float(numeric.mean()) * len(alike) / len(split)
+        regular = [cells for cells in split if len(cells) == fields]
+        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in cells] for cells in regular])
+        share = float(numeric.mean()) * len(regular) / len(split)
         columns = np.flatnonzero(numeric.mean(axis=0) > 0.5)
         if share > best and columns.size:
-            best, found = share, (separator, fields, columns)
-    separator, fields, columns = found
+            best, layout = share, (separator, fields, columns)
+    separator, fields, columns = layout
     run: list[int] = []
     for index, line in enumerate(lines if best > 0 else []):
         if not line.strip():
@@ -233,8 +233,8 @@ def _split_header(line: str, layout: _Layout) -> Iterator[list[str]]:
     """Yield the cells of a line, by any separator that gives as many as the numbers have."""
     bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
     ways = [_cells(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
-    for number, way in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
-        cells = [cell.strip().strip('"') for cell in way]
+    for number, fields in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
+        cells = [cell.strip().strip('"') for cell in fields]
         more = any(cells[layout.fields :]) and number > 0
         if len(cells) < layout.fields or more or not any(cells):
             continue
@@ -304,8 +304,8 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
 def _thousands(text: str, decimal: str, separator: str) -> str | None:
     """Return the mark between thousands, as in 1.234,5, if there are any."""
     mark = "." if decimal == "," else ","
-    found = mark != separator and re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text)
-    return mark if found else None
+    match = mark != separator and re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text)
+    return mark if match else None
 
 
 def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:

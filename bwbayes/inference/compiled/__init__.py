@@ -8,18 +8,19 @@ others the drive comes from NumPy, and the rest of the work is compiled still.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes
-from bwbayes.inference.compiled.stages import DRIVES, STAGES, given
+from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
 from bwbayes.inference.noise import Noise, SteadyState
 from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import MOST_TIMES
 from bwbayes.model.declaration import Values
 
-__all__ = ["moments"]
+__all__ = ["moments", "parts", "physics"]
 
 # Elements (models x samples) of the drive that is worked out beforehand, at a time.
 LARGEST = 1 << 23
@@ -60,29 +61,13 @@ def moments(
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
-    record, parts = (voltage, displacement, skipped), _parts(actuator, voltage)
-    able = np.zeros(len(theta), dtype=bool)
-    prepare = STAGES.get(type(actuator.hysteresis))
-    if prepare:
-        memory = actuator.begin(column, voltage, from_rest=from_rest)
-        stage = prepare(actuator.hysteresis, column, voltage, memory)
-        able = stage.able
-        models, own = _models(actuator, column, stage.rest, steady, voltage), stage.own
-        if able.all():
-            sums = kernels.sums(*record, models, stage.kind, own, stage.plan, *parts, *unknowns)
-        else:
-            mine = stage.kind, own[able], stage.plan
-            sums[:, able] = kernels.sums(*record, models[able], *mine, *parts, *unknowns)
-    others = np.flatnonzero(~able)
-    size = max(LARGEST // voltage.size, 1)
-    for rows in (others[i : i + size] for i in range(0, others.size, size)):
-        drive = _drive(actuator, table.actuator(theta[rows]), voltage, from_rest=from_rest)
-        rest = np.zeros(len(theta))
-        rest[rows] = drive[:, 0]
-        models = _models(actuator, column, rest, steady, voltage)[rows]
-        stage = given(drive[:, 0], drive)
-        mine = stage.kind, stage.own, stage.plan
-        sums[:, rows] = kernels.sums(*record, models, *mine, *parts, *unknowns)
+    record, known = (voltage, displacement, skipped), parts(actuator, voltage)
+    for rows, stage in _staged(actuator, column, theta, voltage, from_rest=from_rest):
+        equilibrium = np.zeros(len(theta))
+        equilibrium[rows] = stage.rest
+        models = _models(actuator, column, equilibrium, steady, voltage)[rows]
+        drive = stage.kind, stage.group, stage.plan
+        sums[:, rows] = kernels.sums(*record, models, *drive, *known, *unknowns)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):
@@ -93,82 +78,97 @@ def moments(
     return products, log_determinant
 
 
-def _drive(
-    actuator: Actuator, theta: FloatArray, voltage: FloatArray, *, from_rest: bool
-) -> FloatArray:
-    """Return what the operator makes of a record's voltage, (models, samples), um."""
-    compiled = DRIVES.get(type(actuator.hysteresis))
+def _staged(
+    actuator: Actuator, column: Values, theta: FloatArray, voltage: FloatArray, *, from_rest: bool
+) -> Iterator[tuple[IntArray | slice, Stage]]:
+    """Yield which models go together, and the stage that makes their drive."""
+    operator, others = actuator.hysteresis, np.arange(len(theta))
+    compiled = DRIVES.get(type(operator))
     if compiled is None:
-        return actuator.hysteretic(theta, voltage, from_rest=from_rest)
-    column = actuator.columns(theta)
-    memory = actuator.begin(column, voltage, from_rest=from_rest)
-    return compiled(actuator.hysteresis, column, voltage, memory)[0]
+        memory = actuator.begin(column, voltage, from_rest=from_rest)
+        stage = prepared(operator, column, voltage, memory)
+        if stage is not None and stage.able.all():
+            yield slice(None), stage
+            return
+        if stage is not None:
+            able, others = np.flatnonzero(stage.able), np.flatnonzero(~stage.able)
+            yield able, stage._replace(rest=stage.rest[able], group=stage.group[able])
+    size = max(LARGEST // voltage.size, 1)
+    for rows in (others[i : i + size] for i in range(0, others.size, size)):
+        values = {name: column[name][rows] for name in actuator.parameters}
+        memory = actuator.begin(values, voltage, from_rest=from_rest)
+        drive = (compiled or type(operator).advance)(operator, values, voltage, memory)[0]
+        yield rows, given(drive[:, 0], drive)
 
 
-def _parts(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def parts(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what gain and creep know: ``curve``, ``lags`` and ``growth`` of the kernel."""
     curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.empty(0)
     if actuator.gain is not None:
         x = actuator.gain.scaled(voltage)
         curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
     if actuator.creep is not None:
-        every = actuator.creep.recursions(1, actuator.interval, actuator.hold)
-        lags = np.array([[*one.numerator[0], -one.denominator[0, 1]] for one in every])
+        recursions = actuator.creep.recursions(1, actuator.interval, actuator.hold)
+        lags = np.array(
+            [[*recursion.numerator[0], -recursion.denominator[0, 1]] for recursion in recursions]
+        )
         if actuator.creep.growing:
             growth = actuator.creep.size(voltage)
     return curve, lags, growth
 
 
-def _models(
-    actuator: Actuator,
-    column: Values,
-    rest: FloatArray,
-    steady: SteadyState,
-    voltage: FloatArray,
-) -> FloatArray:
-    """Return the kernel's parameters (models, parameters); ``rest`` (models,) is w₀ without gain.
+def physics(
+    actuator: Actuator, column: Values, equilibrium: FloatArray, voltage: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what models (models,) are without a noise, by the names of ``PARAMETERS``.
+
+    ``equilibrium`` (models,) is w₀ without gain, um.
 
     With creep the kernel's dynamics follow at once: the creep's stage has the true ones.
     """
-    models = rest.size
     sections = actuator.sections(column)
-    drives = [rest]
+    drives = [equilibrium]
     if actuator.gain is not None:
-        drives = [rest + actuator.gain.displacement(column, voltage[:1])[:, 0]]
+        drives = [equilibrium + actuator.gain.displacement(column, voltage[:1])[:, 0]]
     if actuator.creep is not None:
         crept = actuator.creep.drive(column, drives[0][:, np.newaxis], voltage[:1])[:, 0]
         drives += [crept] * len(actuator.creep.times)
     level = column["offset"] + sum(g * w for g, w in zip(sections.gains, drives, strict=True))
-    dynamics, nothing, one = sections.recursions[0], np.zeros(models), np.ones(models)
+    dynamics, nothing = sections.recursions[0], np.zeros(equilibrium.size)
     b = [*dynamics.numerator.T, nothing, nothing][:3]
     a = [*dynamics.denominator.T, nothing, nothing][1:3]
-    seen = [one, nothing, nothing, nothing, nothing] if actuator.creep is not None else [*b, *a]
-    free = np.zeros((models, 2, 2))
-    unknowns, memory = dynamics.free.shape[1:]
-    free[:, :unknowns, :memory] = dynamics.free
-    strengths = list(sections.gains[1:])
-    rows = [
-        level,
-        *seen,
-        steady.kept,
-        np.exp(steady.log_decay),
+    rows = dict(zip(("true_b0", "true_b1", "true_b2", "true_a1", "true_a2"), (*b, *a), strict=True))
+    seen = [nothing + 1, *[nothing] * 4] if actuator.creep is not None else [*b, *a]
+    rows |= dict(zip(("b0", "b1", "b2", "a1", "a2"), seen, strict=True))
+    rows |= {f"strength_{k}": gain for k, gain in enumerate(sections.gains[1:], 1)}
+    rows |= {"level": level, "rest": drives[0], "growth": column.get("creep_growth", nothing)}
+    return rows | {name: column.get(name, nothing) for name in ("quadratic", "cubic")}
+
+
+def _models(
+    actuator: Actuator,
+    column: Values,
+    equilibrium: FloatArray,
+    steady: SteadyState,
+    voltage: FloatArray,
+) -> FloatArray:
+    """Return the kernel's parameters (models, parameters); ``equilibrium`` as in `physics`."""
+    rows = physics(actuator, column, equilibrium, voltage)
+    rows |= {
+        "kept": steady.kept,
+        "decay": np.exp(steady.log_decay),
         # φ − a, without its cancellation.
-        steady.kept * steady.predicted / steady.variance,
-        steady.predicted,
-        steady.variance,
-        steady.surplus,
-        steady.rate,
-        *free.reshape(models, 4).T,
-        *b,
-        *a,
-        column.get("quadratic", nothing),
-        column.get("cubic", nothing),
-        drives[0],
-        column.get("creep_growth", nothing),
-        *strengths,
-        *[nothing] * (MOST_TIMES - len(strengths)),
-    ]
-    made = np.empty((models, len(lanes.PARAMETERS)))
-    for place, row in zip(made.T, rows, strict=True):
-        place[:] = row
-    return made
+        "gain": steady.kept * steady.predicted / steady.variance,
+        "predicted": steady.predicted,
+        "variance": steady.variance,
+        "surplus": steady.surplus,
+        "rate": steady.rate,
+    }
+    free = actuator.sections(column).recursions[0].free
+    for unknown in range(free.shape[1]):
+        for part in range(free.shape[2]):
+            rows[f"free_{unknown + 1}{part + 1}"] = free[:, unknown, part]
+    table = np.zeros((equilibrium.size, len(lanes.PARAMETERS)))
+    for row, name in enumerate(lanes.PARAMETERS):
+        table[:, row] = rows.get(name, 0.0)
+    return table

@@ -1,8 +1,9 @@
-"""What the stages of operators that remember extrema share: where the voltage turns and returns.
+"""The stage of operators that remember extrema: each brings its Everett function alone.
 
 Which branch a sample lies on is the voltage's affair alone: :func:`plan_of` says it for all models
-and the whole record at once. What is left to a stage is to remember the displacement of each model
-at each turn, in slots, and to move along a branch, by a recurrence where it can.
+and the whole record at once. What is left is to remember the displacement of each model at each
+turn, in slots, and to add what :meth:`everett
+<bwbayes.model.operators.memory.RemembersExtrema.everett>` says from there on.
 
 The unknown start gives each model an extremum of its own. While the voltage stays below all of
 these, or has passed all, nothing is different; in between, models are told apart one by one.
@@ -17,43 +18,25 @@ from numba import njit
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.model.operators.memory import Memory
+from bwbayes.model.compiled import everett
+from bwbayes.model.operators.memory import Memory, RemembersExtrema
 
-__all__ = [
-    "EACH_OWN",
-    "EITHER",
-    "EXTRA",
-    "FRESH",
-    "LAST",
-    "OWN",
-    "PUSH",
-    "REST",
-    "ROWS",
-    "SHARED",
-    "SIGN",
-    "SLOT",
-    "TURNED",
-    "WHOSE",
-    "ExtremaPlan",
-    "common_rows",
-    "of_slots",
-    "still",
-    "turns",
-]
+__all__ = ["ExtremaPlan", "along_branches", "rows"]
 
 # Columns of a plan: the slot of the extremum that a sample's branch comes from (−1: the voltage has
 # not moved yet); the direction; the extremum's voltage; the slot in which the last sample becomes
 # an extremum (0: none); whether the branch is another than the last sample's; whose extremum it is;
-# and what an operator needs to know.
-SLOT, SIGN, TURNED, PUSH, FRESH, WHOSE, EXTRA = range(7)
+# and the voltage of that two before it.
+SLOT, SIGN, TURNED, PUSH, FRESH, WHOSE, BEFORE = range(7)
 COLUMNS = 7
 
 # Whose: all models'; each has its own; of those that have passed their own it is the one before.
 SHARED, EACH_OWN, EITHER = 0.0, 1.0, 2.0
 
-# Rows that all stages have: w₀, w of the last sample, the extremum of its own.
-ROWS = 3
-REST, LAST, OWN = (LANES * row for row in range(ROWS))
+# Rows: w₀, w of the last sample, the extremum of its own, how many numbers its Everett function
+# needs; then these, and w of each slot.
+FIXED = 4
+REST, LAST, OWN, COUNT, NUMBERS = (LANES * row for row in range(FIXED + 1))
 
 
 class ExtremaPlan(NamedTuple):
@@ -66,10 +49,10 @@ class ExtremaPlan(NamedTuple):
     def of(cls, voltage: FloatArray, memory: Memory) -> ExtremaPlan:
         """Look where a voltage (samples,) turns and closes loops."""
         levels = np.array([extremum.voltage for extremum in memory.extrema])
-        each = [i for i, extremum in enumerate(memory.extrema) if extremum.own is not None]
-        own = each[0] if each else -1
-        lowest = float(np.min(_own(memory))) if each else 0.0
-        return cls(*plan_of(voltage, levels, memory.direction, own, lowest))
+        owners = [i for i, extremum in enumerate(memory.extrema) if extremum.own is not None]
+        own_slot = owners[0] if owners else -1
+        lowest = float(np.min(_own(memory))) if owners else 0.0
+        return cls(*plan_of(voltage, levels, memory.direction, own_slot, lowest))
 
 
 def _own(memory: Memory) -> FloatArray:
@@ -82,11 +65,11 @@ def _own(memory: Memory) -> FloatArray:
 
 @njit(nogil=True, cache=True)
 def plan_of(
-    voltage: FloatArray, levels: FloatArray, direction: float, own: int, lowest: float
+    voltage: FloatArray, levels: FloatArray, direction: float, own_slot: int, lowest: float
 ) -> tuple[FloatArray, int]:
     """Return the plan (samples, columns), and the number of slots.
 
-    ``levels`` are the extrema at the first sample, V, the one in slot ``own`` (−1: none) being the
+    ``levels`` are the extrema at the first sample, V, that in ``own_slot`` (−1: none) being the
     largest of those that models have of their own, and ``lowest`` the lowest.
     """
     plan = np.zeros((voltage.size, COLUMNS))
@@ -113,44 +96,111 @@ def plan_of(
             if s * u < s * closing:
                 break
             depth -= 2 if depth > 2 else 1
-        if own >= depth:
-            own = -1
+        if own_slot >= depth:
+            own_slot = -1
         slot = depth - 1
         plan[t, SLOT] = slot
         plan[t, SIGN] = s
         plan[t, TURNED] = stack[slot]
-        if own > 0 and slot == own:
+        if own_slot > 0 and slot == own_slot:
             plan[t, WHOSE] = EACH_OWN
-        elif own > 0 and slot == own + 1 and u >= lowest:
+        elif own_slot > 0 and slot == own_slot + 1 and u >= lowest:
             plan[t, WHOSE] = EITHER
         same = plan[t - 1, SLOT] == slot and plan[t - 1, WHOSE] == plan[t, WHOSE]
         plan[t, FRESH] = 0.0 if same and plan[t, PUSH] == 0.0 else 1.0
         # For those that have passed their own: where their branch comes from.
-        plan[t, EXTRA] = stack[slot - 2] if plan[t, WHOSE] == EITHER else 0.0
+        plan[t, BEFORE] = stack[slot - 2] if plan[t, WHOSE] == EITHER else 0.0
     return plan, slots
 
 
-def of_slots(plan: ExtremaPlan, memory: Memory, *kept: FloatArray) -> list[FloatArray]:
-    """Return the rows of all slots: of each, ``kept`` (slots known, models) in turn."""
-    nothing = np.zeros_like(memory.displacement)
-    known = len(memory.extrema)
-    return [one[k] if k < known else nothing for k in range(plan.slots) for one in kept]
+@njit(nogil=True, cache=True)
+def along_branches(
+    operator: RemembersExtrema,
+    group: FloatArray,
+    plan: FloatArray,
+    voltage: FloatArray,
+    first: int,
+    last: int,
+    out: FloatArray,
+) -> None:
+    """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move the memory on."""
+    count, w = int(group[COUNT]), np.empty(last - first)
+    numbers, slots = np.empty(count), NUMBERS + count * LANES
+    begin = first
+    while begin < last:
+        # As far as the branch is the same.
+        end = begin + 1
+        while end < last and plan[end, FRESH] == 0.0:
+            end += 1
+        base = slots + int(plan[begin, SLOT]) * LANES
+        pushed = slots + int(plan[begin, PUSH]) * LANES
+        for i in range(LANES):
+            for k in range(count):
+                numbers[k] = group[NUMBERS + k * LANES + i]
+            if pushed > slots:
+                group[pushed + i] = group[LAST + i]
+            if base < slots:
+                w[: end - begin] = group[LAST + i]
+            else:
+                own = group[OWN + i] if plan[begin, WHOSE] == EACH_OWN else plan[begin, TURNED]
+                _branch(operator, numbers, group[base + i], own, plan[begin], voltage[begin:end], w)
+            if plan[begin, WHOSE] == EITHER:
+                _either(operator, numbers, group, base + i, i, plan[begin], voltage[begin:end], w)
+            group[LAST + i] = w[end - begin - 1]
+            for t in range(begin, end):
+                out[(t - first) * LANES + i] = w[t - begin] - group[REST + i]
+        begin = end
 
 
-def turns(memory: Memory) -> tuple[FloatArray, FloatArray]:
-    """Return the extrema's voltages, V, and displacements, um, each (extrema, models)."""
-    nothing = np.zeros_like(memory.displacement)
-    volts = [e.voltage + nothing if e.own is None else e.own for e in memory.extrema]
-    return np.stack(volts), np.stack([e.displacement for e in memory.extrema])
-
-
-def common_rows(memory: Memory) -> list[FloatArray]:
-    """Return the rows that all stages have."""
-    return [memory.displacement, memory.displacement, _own(memory)]
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _branch(
+    operator: RemembersExtrema,
+    numbers: FloatArray,
+    level: float,
+    turned: float,
+    plan: FloatArray,
+    voltage: FloatArray,
+    w: FloatArray,
+) -> None:
+    """Write w along a branch from an extremum with a displacement ``level`` on."""
+    s = plan[SIGN]
+    if plan[SLOT] == 0.0:
+        # The first curve is half a branch from the mirrored voltage on.
+        for t in range(voltage.size):
+            u = voltage[t]
+            w[t] = level + 0.5 * s * everett(operator, numbers, -u, u)
+    else:
+        for t in range(voltage.size):
+            w[t] = level + s * everett(operator, numbers, turned, voltage[t])
 
 
 @njit(nogil=True, cache=True)
-def still(own: FloatArray, row: int, out: FloatArray) -> None:
-    """Stay where the voltage has not moved yet."""
-    for i in range(LANES):
-        out[row + i] = own[LAST + i] - own[REST + i]
+def _either(
+    operator: RemembersExtrema,
+    numbers: FloatArray,
+    group: FloatArray,
+    place: int,
+    lane: int,
+    plan: FloatArray,
+    voltage: FloatArray,
+    w: FloatArray,
+) -> None:
+    """Go on from the extremum before its own once a model has come back to that."""
+    for t in range(voltage.size):
+        u = voltage[t]
+        if u >= group[OWN + lane]:
+            moved = everett(operator, numbers, plan[BEFORE], u)
+            w[t] = group[place - 2 * LANES] + moved
+            group[OWN + lane], group[place - LANES] = u, w[t]
+
+
+def rows(numbers: FloatArray, plan: ExtremaPlan, memory: Memory) -> FloatArray:
+    """Return what the stage starts from, (models, rows), w₀ first."""
+    known = len(memory.extrema)
+    group = np.zeros((len(numbers), FIXED + numbers.shape[1] + max(plan.slots, known)))
+    group[:, 0] = group[:, 1] = memory.displacement
+    group[:, 2], group[:, 3] = _own(memory), numbers.shape[1]
+    group[:, FIXED : FIXED + numbers.shape[1]] = numbers
+    for slot, extremum in enumerate(memory.extrema, FIXED + numbers.shape[1]):
+        group[:, slot] = extremum.displacement
+    return group

@@ -24,7 +24,7 @@ import math
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 
 # isort: off
 # fmt: off
@@ -37,7 +37,7 @@ from bwbayes.inference.compiled.lanes import (
 # isort: on
 from bwbayes.inference.compiled.parts import creep, polynomial
 from bwbayes.inference.compiled.responses import is_tracked, tracked_by
-from bwbayes.inference.compiled.stages import drive_of
+from bwbayes.inference.compiled.stages import Kind, drive_of
 
 __all__ = ["sums"]
 
@@ -75,7 +75,7 @@ def _settled(
             state[SQUARES + i] += innovation * innovation
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _exact(
     state: FloatArray,
     displacement: FloatArray,
@@ -112,10 +112,10 @@ def _exact(
                 state[VALUE + at + i] = x
         for k in range(slow):
             at = (first_slow + k) * LANES
-            left = lags[k, 2]
+            decay = lags[k, 2]
             for i in range(LANES):
                 state[VALUE + at + i] = state[KEEP_1 + at + i]
-                state[KEEP_1 + at + i] *= left
+                state[KEEP_1 + at + i] *= decay
         if skipped[t] < 0.0:
             continue
         _skip(state, skipped[t], series)
@@ -151,11 +151,11 @@ def _skip(state: FloatArray, readings: float, series: int) -> None:
         return
     _take_logs(state)
     for i in range(LANES):
-        kept = math.exp(-readings * state[RATE + i])
+        decay = math.exp(-readings * state[RATE + i])
         fresh = -math.expm1(-2.0 * readings * state[RATE + i])
-        state[UNSURE + i] = kept * kept * state[UNSURE + i] + fresh * state[SURPLUS + i]
+        state[UNSURE + i] = decay * decay * state[UNSURE + i] + fresh * state[SURPLUS + i]
         for k in range(series):
-            state[ESTIMATE + k * LANES + i] *= kept
+            state[ESTIMATE + k * LANES + i] *= decay
 
 
 @njit(nogil=True, cache=True)
@@ -169,18 +169,41 @@ def _take_logs(state: FloatArray) -> None:
 @njit(nogil=True, cache=True)
 def _is_settled(state: FloatArray) -> bool:
     """Tell whether all models' filters are in their steady state."""
-    unsure, variance = state[UNSURE : UNSURE + LANES], state[VARIANCE : VARIANCE + LANES]
-    return bool(np.max(unsure / variance) <= FORGOTTEN)
+    settled = True
+    for i in range(LANES):
+        settled &= state[UNSURE + i] <= FORGOTTEN * state[VARIANCE + i]
+    return settled
 
 
 @njit(nogil=True, cache=True)
-def _is_heard(state: FloatArray, offset: int, free: int) -> bool:
-    """Tell whether any model's filter still hears of the unknown start of the dynamics."""
-    for i in range((1 + offset) * LANES, (1 + offset + free) * LANES):
-        left = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
-        if left > FORGOTTEN:
+def _is_heard(state: FloatArray, series: int) -> bool:
+    """Tell whether any model's filter still hears of the unknown start in one of its series."""
+    for i in range(series * LANES, (series + 1) * LANES):
+        largest = max(abs(state[KEEP_1 + i]), abs(state[KEEP_2 + i]), abs(state[ESTIMATE + i]))
+        if largest > FORGOTTEN:
             return True
     return False
+
+
+@njit(nogil=True, cache=True)
+def _stay(
+    state: FloatArray,
+    lags: FloatArray,
+    offset: int,
+    free: int,
+    decays: FloatArray,
+    series: IntArray,
+) -> int:
+    """Count the responses that stay: the offset, and those of the creep that are heard still.
+
+    ``decays`` and ``series`` are what :func:`tracked_by` follows them by.
+    """
+    count = offset
+    for k in range(series.size - offset):
+        if _is_heard(state, 1 + offset + free + k):
+            decays[count], series[count] = lags[k, 2], 1 + offset + free + k
+            count += 1
+    return count
 
 
 @njit(nogil=True, cache=True)
@@ -203,10 +226,10 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
             state[KEEP_1 + at] = state[STRENGTH + k * LANES + i]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _group(
-    kind: int,
-    own: FloatArray,
+    kind: Kind,
+    group: FloatArray,
     plan: FloatArray,
     curve: FloatArray,
     lags: FloatArray,
@@ -223,13 +246,12 @@ def _group(
     """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
     _begin(state, offset, free, slow)
     drive = _aligned(PIECE * LANES)
-    # Responses that stay: the offset, and those of the creep.
-    left, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
-    for k in range(slow):
-        left[offset + k], series[offset + k] = lags[k, 2], 1 + offset + free + k
-    now, settled, heard, tracked = 0, False, True, False
+    decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
+    staying = 0
+    # Not a literal, which numba would compile all that follows for a second time.
+    now, settled, audible, tracked = int(np.int64(0)), False, True, False
     while now < voltage.size:
-        steady = settled and tracked and not heard
+        steady = settled and tracked and not audible
         last = min(now + (PIECE if steady else SHORT_PIECE), voltage.size)
         plain = steady and skipped[now] == 0.0
         if plain:
@@ -238,20 +260,25 @@ def _group(
             while end < last and skipped[end] == 0.0:
                 end += 1
             last = end
-        drive_of(kind, own, plan, voltage, now, last, drive)
+        drive_of(kind, group, plan, voltage, now, last, drive)
         if curve.size > 0:
             polynomial(state, curve, now, last, drive)
         if lags.size > 0:
             creep(state, lags, growth, now, last, drive)
-        if plain and series.size == 0:
+        if plain and staying == 0:
             _settled(state, displacement, now, last, drive)
         elif plain:
-            tracked_by(state, displacement, now, last, drive, left, series)
+            followed = decays[:staying], series[:staying]
+            tracked_by(state, displacement, now, last, drive, *followed)
         else:
             _exact(state, displacement, skipped, now, last, drive, lags, offset, free, slow)
             settled = _is_settled(state)
-            heard = heard and _is_heard(state, offset, free)
-            tracked = settled and not heard and is_tracked(state, left, series)
+            audible = False
+            for k in range(1 + offset, 1 + offset + free):
+                audible = audible or _is_heard(state, k)
+            staying = _stay(state, lags, offset, free, decays, series)
+            tracked = settled and not audible
+            tracked = tracked and is_tracked(state, decays[:staying], series[:staying])
         now = last
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]
@@ -268,14 +295,14 @@ def _aligned(size: int) -> FloatArray:
     return row[skipped : skipped + size]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def sums(
     voltage: FloatArray,
     displacement: FloatArray,
     skipped: FloatArray,
     models: FloatArray,
-    kind: int,
-    own: FloatArray,
+    kind: Kind,
+    group: FloatArray,
     plan: FloatArray,
     curve: FloatArray,
     lags: FloatArray,
@@ -298,27 +325,28 @@ def sums(
         (samples,) how many readings are missing just before one, −1 where there is none.
     models
         (models, parameters), the columns as in ``PARAMETERS``.
-    kind, own, plan
+    kind, group, plan
         The stage that makes the drive, what each model is in it (models, rows), and what it knows
         of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     curve, lags, growth
         What gain and creep know, as in :mod:`bwbayes.inference.compiled.parts`.
     """
     count = models.shape[0]
-    result, part = np.empty((SUMS, count)), np.empty((SUMS, LANES))
-    state, mine = _aligned(STATE), _aligned(own.shape[1] * LANES)
+    result, results = np.empty((SUMS, count)), np.empty((SUMS, LANES))
+    state, lane_group = _aligned(STATE), _aligned(group.shape[1] * LANES)
     for first in range(0, count, LANES):
         for i in range(LANES):
             # Lanes to spare repeat the last model.
             model = min(first + i, count - 1)
             for row in range(models.shape[1]):
                 state[row * LANES + i] = models[model, row]
-            for row in range(own.shape[1]):
-                mine[row * LANES + i] = own[model, row]
+            for row in range(group.shape[1]):
+                lane_group[row * LANES + i] = group[model, row]
         _group(
-            kind, mine, plan, curve, lags, growth, state, voltage, displacement, skipped,
-            offset, free, slow, part,
+            kind, lane_group, plan, curve, lags, growth, state, voltage, displacement, skipped,
+            offset, free, slow, results,
         )  # fmt: skip
-        last = min(first + LANES, count)
-        result[:, first:last] = part[:, : last - first]
+        for row in range(SUMS):
+            for i in range(min(LANES, count - first)):
+                result[row, first + i] = results[row, i]
     return result

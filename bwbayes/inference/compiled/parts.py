@@ -57,19 +57,19 @@ def creep(
         size_0 = 1.0 if growth.size == 0 else growth[0]
         for i in range(LANES):
             w = drive[row + i]
-            whole = w + state[REST + i]
+            total = w + state[REST + i]
             before = state[REST + i] * (1.0 + state[GROWTH + i] * size_0)
-            state[CREEPS + i] = whole * (1.0 + state[GROWTH + i] * size) - before
+            state[CREEPS + i] = total * (1.0 + state[GROWTH + i] * size) - before
             x = state[TRUE_B0 + i] * w + state[TRUE_X1 + i]
             state[TRUE_X1 + i] = state[TRUE_B1 + i] * w - state[TRUE_A1 + i] * x
             state[TRUE_X1 + i] += state[TRUE_X2 + i]
             state[TRUE_X2 + i] = state[TRUE_B2 + i] * w - state[TRUE_A2 + i] * x
             drive[row + i] = x
         for k in range(lags.shape[0]):
-            now, next_, kept = lags[k, 0], lags[k, 1], lags[k, 2]
+            now, next_, keep = lags[k, 0], lags[k, 1], lags[k, 2]
             at = k * LANES
             for i in range(LANES):
                 w = state[CREEPS + i]
                 x = now * w + state[LAG + at + i]
-                state[LAG + at + i] = next_ * w + kept * x
+                state[LAG + at + i] = next_ * w + keep * x
                 drive[row + i] += state[STRENGTH + at + i] * x

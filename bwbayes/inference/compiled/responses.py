@@ -34,14 +34,14 @@ def tracked_by(
     first: int,
     last: int,
     drive: FloatArray,
-    left: FloatArray,
+    decays: FloatArray,
     series: IntArray,
 ) -> None:
     """Do the settled form, with responses whose innovations follow them.
 
     A response r that keeps the part ρ of itself from reading to reading has an innovation κ r, with
     κ = (ρ − φ)/(ρ − a), so only Σ ρᵗ η of the residual's innovations η has to be added up; products
-    of two responses are geometric sums. ``left`` is ρ of each, ``series`` says which they are.
+    of two responses are geometric sums. ``decays`` is ρ of each, ``series`` says which they are.
     """
     count = series.size
     for k in range(count):
@@ -63,16 +63,16 @@ def tracked_by(
             state[SQUARES + i] += innovation * innovation
             state[SUM + i] = innovation
         for k in range(count):
-            part, at = weight[k], INNOVATION + series[k] * LANES
+            factor, at = weight[k], INNOVATION + series[k] * LANES
             for i in range(LANES):
-                state[at + i] += part * state[SUM + i]
-            weight[k] *= left[k]
-    _fold(state, last - first, weight, left, series)
+                state[at + i] += factor * state[SUM + i]
+            weight[k] *= decays[k]
+    _fold(state, last - first, weight, decays, series)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _fold(
-    state: FloatArray, samples: int, weight: FloatArray, left: FloatArray, series: IntArray
+    state: FloatArray, samples: int, weight: FloatArray, decays: FloatArray, series: IntArray
 ) -> None:
     """Add what a number of samples brought to the products, and move the responses on.
 
@@ -80,18 +80,18 @@ def _fold(
     """
     count = series.size
     for k in range(count):
-        at, rho = series[k] * LANES, left[k]
+        at, rho = series[k] * LANES, decays[k]
         for j in range(k + 1):
-            other, sigma = series[j] * LANES, left[j]
-            both = rho * sigma
+            other, sigma = series[j] * LANES, decays[j]
+            product = rho * sigma
             total = float(samples)
-            if both < 1.0:
-                total = (1.0 - weight[k] * weight[j]) / (1.0 - both)
+            if product < 1.0:
+                total = (1.0 - weight[k] * weight[j]) / (1.0 - product)
             pair = PRODUCTS + (series[k] * (series[k] + 1) // 2 + series[j]) * LANES
             for i in range(LANES):
-                own = state[KEEP_1 + at + i] * _follows(state, i, rho)
-                its = state[KEEP_1 + other + i] * _follows(state, i, sigma)
-                state[pair + i] += own * its * total / state[VARIANCE + i]
+                first = state[KEEP_1 + at + i] * _follows(state, i, rho)
+                second = state[KEEP_1 + other + i] * _follows(state, i, sigma)
+                state[pair + i] += first * second * total / state[VARIANCE + i]
         pair = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
         for i in range(LANES):
             kappa = _follows(state, i, rho)
@@ -101,26 +101,26 @@ def _fold(
         at = series[k] * LANES
         for i in range(LANES):
             state[KEEP_1 + at + i] *= weight[k]
-            follows = _follows(state, i, left[k])
+            follows = _follows(state, i, decays[k])
             state[ESTIMATE + at + i] = state[KEEP_1 + at + i] * (1.0 - follows)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _follows(state: FloatArray, i: int, rho: float) -> float:
     """Return κ, the innovation of a response that keeps ρ of itself, over the response."""
     return float((rho - state[KEPT + i]) / (rho - state[DECAY + i]))
 
 
 @njit(nogil=True, cache=True)
-def is_tracked(state: FloatArray, left: FloatArray, series: IntArray) -> bool:
+def is_tracked(state: FloatArray, decays: FloatArray, series: IntArray) -> bool:
     """Tell whether the innovations of all those responses only follow them, to their rounding."""
     for k in range(series.size):
         at = series[k] * LANES
         for i in range(LANES):
-            if left[k] <= state[DECAY + i]:
+            if decays[k] <= state[DECAY + i]:
                 return False
             keep = state[KEEP_1 + at + i]
-            apart = state[ESTIMATE + at + i] - keep * (1.0 - _follows(state, i, left[k]))
-            if not abs(apart) <= ROUNDING * abs(keep):
+            gap = state[ESTIMATE + at + i] - keep * (1.0 - _follows(state, i, decays[k]))
+            if not abs(gap) <= ROUNDING * abs(keep):
                 return False
     return True

@@ -12,22 +12,25 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.compiled import parts, physics
 from bwbayes.inference.compiled.lanes import (
     A1,
     A2,
     B0,
     B1,
     B2,
-    CUBIC,
+    LAG,
     LANES,
     LEVEL,
-    QUADRATIC,
+    PARAMETERS,
     STATE,
+    TRUE_X1,
+    TRUE_X2,
     X1,
     X2,
 )
-from bwbayes.inference.compiled.parts import polynomial
-from bwbayes.inference.compiled.stages import DRIVES, STAGES, Stage, drive_of, given
+from bwbayes.inference.compiled.parts import creep, polynomial
+from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
@@ -47,27 +50,31 @@ class Walk:
     def __init__(
         self,
         stage: Stage,
-        curve: FloatArray,
+        known: tuple[FloatArray, FloatArray, FloatArray],
         state: FloatArray,
         voltage: FloatArray,
         drive: _GivenDrive | None,
     ) -> None:
-        self.stage, self.curve, self.state, self.voltage = stage, curve, state, voltage
+        self.stage, self.known, self.state, self.voltage = stage, known, state, voltage
         self.drive = drive
-        groups = np.reshape(stage.own[_lanes(len(stage.own))], (len(state), LANES, -1))
+        groups = np.reshape(stage.group[_lanes(len(stage.group))], (len(state), LANES, -1))
         self.own = np.ascontiguousarray(groups.swapaxes(1, 2)).reshape(len(state), -1)
         self.now = 0
 
     def to(self, last: int) -> FloatArray:
         """Displacement (models, samples), um, from where the models are to before a sample."""
-        displacement = np.empty((len(self.stage.own), last - self.now))
-        known, begin, end = (self.stage.plan, self.curve, self.voltage), self.now, last
+        displacement = np.empty((len(self.stage.group), last - self.now))
+        begin, end, plan, voltage = self.now, last, self.stage.plan, self.voltage
+        curve, lags, growth = self.known
         if self.drive is not None:
             piece = slice(begin, end)
-            known = self.drive.along(self.voltage[piece]), self.curve[piece], self.voltage[piece]
-            begin, end = 0, last - self.now
-        plan, curve, voltage = known
-        _walk(self.stage.kind, self.own, plan, curve, self.state, voltage, begin, end, displacement)
+            voltage, curve, begin, end = voltage[piece], curve[piece], 0, last - self.now
+            growth = growth[piece]
+            plan = self.drive.along(voltage)
+        _walk(
+            self.stage.kind, self.own, plan, curve, lags, growth, self.state, voltage, begin, end,
+            displacement,
+        )  # fmt: skip
         self.now = last
         return displacement
 
@@ -95,42 +102,34 @@ def walk(
 ) -> Walk | None:
     """Put models to a voltage's first sample; None if they are left to NumPy.
 
-    That is so with creep, for an operator that is not compiled, and where a stage cannot do a
-    model. Parameters and errors are those of :meth:`~bwbayes.model.actuator.Actuator.advance`, but
-    that the ``voltage`` (samples,) is known up to the end.
+    That is so for an operator that is not compiled, and where a stage cannot do a model. Parameters
+    and errors are those of :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the
+    ``voltage`` (samples,) is known up to the end.
     """
     operator, drive = actuator.hysteresis, None
-    compiled = STAGES.keys() | DRIVES.keys()
-    if actuator.creep is not None or type(operator) not in compiled:
-        return None
     column = actuator.columns(theta)
     actuator.check(column)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
+    stage: Stage | None
     if type(operator) in DRIVES:
         drive = _GivenDrive(operator, column, memory)
         stage = given(drive.along(voltage[:1])[:, 0], np.empty((0, 0)))
     else:
-        stage = STAGES[type(operator)](operator, column, voltage, memory)
-    if not stage.able.all():
+        stage = prepared(operator, column, voltage, memory)
+    if stage is None or not stage.able.all():
         return None
-    nothing, rest, curve = np.zeros(len(theta)), stage.rest, np.empty((0, 2))
-    if actuator.gain is not None:
-        rest = rest + actuator.gain.displacement(column, voltage[:1])[:, 0]
-        x = actuator.gain.scaled(voltage)
-        curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
-    sections = actuator.sections(column)
-    dynamics, moving = sections.recursions[0], sections.begin(unrest)[0]
-    b = [*dynamics.numerator.T, nothing, nothing][:3]
-    a = [*dynamics.denominator.T, nothing, nothing][1:3]
-    x1, x2 = [*moving.T, nothing, nothing][:2]
-    rows = {LEVEL: column["offset"] + rest, B0: b[0], B1: b[1], B2: b[2], A1: a[0], A2: a[1]}
-    rows |= {X1: x1, X2: x2}
-    rows |= {QUADRATIC: column.get("quadratic", nothing), CUBIC: column.get("cubic", nothing)}
     at = _lanes(len(theta))
     state = np.zeros((at.size // LANES, STATE))
+    for name, values in physics(actuator, column, stage.rest, voltage).items():
+        row = LANES * PARAMETERS.index(name)
+        state[:, row : row + LANES] = values[at].reshape(-1, LANES)
+    moving, *crept = actuator.sections(column).begin(unrest)
+    dynamics = (X1, X2) if actuator.creep is None else (TRUE_X1, TRUE_X2)
+    rows = dict(zip(dynamics, moving.T, strict=False))
+    rows |= {LAG + LANES * k: lag[:, 0] for k, lag in enumerate(crept)}
     for row, values in rows.items():
         state[:, row : row + LANES] = values[at].reshape(-1, LANES)
-    return Walk(stage, curve, state, voltage, drive)
+    return Walk(stage, parts(actuator, voltage), state, voltage, drive)
 
 
 def _lanes(models: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -153,10 +152,12 @@ def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
 
 @njit(nogil=True, cache=True)
 def _walk(
-    kind: int,
-    own: FloatArray,
+    kind: Kind,
+    groups: FloatArray,
     plan: FloatArray,
     curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
     state: FloatArray,
     voltage: FloatArray,
     first: int,
@@ -169,9 +170,11 @@ def _walk(
         models = min(LANES, displacement.shape[0] - group * LANES)
         for now in range(first, last, PIECE):
             end = min(now + PIECE, last)
-            drive_of(kind, own[group], plan, voltage, now, end, drive)
+            drive_of(kind, groups[group], plan, voltage, now, end, drive)
             if curve.size > 0:
                 polynomial(state[group], curve, now, end, drive)
+            if lags.size > 0:
+                creep(state[group], lags, growth, now, end, drive)
             _follow(state[group], end - now, drive)
             for i in range(models):
                 for t in range(now, end):

@@ -69,12 +69,12 @@ class One:
         self.slope = slope
 
     def voltage(
-        self, displacement: FloatArray, limits: Limits, nearest: bool, made: FloatArray | None
+        self, displacement: FloatArray, limits: Limits, nearest: bool, solution: FloatArray | None
     ) -> FloatArray:
         """Return the voltage (samples,) for a displacement; without limits it may be known."""
         drive = displacement - self.column["offset"][0]
         anything = self.anywhere(float(np.max(np.abs(drive))))
-        voltage = self._undone(drive, anything) if made is None else made
+        voltage = self._undone(drive, anything) if solution is None else solution
         edges = (voltage <= anything.low) | (voltage >= anything.high)
         if edges.any() and not nearest:
             sample = int(np.argmax(edges))
@@ -96,8 +96,8 @@ class One:
     def anywhere(self, peak: float) -> Path:
         """Return a range of voltages that is wide for displacements up to a peak, um."""
         size = peak / self.slope if self.slope > 0 else 1.0
-        most = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
-        return Path(-most, most)
+        extent = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
+        return Path(-extent, extent)
 
     def drive(
         self, displacement: FloatArray, sections: Sections, path: Path | None = None
@@ -119,12 +119,12 @@ class One:
             if creep.growing:
                 assert path is not None
                 crept = creep.drive(self.column, crept, self._static(drive, path))
-            left = displacement.copy()
+            remainder = displacement.copy()
             for number, (lag, strength) in enumerate(zip(lags, strengths, strict=True), 1):
-                rest = crept[0, 0] if self.state is None else self.state.rest[number][0]
-                moved = lag.run(crept - rest, states[number].copy())[0]
-                left -= strength * (rest + moved)
-            before, drive = drive, self._driven(left, dynamics)
+                equilibrium = crept[0, 0] if self.state is None else self.state.rest[number][0]
+                moved = lag.run(crept - equilibrium, states[number].copy())[0]
+                remainder -= strength * (equilibrium + moved)
+            before, drive = drive, self._driven(remainder, dynamics)
             change = float(np.max(np.abs(drive - before)))
             if change <= close:
                 return drive
@@ -139,8 +139,10 @@ class One:
         """Return the drive (samples,) with which the dynamics alone make a displacement."""
         if self.state is None:
             return np.asarray(displacement[0] + undone(dynamics, displacement - displacement[0]))
-        rest = self.state.rest[0][0]
-        return np.asarray(rest + undone(dynamics, displacement - rest, self.state.filter[0]))
+        equilibrium = self.state.rest[0][0]
+        return np.asarray(
+            equilibrium + undone(dynamics, displacement - equilibrium, self.state.filter[0])
+        )
 
     def _undone(self, displacement: FloatArray, path: Path) -> FloatArray:
         """Undo dynamics and creep, then what is left."""
@@ -170,35 +172,35 @@ class One:
         start, memory = self.begun(float(drive[0]), path)
         done = int(self.state is None and not self.from_rest)
         result[:done] = start
-        whole = Path(path.low, path.high)
+        full = Path(path.low, path.high)
         here, memory = self._along(np.array([start]), memory)
         joined = np.concatenate([here, drive[done:]])
         free, behind = done == 0 and self.state is None, False
         for begin, last, _ in monotone_stretches(joined, LONGEST):
             first = begin
             while first < last:
-                end, limit = last, whole
+                end, limit = last, full
                 if behind and not free:
                     end = first + 1
                     limit = Path(
                         max(path.low, start - path.step), min(path.high, start + path.step)
                     )
-                part = self._stretch(
+                segment = self._stretch(
                     joined[first + 1 : end + 1], float(here[-1]), start, memory, limit
                 )
-                fast = np.abs(np.diff(part, prepend=start)) > path.step
+                fast = np.abs(np.diff(segment, prepend=start)) > path.step
                 # The first voltage of a record is not a step from anything.
                 fast[0] &= not free
                 if behind:
-                    behind = bool(part[0] in (limit.low, limit.high))
+                    behind = bool(segment[0] in (limit.low, limit.high))
                 elif fast.any():
                     # From there on a sample at a time, until the drive is where it is to be.
-                    part, behind = part[: int(np.argmax(fast))], True
-                if part.size:
-                    result[done + first : done + first + part.size] = part
-                    here, memory = self._along(part, memory)
-                    start, free = float(part[-1]), False
-                first += part.size
+                    segment, behind = segment[: int(np.argmax(fast))], True
+                if segment.size:
+                    result[done + first : done + first + segment.size] = segment
+                    here, memory = self._along(segment, memory)
+                    start, free = float(segment[-1]), False
+                first += segment.size
         return result
 
     def _stretch(
@@ -211,8 +213,8 @@ class One:
         goal = here + s * np.maximum(s * (target - here), 0.0)
         if goal[-1] == here or s * (edge - start) <= 0:
             return np.full(target.shape, start)
-        asked = abs(float(goal[-1]) - here)
-        first = asked / self.slope if self.slope > 0 else 1.0
+        distance = abs(float(goal[-1]) - here)
+        first = distance / self.slope if self.slope > 0 else 1.0
         return reached(lambda u: self._along(u, memory)[0], goal, start, edge, first)
 
     def _along(self, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
@@ -234,13 +236,13 @@ class One:
             return float(self._along(np.array([voltage]), at)[0][0]) - drive
 
         low, high = path.low, path.high
-        middle = min(max(self.span.middle, low), high)
-        s = -1.0 if off(middle) > 0 else 1.0
-        reach = max(self.span.half, abs(off(middle)) / self.slope if self.slope > 0 else 0.0, 1e-9)
+        center = min(max(self.span.middle, low), high)
+        s = -1.0 if off(center) > 0 else 1.0
+        reach = max(self.span.half, abs(off(center)) / self.slope if self.slope > 0 else 0.0, 1e-9)
         edge = high if s > 0 else low
-        while s * (edge - middle) > reach and s * off(middle + s * reach) < 0:
+        while s * (edge - center) > reach and s * off(center + s * reach) < 0:
             reach = 2 * reach
-        far = middle + s * min(reach, abs(edge - middle))
-        if s * off(far) < 0:
-            return far
-        return float(brentq(off, middle, far, xtol=1e-15 * max(abs(far), 1.0), rtol=1e-14))
+        bracket = center + s * min(reach, abs(edge - center))
+        if s * off(bracket) < 0:
+            return bracket
+        return float(brentq(off, center, bracket, xtol=1e-15 * max(abs(bracket), 1.0), rtol=1e-14))

@@ -73,34 +73,34 @@ def inverse(
         or none within the limits, with its place and time.
     """
     models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
-    asked = _checked(displacement, len(models))
+    target = _checked(displacement, len(models))
     columns = actuator.columns(models)
     actuator.check(columns)
     slopes = np.broadcast_to(
         np.abs(actuator.hysteresis.gain(columns, actuator.span or UNIT)), len(models)
     )
-    ones = []
+    singles = []
     for row, slope in enumerate(slopes.tolist()):
         column = {name: values[row : row + 1] for name, values in columns.items()}
-        ones.append(One(actuator, column, from_rest, of_rows(state, slice(row, row + 1)), slope))
-    asked = np.broadcast_to(asked, (len(models), asked.shape[1]))
-    result = np.empty(asked.shape)
-    known = together(ones, columns, state, asked, result)
-    for row, one in enumerate(ones):
-        if limits is not None or not known[row]:
-            made = result[row] if known[row] else None
-            result[row] = one.voltage(asked[row], limits or Limits(), nearest, made)
+        singles.append(One(actuator, column, from_rest, of_rows(state, slice(row, row + 1)), slope))
+    target = np.broadcast_to(target, (len(models), target.shape[1]))
+    result = np.empty(target.shape)
+    solved = together(singles, columns, state, target, result)
+    for row, single in enumerate(singles):
+        if limits is not None or not solved[row]:
+            solution = result[row] if solved[row] else None
+            result[row] = single.voltage(target[row], limits or Limits(), nearest, solution)
     return result
 
 
 def _checked(displacement: ArrayLike, models: int) -> FloatArray:
-    asked = np.atleast_2d(np.asarray(displacement, dtype=np.float64))
-    if asked.ndim != 2 or asked.shape[1] == 0 or len(asked) not in (1, models):
+    target = np.atleast_2d(np.asarray(displacement, dtype=np.float64))
+    if target.ndim != 2 or target.shape[1] == 0 or len(target) not in (1, models):
         raise InputError(
-            f"reference: has shape {asked.shape}; give a non-empty row of samples, or one for each "
-            "model"
+            f"reference: has shape {target.shape}; give a non-empty row of samples, or one for "
+            "each model"
         )
-    if not np.isfinite(asked).all():
-        sample = int(np.argmin(np.isfinite(asked).all(axis=0)))
+    if not np.isfinite(target).all():
+        sample = int(np.argmin(np.isfinite(target).all(axis=0)))
         raise InputError(f"reference: not a finite number in sample {sample}; give every sample")
-    return asked
+    return target

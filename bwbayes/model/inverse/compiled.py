@@ -1,7 +1,7 @@
 """Many models read backwards, one after the other: compiled, and the same for any operator.
 
 At each sample one number is looked for: the voltage at which the hysteresis' step
-(:mod:`bwbayes.model.inverse.steps`), with the gain, and behind it dynamics and creep, make the
+(:mod:`bwbayes.model.step`), with the gain, and behind it dynamics and creep, make the
 displacement that is asked for. Newton's rule finds it, kept between bounds, and bisection where
 that does not do. Nothing here knows what the hysteresis is but through its step.
 
@@ -11,19 +11,14 @@ It needs numba, which is loaded when many models are read backwards, not before.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numba.extending import overload, register_jitable
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.model.elementwise import anywhere, look_up, select
-from bwbayes.model.inverse import curved_steps, steps
-from bwbayes.model.inverse.curved_steps import AsymmetricStep, DuhemStep, PowerStep
-from bwbayes.model.inverse.steps import HysteresisStep, LinearStep, PlaysStep
-from bwbayes.model.operators import duhem
+from bwbayes.model.compiled import INNER, move
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["Chains", "invert"]
 
@@ -35,16 +30,6 @@ BENT = 0.25
 
 # Rounds at most: of Newton's rule, of which it needs a few, and of bisection to the last bit.
 NEWTON_ROUNDS, ROUNDS = 40, 120
-
-
-# What is called at each sample allocates nothing: to count who holds an array would take longer
-# than all of the arithmetic.
-INNER: Mapping[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"contract", "nsz"},
-    "_nrt": False,
-}
 
 
 class Chains(NamedTuple):
@@ -86,23 +71,6 @@ class Chains(NamedTuple):
     begins: bool
 
 
-overload(anywhere)(lambda condition: lambda condition: condition)  # noqa: ARG005
-overload(select)(
-    lambda condition, yes, no: lambda condition, yes, no: yes if condition else no  # noqa: ARG005
-)
-overload(look_up)(lambda rows, place: lambda rows, place: rows[np.intp(place)])  # noqa: ARG005
-register_jitable(**INNER)(steps.phi)
-register_jitable(**INNER)(curved_steps.find_cell)
-register_jitable(**INNER)(curved_steps.clock)
-register_jitable(**INNER)(curved_steps.height_at)
-register_jitable(**INNER)(steps.relaxed)
-register_jitable(**INNER)(duhem.phi_functions)
-
-KINDS = LinearStep, PlaysStep, AsymmetricStep, DuhemStep, PowerStep
-LINEAR, PLAYS, ASYMMETRIC, DUHEM, _ = range(len(KINDS))
-_linear, _plays, _asymmetric, _duhem, _power = (njit(**INNER)(kind.move) for kind in KINDS)
-
-
 def invert(
     step: HysteresisStep, memory: FloatArray, chains: Chains, samples: FloatArray
 ) -> BoolArray:
@@ -119,28 +87,31 @@ def invert(
     samples
         (models, samples), um without the offset, and then V.
     """
-    kind = KINDS.index(type(step))
     right: BoolArray = _invert(
-        kind, np.ascontiguousarray(step.parameters), np.ascontiguousarray(memory), chains, samples
+        step, np.ascontiguousarray(step.parameters), np.ascontiguousarray(memory), chains, samples
     )
     return right
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _invert(
-    kind: int, parameters: FloatArray, memory: FloatArray, chains: Chains, samples: FloatArray
+    step: HysteresisStep,
+    parameters: FloatArray,
+    memory: FloatArray,
+    chains: Chains,
+    samples: FloatArray,
 ) -> BoolArray:
     right, after = np.ones(samples.shape[0], dtype=np.bool_), np.empty(memory.shape[1])
     for model in range(samples.shape[0]):
         right[model] = _invert_one(
-            kind, parameters[model], memory[model], after, chains, model, samples[model]
+            step, parameters[model], memory[model], after, chains, model, samples[model]
         )
     return right
 
 
 @njit(**INNER)
 def _invert_one(
-    kind: int,
+    step: HysteresisStep,
     parameters: FloatArray,
     memory: FloatArray,
     after: FloatArray,
@@ -150,8 +121,8 @@ def _invert_one(
 ) -> bool:
     """Turn one model's displacement into its voltage; tell whether it rises with that all along."""
     top, bottom, gains = chains.numerator[model], chains.denominator[model], chains.gains[model]
-    rest, filters = chains.rest[model], chains.filters[model]
-    curve, kappa, far = chains.curve[model], chains.growth[model], chains.farthest[model]
+    equilibrium, filters = chains.rest[model], chains.filters[model]
+    curve, kappa, farthest = chains.curve[model], chains.growth[model], chains.farthest[model]
     # A drive that is held acts one sample later, and is found from the next sample.
     late = int(top[0, 0] == 0.0)
     close = CLOSE * chains.largest[model]
@@ -170,38 +141,40 @@ def _invert_one(
                     carried = filters[i, 0]
                     if late:
                         carried = filters[i, 1] - bottom[i, 1] * carried
-                    missing -= gains[i] * (rest[i] + carried) - count * rest[i]
+                    missing -= gains[i] * (equilibrium[i] + carried) - count * equilibrium[i]
                 if i == 0:
                     plain = count
                 else:
                     creeping += count
             demand = plain, creeping, kappa, missing
-            here = _solve(kind, parameters, curve, memory, after, here, demand, far, close)
+            here = _solve(step, parameters, curve, memory, after, here, demand, farthest, close)
             u, w, slope, _, _ = here
             if math.isnan(slope):
                 return False
         for i in range(gains.size):
             drive = w if i == 0 else w * (1.0 + kappa * abs(u))
             if first:
-                rest[i] = drive
+                equilibrium[i] = drive
                 filters[i] = 0.0
-            moved = top[i, 0] * (drive - rest[i]) + filters[i, 0]
-            filters[i, 0] = top[i, 1] * (drive - rest[i]) - bottom[i, 1] * moved + filters[i, 1]
-            filters[i, 1] = top[i, 2] * (drive - rest[i]) - bottom[i, 2] * moved
+            moved = top[i, 0] * (drive - equilibrium[i]) + filters[i, 0]
+            filters[i, 0] = (
+                top[i, 1] * (drive - equilibrium[i]) - bottom[i, 1] * moved + filters[i, 1]
+            )
+            filters[i, 1] = top[i, 2] * (drive - equilibrium[i]) - bottom[i, 2] * moved
         samples[t] = u
     return True
 
 
 @njit(**INNER)
 def _solve(
-    kind: int,
+    step: HysteresisStep,
     parameters: FloatArray,
     curve: FloatArray,
     memory: FloatArray,
     after: FloatArray,
     here: tuple[float, float, float, float, float],
     demand: tuple[float, float, float, float],
-    far: float,
+    farthest: float,
     close: float,
 ) -> tuple[float, float, float, float, float]:
     """Solve (p + c (1 + κ |u|)) w(u) = missing, and move the memory there.
@@ -212,7 +185,7 @@ def _solve(
     """
     plain, creeping, kappa, missing = demand
     start, w, slope, bend, direction = here
-    u, low, high, done = start, -far, far, 0
+    u, low, high, done = start, -farthest, farthest, 0
     factor = plain + creeping * (1.0 + kappa * abs(u))
     off = factor * w - missing
     # Just after a turn the slope is another one.
@@ -223,14 +196,15 @@ def _solve(
         low, high = (u, high) if off < 0.0 else (low, u)
         steep = factor * slope + creeping * kappa * (w if u >= 0.0 else -w)
         # On the parabola that touches, as far as that is a small correction.
-        one = 1.0 / steep
-        step = -off * one
-        better = u + step * (1.0 - min(max(0.5 * bend * factor * step * one, -BENT), BENT))
+        inverse_slope = 1.0 / steep
+        change = -off * inverse_slope
+        bent = min(max(0.5 * bend * factor * change * inverse_slope, -BENT), BENT)
+        better = u + change * (1.0 - bent)
         if not (steep > 0.0 and low < better < high and done < NEWTON_ROUNDS):
             better = 0.5 * (low + high)
         fell = not steep > 0.0 and (u - start) * off < 0.0
         before, flatter, u = u, slope, better
-        w, slope = _drive(kind, parameters, curve, memory, u, after)
+        w, slope = _drive(step, parameters, curve, memory, u, after)
         factor = plain + creeping * (1.0 + kappa * abs(u))
         off = factor * w - missing
         if u != before and not (turned and before == start):
@@ -245,7 +219,7 @@ def _solve(
 
 @njit(**INNER)
 def _drive(
-    kind: int,
+    step: HysteresisStep,
     parameters: FloatArray,
     curve: FloatArray,
     memory: FloatArray,
@@ -253,15 +227,6 @@ def _drive(
     after: FloatArray,
 ) -> tuple[float, float]:
     """Return hysteresis and gain, um, and their slope, um/V; and write the memory ``after``."""
-    if kind == LINEAR:
-        w, slope = _linear(parameters, memory, u, after)
-    elif kind == PLAYS:
-        w, slope = _plays(parameters, memory, u, after)
-    elif kind == ASYMMETRIC:
-        w, slope = _asymmetric(parameters, memory, u, after)
-    elif kind == DUHEM:
-        w, slope = _duhem(parameters, memory, u, after)
-    else:
-        w, slope = _power(parameters, memory, u, after)
+    w, slope = move(step, parameters, memory, u, after)
     w += curve[0] + u * (curve[1] + u * (curve[2] + u * curve[3]))
     return w, slope + curve[1] + u * (2.0 * curve[2] + 3.0 * u * curve[3])

@@ -14,7 +14,7 @@ def of_rows(memory: Any, rows: slice) -> Any:
     if isinstance(memory, np.ndarray):
         return memory[rows]
     if isinstance(memory, tuple):
-        parts = [of_rows(one, rows) for one in memory]
+        parts = [of_rows(member, rows) for member in memory]
         return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
     if hasattr(memory, "__dataclass_fields__"):
         return type(memory)(

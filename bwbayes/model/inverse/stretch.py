@@ -55,24 +55,24 @@ def reached(
     s = 1.0 if edge >= start else -1.0
     here = float(along(np.array([start]))[0])
     goal = np.maximum.accumulate(np.maximum(s * (target - here), 0.0))
-    far, room = _far_enough(
+    farthest, room = _far_enough(
         along, start, edge, s, min(first, abs(edge - start)), here + s * goal[-1]
     )
     if room == 0.0:
-        return np.full(target.shape, far)
+        return np.full(target.shape, farthest)
     points = start + s * room * np.linspace(0.0, 1.0, GRID)
-    points[-1] = far
+    points[-1] = farthest
     heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
     heights = np.maximum.accumulate(heights)
     if goal[0] >= heights[-1]:
-        return np.full(target.shape, far)
+        return np.full(target.shape, farthest)
     above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
     result = searched(
         lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
         (points[above - 1], points[above]),
         (heights[above - 1] - goal, heights[above] - goal),
     )
-    return np.where(goal <= 0, start, np.where(goal >= heights[-1], far, result))
+    return np.where(goal <= 0, start, np.where(goal >= heights[-1], farthest, result))
 
 
 def _far_enough(
@@ -84,15 +84,15 @@ def _far_enough(
     goal: float,
 ) -> tuple[float, float]:
     """Return a voltage beyond which the path need not be followed, and how far that is, V."""
-    most = abs(edge - start)
+    limit = abs(edge - start)
     for _ in range(DOUBLINGS):
-        if reach >= most:
-            return edge, most
-        far = start + s * reach
-        if s * (float(along(np.array([far]))[0]) - goal) >= 0:
-            return far, reach
+        if reach >= limit:
+            return edge, limit
+        trial = start + s * reach
+        if s * (float(along(np.array([trial]))[0]) - goal) >= 0:
+            return trial, reach
         reach = 2 * reach
-    return edge, most
+    return edge, limit
 
 
 def _in_order(
@@ -111,27 +111,27 @@ def searched(
     values: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
     """Return the roots (samples,) of a function between ends where it has opposite signs."""
-    (b, a), (fb, fa) = (one.copy() for one in ends), (one.copy() for one in values)
+    (b, a), (fb, fa) = (end.copy() for end in ends), (value.copy() for value in values)
     c, fc = a.copy(), fa.copy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        part = np.clip(np.nan_to_num(fa / (fa - fb), nan=0.5), 0.0, 1.0)
+        fraction = np.clip(np.nan_to_num(fa / (fa - fb), nan=0.5), 0.0, 1.0)
         for _ in range(ROUNDS):
-            x = a + part * (b - a)
+            x = a + fraction * (b - a)
             fx = function(x)
             same = np.sign(fx) == np.sign(fa)
             c, fc = np.where(same, a, b), np.where(same, fa, fb)
             b, fb = np.where(same, b, a), np.where(same, fb, fa)
             a, fa = x, fx
             best = np.where(np.abs(fa) < np.abs(fb), a, b)
-            least = np.minimum(np.abs(fa), np.abs(fb))
+            smallest = np.minimum(np.abs(fa), np.abs(fb))
             narrow = 2 * EPSILON * np.abs(best) / np.abs(b - a)
-            if ((least == 0) | (narrow >= 0.5) | (a == b)).all():
+            if ((smallest == 0) | (narrow >= 0.5) | (a == b)).all():
                 return best
             xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
             safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
             step = fa / (fb - fa) * fc / (fb - fc)
             step += (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-            part = np.where(safe & np.isfinite(step), step, 0.5)
+            fraction = np.where(safe & np.isfinite(step), step, 0.5)
             narrow = np.minimum(np.nan_to_num(narrow, nan=0.5), 0.5)
-            part = np.clip(part, narrow, 1 - narrow)
+            fraction = np.clip(fraction, narrow, 1 - narrow)
     return best

@@ -3,7 +3,7 @@
 One model is inverted fastest along whole stretches. Of a thousand draws each has its own voltage
 and its own turns, and then it is many times faster to go from sample to sample, compiled
 (:mod:`bwbayes.model.inverse.compiled`): for whatever has a step
-(:mod:`bwbayes.model.inverse.steps`), and where there is numba.
+(:mod:`bwbayes.model.step`), and where there is numba.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.actuator import State
+from bwbayes.model.gain import DriveStep
 from bwbayes.model.inverse.alone import One
-from bwbayes.model.inverse.stepped import DriveStep, has_step, step_of
 from bwbayes.model.inverse.stretch import searched
 from bwbayes.model.linear import Sections
+from bwbayes.model.operator import Operator
 
 __all__ = ["MANY", "together"]
 
@@ -33,10 +34,10 @@ ROUNDED = 1e-6
 
 
 def together(
-    ones: Sequence[One],
+    singles: Sequence[One],
     columns: Mapping[str, FloatArray],
     state: State | None,
-    asked: FloatArray,
+    target: FloatArray,
     result: FloatArray,
 ) -> BoolArray:
     """Write the voltages without limits of models that go together; tell which (models,) do.
@@ -47,35 +48,38 @@ def together(
     ----------
     ones, columns, state
         The models, by themselves and all together, (models,) each, and where they stand.
-    asked
+    target
         The displacements (models, samples), um.
     result
         Where their voltages go, (models, samples), V.
     """
-    actuator, models = ones[0].actuator, len(ones)
-    if models < MANY or find_spec("numba") is None or not has_step(actuator.hysteresis):
+    actuator, models = singles[0].actuator, len(singles)
+    stepped = type(actuator.hysteresis).step is not Operator.step
+    if models < MANY or find_spec("numba") is None or not stepped:
         return np.zeros(models, dtype=np.bool_)
     # Here, because numba may not be installed, and takes half a second to load.
     from bwbayes.model.inverse.compiled import Chains, invert  # noqa: PLC0415
 
-    drive = DriveStep(step_of(actuator.hysteresis, columns), actuator.gain, columns)
+    drive = DriveStep(actuator.hysteresis.step(columns), actuator.gain, columns)
     sections, creep, growth = actuator.sections(columns), actuator.creep, np.zeros(models)
     if creep is not None and creep.growing:
         growth = columns["creep_growth"] * creep.size(np.array(1.0))
-    np.subtract(asked, columns["offset"][:, np.newaxis], out=result)
+    np.subtract(target, columns["offset"][:, np.newaxis], out=result)
     if state is not None:
         memory, start = drive.step.remembered(state.hysteresis), state.hysteresis.voltage
-    elif ones[0].from_rest:
-        at_rest = actuator.hysteresis.begin(columns, 0.0, ones[0].span, from_rest=True)
+    elif singles[0].from_rest:
+        at_rest = actuator.hysteresis.begin(columns, 0.0, singles[0].span, from_rest=True)
         memory, start = drive.step.remembered(at_rest), 0.0
     else:
-        start = _first(ones, drive, columns["initial"], sections, growth, result[:, 0])
-        memory = drive.step.begun(start, columns["initial"], ones[0].span)
+        start = _first(singles, drive, columns["initial"], sections, growth, result[:, 0])
+        memory = drive.step.begun(start, columns["initial"], singles[0].span)
     start = np.broadcast_to(start, models).astype(np.float64)
     right = drive.step.holds(memory)
     w, slope, _ = drive.go(memory, start)
     largest = np.maximum(result.max(axis=1), -result.min(axis=1))
-    farthest = [one.anywhere(size).high for one, size in zip(ones, largest.tolist(), strict=True)]
+    farthest = [
+        single.anywhere(size).high for single, size in zip(singles, largest.tolist(), strict=True)
+    ]
     curve = np.zeros((4, models)) if actuator.gain is None else actuator.gain.powers(columns)
     chains = Chains(
         np.ascontiguousarray(curve.T),
@@ -92,8 +96,8 @@ def together(
     right &= invert(drive.step, memory, chains, result)
     right &= np.max(np.abs(sections.zeros), axis=1, initial=0.0) <= 1 + ROUNDED
     # Bisection ends just before what is too far away.
-    most = (1 - ROUNDED) * chains.farthest
-    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < most)
+    limit = (1 - ROUNDED) * chains.farthest
+    return right & (np.maximum(result.max(axis=1), -result.min(axis=1)) < limit)
 
 
 def _carried(sections: Sections, state: State | None) -> tuple[FloatArray, FloatArray]:
@@ -101,17 +105,17 @@ def _carried(sections: Sections, state: State | None) -> tuple[FloatArray, Float
 
     That is (models, sections, 2).
     """
-    rest = np.zeros((sections.gains[0].size, len(sections.gains)))
-    filters = np.zeros((*rest.shape, 2))
+    equilibrium = np.zeros((sections.gains[0].size, len(sections.gains)))
+    filters = np.zeros((*equilibrium.shape, 2))
     if state is not None:
-        for number, (drive, kept) in enumerate(zip(state.rest, state.filter, strict=True)):
-            rest[:, number] = drive
-            filters[:, number, : kept.shape[1]] = kept
-    return rest, filters
+        for number, (drive, filtered) in enumerate(zip(state.rest, state.filter, strict=True)):
+            equilibrium[:, number] = drive
+            filters[:, number, : filtered.shape[1]] = filtered
+    return equilibrium, filters
 
 
 def _first(
-    ones: Sequence[One],
+    singles: Sequence[One],
     drive: DriveStep,
     initial: FloatArray,
     sections: Sections,
@@ -123,7 +127,7 @@ def _first(
     There the first displacement (models,), um, is what the initial state makes of the voltage, with
     dynamics and creep at rest.
     """
-    span, slope = ones[0].span, np.array([one.slope for one in ones])
+    span, slope = singles[0].span, np.array([single.slope for single in singles])
     plain, *creeping = sections.gains
 
     def off(voltage: FloatArray) -> FloatArray:
@@ -131,17 +135,17 @@ def _first(
         w = drive.go(drive.step.begun(voltage, initial, span), voltage).w
         return np.asarray(factor * w - displacement)
 
-    middle = np.full_like(displacement, span.middle)
-    missing = off(middle)
+    center = np.full_like(displacement, span.middle)
+    missing = off(center)
     s = np.where(missing > 0, -1.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         guess = np.where(slope > 0, np.abs(missing) / slope, 0.0)
     reach = np.maximum(guess, max(span.half, SHORTEST))
     for _ in range(DOUBLINGS):
-        beyond = off(middle + s * reach)
+        beyond = off(center + s * reach)
         short = s * beyond < 0
         if not short.any():
             break
         reach = np.where(short, 2 * reach, reach)
     # Where there is none it is so far away that the inverse does not begin there.
-    return searched(off, (middle, middle + s * reach), (missing, beyond))
+    return searched(off, (center, center + s * reach), (missing, beyond))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
@@ -22,6 +21,8 @@ from bwbayes.model.operators.one_state import (
     initial,
     refuse,
 )
+from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["BacklashLike"]
 
@@ -61,14 +62,9 @@ class BacklashLike(OneState):
         """Tell where α < d."""
         return below_d(column)
 
-    def trace(
-        self, column: Values, voltage: FloatArray, state: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w = d u − h (models, samples), and h at the end."""
-        h = hysteresis(voltage, column["alpha"], column["beta"], 0.0, initial=state)
-        after = h[:, -1].copy()
-        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
-        return h, after
+    def step(self, column: Values) -> HysteresisStep:
+        """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
+        return RelaxingStep.alike(column["d"], column["alpha"], column["beta"], column["beta"])
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""

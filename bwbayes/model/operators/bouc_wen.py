@@ -30,6 +30,9 @@ from bwbayes.model.operators.one_state import (
     initial,
     refuse,
 )
+from bwbayes.model.power import PowerStep
+from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["BoucWen"]
 
@@ -165,6 +168,14 @@ class BoucWen(OneState):
             "[model] passive = false"
         ]
 
+    def step(self, column: Values) -> HysteresisStep:
+        """Return that of n = 1, or of any exponent."""
+        d, alpha, beta, gamma = (column[name] for name in ("d", *SHAPE[:3]))
+        exponent = column.get("exponent", np.ones_like(d))
+        if np.all(exponent == 1.0):
+            return RelaxingStep.alike(d, alpha, beta - gamma, beta + gamma)
+        return PowerStep(d, alpha, beta, gamma, exponent)
+
     def opening(self, column: Values, half_range: float) -> FloatArray | None:
         """Return β U for n = 1."""
         return column["beta"] * half_range if np.all(column["exponent"] == 1.0) else None
@@ -199,15 +210,15 @@ def _rate_unit(stated: Mapping[str, float | Distribution]) -> str:
     return "1/V" if stated.get("exponent", 1.0) == 1.0 else "um^(1-n)/V"
 
 
-def _beta(known: Context) -> Distribution:
+def _beta(context: Context) -> Distribution:
     """Return β's default prior; its scale follows the exponent, and it allows for γ's cut."""
-    low, middle, high = (_log_rate(n, known.ranges) for n in _likely(known))
-    part = BETA if known.value("gamma") is None else 1.0
-    return lognormal(part * _exp(middle), math.hypot(BETA_SIGMA, (high - low) / 4))
+    low, center, high = (_log_rate(n, context.ranges) for n in _likely(context))
+    factor = BETA if context.value("gamma") is None else 1.0
+    return lognormal(factor * _exp(center), math.hypot(BETA_SIGMA, (high - low) / 4))
 
 
-def _gamma(known: Context) -> Distribution:
-    low, _, high = (_log_rate(n, known.ranges) for n in _likely(known))
+def _gamma(context: Context) -> Distribution:
+    low, _, high = (_log_rate(n, context.ranges) for n in _likely(context))
     return normal(0.0, GAMMA * _exp(max(low, high)))
 
 
@@ -224,14 +235,14 @@ def _exp(logarithm: float) -> float:
     return math.exp(min(logarithm, 700.0))
 
 
-def _likely(known: Context) -> tuple[float, float, float]:
+def _likely(context: Context) -> tuple[float, float, float]:
     """Return the exponent's 2.5 %, 50 % and 97.5 % quantiles above one."""
-    exponent = known.stated.get("exponent", 1.0)
+    exponent = context.stated.get("exponent", 1.0)
     if not isinstance(exponent, Distribution):
         return exponent, exponent, exponent
     below = float(exponent.frozen.cdf(1.0))
     if below >= 1:
         return 1.0, 1.0, 1.0
     likely = exponent.frozen.ppf(below + (1 - below) * np.array([0.025, 0.5, 0.975]))
-    low, middle, high = (float(n) for n in np.minimum(likely, LARGEST_EXPONENT))
-    return low, middle, high
+    low, center, high = (float(n) for n in np.minimum(likely, LARGEST_EXPONENT))
+    return low, center, high

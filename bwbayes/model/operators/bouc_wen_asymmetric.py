@@ -17,9 +17,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.boucwen import PIECE, _LinearFlow
 from bwbayes.model.declaration import Declaration, Values, normal
-from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     HIGHEST_CEILING,
@@ -31,6 +29,8 @@ from bwbayes.model.operators.one_state import (
     initial_anywhere,
     refuse,
 )
+from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["SIGNS", "BoucWenAsymmetric", "rates"]
 
@@ -100,14 +100,18 @@ class BoucWenAsymmetric(OneState):
             "1/V",
             r"\gamma",
             "hysteresis loop shape, loading against unloading",
-            lambda known: normal(0.0, 4.0 / known.ranges.voltage),
-            bounds=lambda earlier: _within(earlier.get("beta", np.inf)),
+            lambda context: normal(0.0, 4.0 / context.ranges.voltage),
+            bounds=lambda earlier: (
+                np.negative(earlier.get("beta", np.inf)),
+                earlier.get("beta", np.inf),
+            ),
             stated_bounds="|gamma| <= beta",
             loop=True,
         )
         start = replace(initial_anywhere(), bounds=_initial_bounds)
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        return d(), alpha(), beta(0.15, _beta_bounds), gamma, *self._asymmetry(), start
+        shape = beta(0.15, lambda earlier: (np.abs(earlier.get("gamma", np.zeros(1))), np.inf))
+        return d(), alpha(), shape, gamma, *self._asymmetry(), start
 
     def _asymmetry(self) -> list[Declaration]:
         return [
@@ -142,19 +146,15 @@ class BoucWenAsymmetric(OneState):
             return inside
         return inside & _passive(column)
 
-    def trace(
-        self, column: Values, voltage: FloatArray, state: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w = d u − h (models, samples), and h at the end."""
-        h = np.repeat(state[:, np.newaxis], voltage.size, axis=1)
-        if np.ptp(voltage) > 0:
-            flows = {signs: _flow(column, *signs) for signs in product(SIGNS, SIGNS)}
-            for first, last, s in monotone_stretches(voltage, max(PIECE // state.size, 1)):
-                g = _follow(flows, s, s * h[:, first], s * voltage[first : last + 1])
-                np.multiply(g, s, out=h[:, first + 1 : last + 1])
-        after = h[:, -1].copy()
-        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
-        return h, after
+    def step(self, column: Values) -> HysteresisStep:
+        """Return plain Bouc-Wen hysteresis with the rates of each pair of signs."""
+        pairs = [rates(column, s, x) for s, x in product(reversed(SIGNS), repeat=2)]
+        plain = RelaxingStep.alike(column["d"], column["alpha"], *pairs[0])
+        against, ahead = (
+            np.reshape([slow + sign * fast for slow, fast in pairs], plain.ahead.shape)
+            for sign in (-1.0, 1.0)
+        )
+        return replace(plain, against=against, ahead=ahead)
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""
@@ -163,27 +163,6 @@ class BoucWenAsymmetric(OneState):
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""
         return column["beta"] * half_range
-
-
-def _follow(
-    flows: dict[tuple[float, float], _LinearFlow], s: float, start: FloatArray, along: FloatArray
-) -> FloatArray:
-    """Return g = s h (models, points - 1) along s u (points,), which ascends, from its start."""
-    before = int(np.searchsorted(along, 0.0, side="right"))
-    if before == 0:
-        return flows[s, s].advance(start, along[1:] - along[0])
-    if before == along.size:
-        return flows[s, -s].advance(start, along - along[0])[:, 1:]
-    # At zero volts the rates change, for all models alike.
-    early = flows[s, -s].advance(start, np.append(along[1:before], 0.0) - along[0])
-    late = flows[s, s].advance(early[:, -1], along[before:])
-    return np.hstack((early[:, :-1], late))
-
-
-def _flow(column: Values, s: float, x: float) -> _LinearFlow:
-    """Return how g evolves where the voltage goes in direction s and has the sign x."""
-    slow, fast = rates(column, s, x)
-    return _LinearFlow(column["alpha"], slow, fast, np.ones_like(slow))
 
 
 def rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
@@ -219,14 +198,6 @@ def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
         with np.errstate(divide="ignore", over="ignore"):
             tops.append(np.minimum(earlier["alpha"] / slowest, HIGHEST_CEILING))
     return -tops[1], tops[0]
-
-
-def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    return np.abs(earlier.get("gamma", np.zeros(1))), np.inf
-
-
-def _within(top: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
-    return np.negative(top), top
 
 
 def _bounds(name: str, earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -45,8 +45,8 @@ class DomainWall(Pinned):
 
     def curve(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return L = tanh y and L′ = 1 − L² (models,), of any shape."""
-        gone = np.exp(-2 * np.abs(y))
-        return np.tanh(y), 4 * gone / (1 + gone) ** 2
+        decay = np.exp(-2 * np.abs(y))
+        return np.tanh(y), 4 * decay / (1 + decay) ** 2
 
     def bend(self, y: FloatArray, level: FloatArray, slope: FloatArray) -> FloatArray:  # noqa: ARG002  # the curve says it all
         """Return L″ = −2 L L′."""

@@ -7,18 +7,13 @@ voltage. With constants for both, it is the backlash-like model.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.boucwen import PIECE
 from bwbayes.model.declaration import Context, Declaration, Values, normal, rounded
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.drive import monotone_stretches
-from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     OneState,
@@ -29,13 +24,13 @@ from bwbayes.model.operators.one_state import (
     initial_anywhere,
     refuse,
 )
+from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.step import Gone, HysteresisStep
 
-__all__ = ["Duhem", "phi_functions"]
+__all__ = ["Duhem"]
 
-# Below this argument the φ functions are summed as a series of so many terms, which is exact there;
-# above it nothing cancels in their recursion.
-NEAR, SERIES_TERMS = 1.0, 16
-TERMS = tuple(1 / math.factorial(order) for order in range(SERIES_TERMS + 2, 2, -1))
+# Voltages at which a slope is looked at; stands for a rate of zero times a range of voltages.
+LOOKED, SLOW = 1001, 1e-6
 
 # Bounds that other parameters put on one may be rounded.
 SLACK = 1e-12
@@ -101,7 +96,7 @@ class Duhem(OneState):
             "um/V^2",
             r"\alpha_1",
             "growth of the hysteresis with the voltage",
-            lambda known: normal(0.0, 0.2 * known.ranges.gain / _farthest(known)),
+            lambda context: normal(0.0, 0.2 * context.ranges.gain / _farthest(context)),
             bounds=_alpha1_bounds,
             stated_bounds="beta^2 (4 alpha alpha2 - alpha1^2) >= alpha2^2",
             loop=True,
@@ -128,49 +123,13 @@ class Duhem(OneState):
             return inside
         return inside & _passive(column)
 
-    def trace(
-        self, column: Values, voltage: FloatArray, state: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return y = f(u) − h (models, samples), and h at the end.
-
-        Along a stretch of direction s from u₀, with v = |u − u₀|, s α(u) is a polynomial of v, and
-
-            h = h₀ exp(−β v) + Σ k! p_k v^(k+1) φ_(k+1)(−β v),   s α(u₀ + s v) = Σ p_k v^k.
-        """
-        h = np.repeat(state[:, np.newaxis], voltage.size, axis=1)
-        rate = column["beta"][:, np.newaxis]
-        for first, last, s in monotone_stretches(voltage, max(PIECE // state.size, 1)):
-            start, u0 = h[:, first, np.newaxis], voltage[first]
-            v = s * (voltage[first + 1 : last + 1] - u0)
-            strength, slope, half = (p[:, np.newaxis] for p in self._about(column, u0))
-            one, two, three = phi_functions(rate * v)
-            # By Horner's rule; h₀ exp(−z) is h₀ (1 − z φ₁).
-            step = (2 * s * half) * three
-            step *= v
-            step += slope * two
-            step *= v
-            step += (s * strength - rate * start) * one
-            step *= v
-            np.add(start, step, out=h[:, first + 1 : last + 1])
-        after = h[:, -1].copy()
-        np.subtract(self.polynomial(column, voltage), h, out=h)
-        return h, after
-
-    def _about(self, column: Values, u: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return α, α′ and α″/2 (models,) at a voltage."""
-        alpha0, alpha2 = column["alpha"], column["alpha2"]
-        alpha1 = 0.0 if self.odd else column["alpha1"]
-        return alpha0 + u * (alpha1 + u * alpha2), alpha1 + 2 * u * alpha2, alpha2
-
-    def polynomial(self, column: Values, voltage: FloatArray) -> FloatArray:
-        """Return f (models, samples), um."""
-        curve = column["d3"][:, np.newaxis] * voltage
-        if not self.odd:
-            curve += column["d2"][:, np.newaxis]
-        curve *= voltage
-        curve += column["d"][:, np.newaxis]
-        curve *= voltage
-        return curve
+    def step(self, column: Values) -> HysteresisStep:
+        """Return that of f and α."""
+        nothing = np.zeros_like(column["d"])
+        names = ("d", "d2", "d3", "alpha", "alpha1", "alpha2")
+        values = np.stack([column.get(name, nothing) for name in names])
+        rate = np.broadcast_to(column["beta"], (2, 2, nothing.size))
+        return DuhemStep(values[:3], values[3:], rate, rate)
 
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return the mean of f′ over the span."""
@@ -184,47 +143,56 @@ class Duhem(OneState):
         return column["beta"] * half_range
 
 
-def phi_functions(z: Any) -> tuple[Any, Any, Any]:
-    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0, a number or an array, to rounding.
+class DuhemStep(RelaxingStep):
+    """w = f(u) − h with Duhem hysteresis h, exact: dg/dv = α(u) − β g, g = s h."""
 
-    φ₁(−z) = (1 − exp(−z))/z, φ₂(−z) = (1 − φ₁)/z, φ₃(−z) = (1/2 − φ₂)/z; at zero they are 1, 1/2
-    and 1/6. Each falls with z and stays positive.
-    """
-    near = np.minimum(z, NEAR)
-    three = 0.0 * near
-    for term in TERMS:
-        three *= -near
-        three += term
-    two = 0.5 - near * three
-    one = 1.0 - near * two
-    if anywhere(z > NEAR):
-        far = np.maximum(z, NEAR)
-        one_far = -np.expm1(-far) / far
-        two_far = (1.0 - one_far) / far
-        three = select(z > NEAR, (0.5 - two_far) / far, three)
-        two, one = select(z > NEAR, two_far, two), select(z > NEAR, one_far, one)
-    return one, two, three
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
+        """Return f′ − α(u) ∓ β h, with h on the loop over all of the limits: none is larger."""
+        low, high = limits
+        beta = np.maximum(self.ahead[0, 0], SLOW / (high - low))
+        rate = np.broadcast_to(beta, self.ahead.shape)
+        symmetric = replace(self, against=rate, ahead=rate)
+        decay = np.exp(-beta * (high - low))
+
+        def swept(start: float, end: float, h: FloatArray) -> Gone:
+            return symmetric.go(np.stack([np.full_like(h, start), h], 1), np.full_like(h, end))
+
+        nothing = np.zeros_like(beta)
+        rise, fall = (swept(*ends, nothing).memory[:, 1] for ends in ((low, high), (high, low)))
+        at_high = (decay * fall + rise) / (1 - decay**2)
+        at_low = decay * at_high + fall
+        lowest, highest = np.full_like(beta, np.inf), np.full_like(beta, -np.inf)
+        for u in np.linspace(low, high, LOOKED):
+            up, down = swept(low, u, at_low), swept(high, u, at_high)
+            h = np.maximum(up.memory[:, 1], -down.memory[:, 1])
+            # Without any h it is f′ − α.
+            slope = swept(u, u, nothing).slope
+            lowest = np.minimum(lowest, slope - self.ahead[0, 0] * h)
+            highest = np.maximum(highest, slope + self.ahead[0, 0] * h)
+        return lowest, highest
 
 
-def _coefficient(name: str, power: int, label: str, description: str, part: float) -> Declaration:
-    """Declare a gain's coefficient that adds about ``part`` of d u at the farthest voltage."""
+def _coefficient(name: str, power: int, label: str, description: str, scale: float) -> Declaration:
+    """Declare a gain's coefficient that adds about ``scale`` of d u at the farthest voltage."""
     return Declaration(
         name,
         f"um/V^{power}",
         label,
         description,
-        lambda known: normal(0.0, part * known.ranges.gain / _farthest(known) ** (power - 1)),
+        lambda context: normal(
+            0.0, scale * context.ranges.gain / _farthest(context) ** (power - 1)
+        ),
         loop=True,
     )
 
 
-def _farthest(known: Context) -> float:
+def _farthest(context: Context) -> float:
     """Return the largest |u| of the record, V."""
-    return known.ranges.voltage + abs(known.ranges.bias)
+    return context.ranges.voltage + abs(context.ranges.bias)
 
 
-def _growth(known: Context) -> Distribution:
-    scale = 0.3 * known.ranges.gain / _farthest(known) ** 2
+def _growth(context: Context) -> Distribution:
+    scale = 0.3 * context.ranges.gain / _farthest(context) ** 2
     return Distribution("halfnormal", {"scale": rounded(scale)})
 
 
@@ -253,6 +221,6 @@ def _alpha1_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
 def _passive(column: Values) -> BoolArray:
     alpha2, rate2 = column["alpha2"], column["beta"] ** 2
     alpha1 = column.get("alpha1", np.zeros(1))
-    most = 4 * column["alpha"] * alpha2 * (1 + SLACK) - alpha1**2
-    inside: BoolArray = rate2 * most >= alpha2**2 * (1 - SLACK)
+    bound = 4 * column["alpha"] * alpha2 * (1 + SLACK) - alpha1**2
+    inside: BoolArray = rate2 * bound >= alpha2**2 * (1 - SLACK)
     return inside

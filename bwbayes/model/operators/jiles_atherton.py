@@ -62,8 +62,8 @@ class JilesAtherton(Pinned):
         elif not near.any():
             level, slope = _far(size)
         else:
-            both = _near(np.minimum(size, 1.0)), _far(np.maximum(size, 1.0))
-            level, slope = (np.where(near, *values) for values in zip(*both, strict=True))
+            branches = _near(np.minimum(size, 1.0)), _far(np.maximum(size, 1.0))
+            level, slope = (np.where(near, *values) for values in zip(*branches, strict=True))
         return np.copysign(level, y), slope
 
     def bend(self, y: FloatArray, level: FloatArray, slope: FloatArray) -> FloatArray:
@@ -99,7 +99,7 @@ def _near(y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _far(y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    one = 1 / y
-    gone = np.exp(-2 * y)
-    ratio = 2 * gone / (1 - gone)
-    return 1 + ratio - one, one * one - 2 * ratio / (1 - gone)
+    inverse = 1 / y
+    decay = np.exp(-2 * y)
+    ratio = 2 * decay / (1 - decay)
+    return 1 + ratio - inverse, inverse * inverse - 2 * ratio / (1 - decay)

@@ -9,12 +9,14 @@ Everett function, is averaged over that shift: wider bells with the same corner 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
-from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
+from bwbayes.model.elementwise import select
+from bwbayes.model.operators.memory import INITIAL, RemembersExtrema, refuse
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 from bwbayes.model.operators.preisach import DENSITY
 
@@ -30,9 +32,8 @@ ROUNDED = 1 + 1e-9
 # Beyond this many bells no relays are left: tanh is one to machine precision.
 SATURATED = 20.0
 
-# artanh(w) / w − 1 by its series, to 2e-16 of itself, where w² is no larger.
-SMALL = 0.01
-SERIES = tuple(1 / (2 * k + 1) for k in range(1, 9))
+# artanh(w) / w − 1 by so many terms of its series, to 2e-16 of itself, where w² is no larger.
+SMALL, TERMS = 0.01, 8
 
 
 @dataclass(frozen=True)
@@ -70,14 +71,15 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
             default=lambda context: lognormal(0.2 * context.ranges.voltage, 1.0),
             floor=0.0,
             reaches_floor=True,
-            bounds=lambda known: (0.0, WIDEST * known.get("saturation", np.array(np.inf))),
+            bounds=lambda earlier: (0.0, WIDEST * earlier.get("saturation", np.array(np.inf))),
             stated_bounds=f"width <= {WIDEST:g} saturation",
             loop=True,
         )
         rayleigh, saturation = DENSITY
         # Of a width that is fixed.
         saturation = replace(
-            saturation, bounds=lambda known: (known.get("width", np.array(0.0)) / WIDEST, np.inf)
+            saturation,
+            bounds=lambda earlier: (earlier.get("width", np.array(0.0)) / WIDEST, np.inf),
         )
         return (SLOPE, rayleigh, saturation, width, INITIAL)
 
@@ -87,39 +89,37 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
         wide = column["width"] > WIDEST * ROUNDED * column["saturation"]
         refuse("width", wide, column["width"], f"must be at most {WIDEST:g} times saturation")
 
-    def branch(self, column: Values) -> Branch:
-        """Return E of the start and the voltage."""
-        slope, scale, rayleigh, width = (
-            column[name][:, np.newaxis] for name in ("d", "saturation", "rayleigh", "width")
-        )
-        omega = width / scale
-        sinh, cosh = np.sinh(omega), np.cosh(omega)
-        height = rayleigh * scale**2 * np.divide(sinh, omega, where=omega > 0, out=1 + 0 * omega)
-        far = (omega / 2 + SATURATED) * scale
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d, u_s, 2 α_R u_s² sinh ω / ω, sinh ω, cosh ω, and beyond what E is flat, V."""
+        scale, omega = column["saturation"], column["width"] / column["saturation"]
+        sinh = np.sinh(omega)
+        height = 2 * column["rayleigh"] * scale**2
+        height *= np.divide(sinh, omega, where=omega > 0, out=np.ones_like(omega))
+        limit = (omega / 2 + SATURATED) * scale
+        return np.column_stack([column["d"], scale, height, sinh, np.cosh(omega), limit])
 
-        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
-            near, turned = np.clip(voltage, -far, far), np.clip(start, -far, far)
-            x, y = near / scale, turned / scale
-            difference = np.sinh((near - turned) / scale)
-            both, square = np.cosh(x + y), difference**2
-            apart = np.sqrt(1 + square)
-            c = both + apart * cosh
-            corners = (np.cosh(2 * x) + cosh) * (np.cosh(2 * y) + cosh)
-            moved = square * (apart + both * cosh) / corners
-            moved += apart * _rest_of_artanh(difference * sinh / c)
-            moved *= 2 * height / c
-            moved += slope * np.abs(voltage - start)
-            return np.asarray(moved)
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
+        """Return E."""
+        scale, sinh, cosh, limit = numbers[1], numbers[3], numbers[4], numbers[5]
+        near = np.minimum(np.maximum(voltage, -limit), limit)
+        turned = np.minimum(np.maximum(start, -limit), limit)
+        x, y = near / scale, turned / scale
+        difference = np.sinh((near - turned) / scale)
+        cosh_sum, square = np.cosh(x + y), difference * difference
+        root = np.sqrt(1.0 + square)
+        c = cosh_sum + root * cosh
+        corners = (np.cosh(2.0 * x) + cosh) * (np.cosh(2.0 * y) + cosh)
+        moved = square * (root + cosh_sum * cosh) / corners
+        moved = moved + root * rest_of_artanh(difference * sinh / c)
+        return numbers[2] / c * moved + numbers[0] * np.abs(voltage - start)
 
-        return everett
 
-
-def _rest_of_artanh(v: FloatArray) -> FloatArray:
+def rest_of_artanh(v: Any) -> Any:
     """Return artanh(v) / v − 1."""
     square = v * v
-    small = np.minimum(square, SMALL)
-    series = np.zeros_like(small)
-    for term in reversed(SERIES):
-        series = (series + term) * small
-    large = np.where(square > SMALL, v, 0.5)
-    return np.where(square > SMALL, np.arctanh(large) / large - 1, series)
+    small, series = np.minimum(square, SMALL), 0.0 * square
+    for order in range(TERMS, 0, -1):
+        series = (series + 1.0 / (2.0 * order + 1.0)) * small
+    large = select(square > SMALL, v, 0.5)
+    return select(square > SMALL, np.arctanh(large) / large - 1.0, series)

@@ -14,14 +14,13 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema, refuse
+from bwbayes.model.operators.memory import INITIAL, refuse
 from bwbayes.model.operators.prandtl_ishlinskii import (
-    Lines,
+    InParallel,
+    PlaysStep,
     checked_thresholds,
-    lines_branch,
     numbered,
     of_gain,
-    plays_lines,
 )
 
 __all__ = ["MaxwellSlip"]
@@ -33,7 +32,7 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class MaxwellSlip(RemembersExtrema):
+class MaxwellSlip(InParallel):
     """Elements that slip at given strains r_j, V, each holding back α_j, um/V, until it does.
 
     ::
@@ -76,12 +75,12 @@ class MaxwellSlip(RemembersExtrema):
             description="displacement per volt of long sweeps, when all elements slip",
             default=of_gain(1.4, 0.5),
             floor=0.0,
-            bounds=lambda known: (_held(known), np.inf),
+            bounds=lambda earlier: (_held(earlier), np.inf),
             stated_bounds="the sum of all alpha <= d",
             loop=True,
         )
         elements = numbered(self.thresholds, "alpha", r"\alpha", "of element")
-        return (slope, *(_below_d(one) for one in elements), INITIAL)
+        return (slope, *(_below_d(element) for element in elements), INITIAL)
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
@@ -90,13 +89,9 @@ class MaxwellSlip(RemembersExtrema):
         demand = "must not be less than the sum of all alpha, or the displacement turns back"
         refuse("d", back, column["d"], demand)
 
-    def branch(self, column: Values) -> Branch:
-        """Return the Everett function of the plays."""
-        return lines_branch(self.lines(column))
-
-    def lines(self, column: Values) -> Lines:
-        """Return the lines that E is made of."""
-        return plays_lines(self.thresholds, "alpha", self._slope(column), column)
+    def step(self, column: Values) -> PlaysStep:
+        """Return the plays; what the elements hold back of d is not in their slope."""
+        return PlaysStep.of(self.thresholds, "alpha", self._slope(column), column)
 
     def _slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""
@@ -108,13 +103,13 @@ def _below_d(element: Declaration) -> Declaration:
     if not element.name.startswith(ELEMENT):
         return element
 
-    def bounds(known: Values) -> tuple[ArrayLike, ArrayLike]:
-        others = {name: values for name, values in known.items() if name != element.name}
+    def bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+        others = {name: values for name, values in earlier.items() if name != element.name}
         return 0.0, others.get("d", np.array(np.inf)) - _held(others)
 
     return replace(element, bounds=bounds)
 
 
-def _held(known: Values) -> FloatArray:
+def _held(earlier: Values) -> FloatArray:
     """Return Σ α_j of those that are known."""
-    return np.asarray(sum(values for name, values in known.items() if name.startswith(ELEMENT)))
+    return np.asarray(sum(values for name, values in earlier.items() if name.startswith(ELEMENT)))

@@ -12,33 +12,26 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Context, Declaration, Values
+from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.drive import monotone_stretches
+from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.operator import Operator, Span, narrower
 
 __all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refuse"]
-
-# Elements (models x samples) that one array expression handles: small enough for the cache.
-PIECE = 65_536
-
-
-def _initial_prior(_: Context) -> Distribution:
-    return Distribution("uniform", {"lower": -1.0, "upper": 1.0})
-
 
 INITIAL = Declaration(
     name="initial",
     unit="-",
     label=r"\xi_0",
     description="state before the record, from the ascending (-1) to the descending branch (+1)",
-    default=_initial_prior,
+    default=lambda _: Distribution("uniform", {"lower": -1.0, "upper": 1.0}),
     bounds=lambda _: (-1.0, 1.0),
     stated_bounds="-1 <= initial <= 1",
     scope="record",
@@ -99,11 +92,23 @@ class RemembersExtrema(Operator):
     """
 
     @abstractmethod
-    def branch(self, column: Values) -> Branch:
-        """Return the Everett function of the models: zero where the voltage is at the start.
+    def numbers(self, column: Values) -> FloatArray:
+        """Return what ``everett`` needs to know of the models, (models, any)."""
 
-        It must be the same whichever of its two voltages is the start.
+    @staticmethod
+    @abstractmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
+        """Return E from one voltage to another, um: zero where they are the same.
+
+        It must be the same whichever of the two is the start. Written once, of what
+        :mod:`bwbayes.model.elementwise` says: for one model, all numbers, where it is compiled, and
+        for all models at once, with ``numbers`` (any, models, 1).
         """
+
+    def branch(self, column: Values) -> Branch:
+        """Return the Everett function of the models."""
+        numbers = np.ascontiguousarray(self.numbers(column).T)[:, :, np.newaxis]
+        return partial(self.everett, numbers)
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
@@ -241,9 +246,9 @@ def _along(
 ) -> None:
     """Write w along a part of a stretch that wipes nothing out to ``out`` (models, samples)."""
 
-    def from_extremum(start: Extremum, part: FloatArray) -> FloatArray:
+    def from_extremum(start: Extremum, voltages: FloatArray) -> FloatArray:
         turned = start.voltage if start.own is None else start.own[:, np.newaxis]
-        moved = direction * branch(turned, part)
+        moved = direction * branch(turned, voltages)
         moved += start.displacement[:, np.newaxis]
         return moved
 

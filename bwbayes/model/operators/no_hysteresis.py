@@ -14,6 +14,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import OneState, d, initial_anywhere, refuse
+from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["NoHysteresis"]
 
@@ -35,7 +37,7 @@ class NoHysteresis(OneState):
         slope = replace(
             d(),
             label="d",
-            default=lambda known: lognormal(known.ranges.gain, 0.6),
+            default=lambda context: lognormal(context.ranges.gain, 0.6),
             bounds=None,
         )
         return slope, replace(initial_anywhere(), default=lambda _: 0.0)
@@ -50,6 +52,11 @@ class NoHysteresis(OneState):
     ) -> tuple[FloatArray, FloatArray]:
         """Return w = d u (models, samples), and the state as it was."""
         return column["d"][:, np.newaxis] * voltage, state
+
+    def step(self, column: Values) -> HysteresisStep:
+        """Return d u."""
+        nothing = np.zeros_like(column["d"])
+        return RelaxingStep.alike(column["d"], nothing, nothing, nothing)
 
     def reachable(
         self, column: Values, voltage: float, span: Span

@@ -1,14 +1,13 @@
 """What operators given by a differential equation in the voltage's path have in common.
 
 Their whole memory is one number in each model: a displacement. It changes along the path of the
-voltage, and it starts as the parameter ``initial``. An operator of this kind says how the number
-changes along a path; where it starts, how pieces of a record are joined, and which states earlier
-drives may have left then follow.
+voltage, and it starts as the parameter ``initial``. An operator of this kind brings a step, or says
+how the number changes along a path; where it starts, how pieces of a record are joined, and which
+states earlier drives may have left then follow.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -18,7 +17,9 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
+from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.operator import Operator, Span
+from bwbayes.model.step import OneStateStep
 
 __all__ = [
     "HIGHEST_CEILING",
@@ -50,14 +51,26 @@ class StateMemory(NamedTuple):
 class OneState(Operator):
     """An operator that remembers the last voltage and one displacement in each model."""
 
-    @abstractmethod
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return w (models, samples) along a path, and the state (models,) at its end.
 
-        ``voltage`` (samples,), V; ``state`` (models,), um, is that at its first sample.
+        ``voltage`` (samples,), V; ``state`` (models,), um, is that at its first sample. By default
+        that of the operator's step.
         """
+        step = self.step(column)
+        assert isinstance(step, OneStateStep)
+        w = np.empty((state.size, voltage.size))
+        w[:, :1] = step.along(voltage[0], state, voltage[:1])[0]
+        if np.ptp(voltage) > 0:
+            for first, last, _ in monotone_stretches(voltage, max(PIECE // state.size, 1)):
+                ahead = slice(first + 1, last + 1)
+                w[:, ahead], states = step.along(voltage[first], state, voltage[ahead])
+                state = states[:, -1].copy()
+        else:
+            w[:] = w[:, :1]
+        return w, state
 
     def begin(
         self,
@@ -89,8 +102,8 @@ class OneState(Operator):
         From below and from above. No hysteresis at all, as after small and smaller loops, lies
         between.
         """
-        left = self.left(column, voltage, span)
-        return np.minimum(np.min(left, axis=0), 0.0), np.maximum(np.max(left, axis=0), 0.0)
+        remanent = self.left(column, voltage, span)
+        return np.minimum(np.min(remanent, axis=0), 0.0), np.maximum(np.max(remanent, axis=0), 0.0)
 
     def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
         """Return the states (2, models) that sweeps through the span leave, from either side."""
@@ -122,7 +135,7 @@ def d() -> Declaration:
         r"d",
         "piezoelectric coefficient",
         # A drive that is small for the loop shows d - α, which may be half of d.
-        lambda known: lognormal(1.6 * known.ranges.gain, 0.6),
+        lambda context: lognormal(1.6 * context.ranges.gain, 0.6),
         floor=0.0,
         bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
         loop=True,
@@ -137,7 +150,7 @@ def alpha() -> Declaration:
         "um/V",
         r"\alpha",
         "hysteretic displacement per volt at h = 0",
-        lambda known: lognormal(0.7 * known.ranges.gain, 1.0),
+        lambda context: lognormal(0.7 * context.ranges.gain, 1.0),
         floor=0.0,
         bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
         stated_bounds="0 < alpha < d",
@@ -156,14 +169,14 @@ def below_d(column: Values) -> BoolArray:
     return inside
 
 
-def beta(part: float = 1.0, bounds: Bounds | None = None) -> Declaration:
-    """Declare β, near 1/U or a ``part`` of it, where other parameters' bounds favour a large β."""
+def beta(scale: float = 1.0, bounds: Bounds | None = None) -> Declaration:
+    """Declare β, near 1/U or a ``scale`` of it, where other parameters' bounds favour a large β."""
     return Declaration(
         "beta",
         "1/V",
         r"\beta",
         "hysteresis loop shape",
-        lambda known: lognormal(part / known.ranges.voltage, 2.3),
+        lambda context: lognormal(scale / context.ranges.voltage, 2.3),
         floor=0.0,
         bounds=bounds,
         loop=True,
@@ -177,7 +190,7 @@ def initial() -> Declaration:
         "um",
         r"h_0",
         "hysteretic displacement at the first sample",
-        lambda known: normal(0.0, 0.3 * known.ranges.reach),
+        lambda context: normal(0.0, 0.3 * context.ranges.reach),
         bounds=below_ceiling,
         scope="record",
         aliases=("h0",),

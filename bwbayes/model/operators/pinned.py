@@ -66,7 +66,7 @@ class Pinned(OneState, Solver):
                 "um/V",
                 r"d",
                 "slope of the displacement without hysteresis, at zero volts",
-                lambda known: lognormal(1.2 * known.ranges.gain, 0.6),
+                lambda context: lognormal(1.2 * context.ranges.gain, 0.6),
                 floor=0.0,
                 loop=True,
                 aliases=("gain", "d33"),
@@ -76,7 +76,7 @@ class Pinned(OneState, Solver):
                 "um",
                 r"P_s",
                 "displacement at saturation",
-                lambda known: lognormal(4.0 * known.ranges.reach, 1.0),
+                lambda context: lognormal(4.0 * context.ranges.reach, 1.0),
                 floor=0.0,
                 loop=True,
             ),
@@ -97,7 +97,7 @@ class Pinned(OneState, Solver):
                 "V",
                 r"k",
                 "voltage by which pinned walls lag behind",
-                lambda known: lognormal(0.25 * known.ranges.voltage, 1.0),
+                lambda context: lognormal(0.25 * context.ranges.voltage, 1.0),
                 floor=0.0,
                 bounds=self._pinning_bounds,
                 stated_bounds=f"at least {WEAKEST:g} of the field's scale",
@@ -137,9 +137,9 @@ class Pinned(OneState, Solver):
         weak = column["pinning"] < (1 - 1e-9) * WEAKEST * self.walls(column).field
         demand = f"must be at least {WEAKEST:g} of saturation/d, the voltage that saturates"
         refuse(column, "pinning", weak, demand)
-        most = (1 + 1e-9) * self.walls(column).lag
+        bound = (1 + 1e-9) * self.walls(column).lag
         demand = "must lie within pinning d (1 - coupling) of zero"
-        refuse(column, "initial", np.abs(column["initial"]) > most, demand)
+        refuse(column, "initial", np.abs(column["initial"]) > bound, demand)
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return U/k."""
@@ -182,9 +182,9 @@ class Pinned(OneState, Solver):
         P = P_an − (1 − c) (P_an − P_irr), so that P_an is what all walls would do in another field.
         """
         walls = self.walls(column)
-        whole = walls._replace(reversible=np.ones_like(behind))
+        reversible = walls._replace(reversible=np.ones_like(behind))
         elsewhere = voltage - walls.coupling * (1 - walls.reversible) * behind
-        return self.at_rest(whole, np.zeros_like(behind), elsewhere) - behind
+        return self.at_rest(reversible, np.zeros_like(behind), elsewhere) - behind
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
@@ -223,5 +223,5 @@ class Pinned(OneState, Solver):
 def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
     if not {"d", "coupling", "pinning"} <= set(earlier):
         return -np.inf, np.inf
-    most = earlier["pinning"] * earlier["d"] * (1 - earlier["coupling"])
-    return -most, most
+    bound = earlier["pinning"] * earlier["d"] * (1 - earlier["coupling"])
+    return -bound, bound

@@ -8,9 +8,11 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -18,25 +20,27 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Context, Declaration, Values, lognormal, rounded
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
+from bwbayes.model.elementwise import anywhere, gone, select
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
+from bwbayes.model.step import HysteresisStep
 
 __all__ = [
     "SLOPE",
-    "Lines",
+    "InParallel",
     "Plays",
+    "PlaysStep",
     "PrandtlIshlinskii",
     "checked_thresholds",
-    "lines_branch",
     "numbered",
     "of_gain",
-    "plays_lines",
     "threshold_volts",
 ]
 
 
-def of_gain(part: float, sigma: float) -> Callable[[Context], Distribution]:
+def of_gain(scale: float, sigma: float) -> Callable[[Context], Distribution]:
     """Return a lognormal default prior whose median is a part of Y/U."""
-    return lambda context: lognormal(part * context.ranges.gain, sigma)
+    return lambda context: lognormal(scale * context.ranges.gain, sigma)
 
 
 SLOPE = Declaration(
@@ -97,25 +101,44 @@ class PrandtlIshlinskii(RemembersExtrema):
             INITIAL,
         )
 
-    def branch(self, column: Values) -> Branch:
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d + α, 2 α r₀ and 2 r₀."""
+        width = 2 * column["threshold"]
+        return np.column_stack([column["d"] + column["alpha"], column["alpha"] * width, width])
+
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
         """Return E = 2 Φ(|u − u_r| / 2)."""
-        steepest = (column["d"] + column["alpha"])[:, np.newaxis]
-        width = 2 * column["threshold"][:, np.newaxis]
-        short = column["alpha"][:, np.newaxis] * width
+        travel = np.abs(voltage - start)
+        return numbers[0] * travel - numbers[1] * gone(travel / numbers[2])
 
-        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
-            travel = np.abs(voltage - start)
-            moved: FloatArray = travel / -width
-            np.expm1(moved, out=moved)
-            moved *= short
-            moved += steepest * travel
-            return moved
 
-        return everett
+class InParallel(RemembersExtrema):
+    """Plays in parallel: E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0)."""
+
+    @abstractmethod
+    def step(self, column: Values) -> PlaysStep:
+        """Return the plays."""
+
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d, all weights and all thresholds."""
+        return self.step(column).parameters
+
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
+        """Return E, whose thresholds rise."""
+        travel, plays = np.abs(voltage - start), (len(numbers) - 1) // 2
+        moved = numbers[0] * travel
+        for j in range(plays):
+            beyond = travel - 2.0 * numbers[1 + plays + j]
+            if not anywhere(beyond > 0.0):
+                break
+            moved = moved + numbers[1 + j] * np.maximum(beyond, 0.0)
+        return moved
 
 
 @dataclass(frozen=True)
-class Plays(RemembersExtrema):
+class Plays(InParallel):
     """Plays with given thresholds r_j, V, and a weight w_j, um/V, for each.
 
     ::
@@ -152,13 +175,92 @@ class Plays(RemembersExtrema):
         """d, the weights, the largest threshold if it is not given, and the start."""
         return (SLOPE, *numbered(self.thresholds, "weight", "w", "of play"), INITIAL)
 
-    def branch(self, column: Values) -> Branch:
-        """Return E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0)."""
-        return lines_branch(self.lines(column))
+    def step(self, column: Values) -> PlaysStep:
+        """Return the plays."""
+        return PlaysStep.of(self.thresholds, "weight", column["d"], column)
 
-    def lines(self, column: Values) -> Lines:
-        """Return the lines that E is made of."""
-        return plays_lines(self.thresholds, "weight", column["d"], column)
+
+@dataclass(frozen=True)
+class PlaysStep(HysteresisStep):
+    """w = d u + Σ w_j z_j with plays z_j = max(u − r_j, min(u + r_j, z_j)); the memory are these.
+
+    Parameters
+    ----------
+    slope
+        d, (models,), um/V.
+    weights
+        w_j, (models, plays), um/V.
+    thresholds
+        r_j, (models or 1, plays), V.
+    """
+
+    slope: FloatArray
+    weights: FloatArray
+    thresholds: FloatArray
+
+    @classmethod
+    def of(
+        cls, thresholds: int | tuple[float, ...], name: str, slope: FloatArray, column: Values
+    ) -> PlaysStep:
+        """Return plays with weights of a name, and the ``slope`` of the rest (models,), um/V."""
+        volts = threshold_volts(thresholds, column)
+        weights = np.stack([column[f"{name}_{j + 1}"] for j in range(volts.shape[1])], axis=1)
+        return cls(slope, weights, volts)
+
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """d, all weights, and all thresholds."""
+        volts = np.broadcast_to(self.thresholds, self.weights.shape)
+        return np.column_stack([self.slope, self.weights, volts])
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return w, and the slope d + Σ w_j of those plays that are moved."""
+        slope, plays = parameters[0], len(memory)
+        w = slope * voltage
+        for j in range(plays):
+            weight, threshold = parameters[1 + j], parameters[1 + plays + j]
+            play = np.maximum(voltage - threshold, np.minimum(voltage + threshold, memory[j]))
+            slope = slope + select(play != memory[j], weight, 0.0)
+            w = w + weight * play
+            after[j] = play
+        return w, slope
+
+    def demagnetised(self) -> FloatArray:
+        """Return all plays at zero, (models, plays)."""
+        return np.zeros_like(self.weights)
+
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return where the extrema that count, and the voltage, have left the plays."""
+        ends = [
+            extremum.voltage if extremum.own is None else extremum.own
+            for extremum in memory.extrema
+        ]
+        return self._led(*ends, memory.voltage)
+
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:
+        """Return the plays after a drive through the span, as the operators begin."""
+        low, high = np.minimum(span.low, voltage), np.maximum(span.high, voltage)
+        return self._led(high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage)
+
+    def _led(self, *ends: float | FloatArray) -> FloatArray:
+        """Return where a voltage that goes to each of its ends leaves demagnetised plays."""
+        plays = self.demagnetised()
+        for voltage in ends:
+            plays = self.go(plays, np.broadcast_to(voltage, self.slope.shape)).memory
+        return plays
+
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
+        """Return d, and d + Σ w_j."""
+        return self.slope, self.slope + self.weights.sum(axis=1)
+
+    def coefficients(self) -> dict[str, tuple[Any, str]]:
+        """Return d, the weights and the thresholds."""
+        return {
+            "d": (float(self.slope[0]), "um/V"),
+            "weights": (self.weights[0].tolist(), "um/V"),
+            "thresholds": (self.thresholds[0].tolist(), "V"),
+        }
 
 
 def checked_thresholds(thresholds: int | Sequence[float]) -> int | tuple[float, ...]:
@@ -219,47 +321,3 @@ def threshold_volts(thresholds: int | tuple[float, ...], column: Values) -> Floa
     if last.size and (last == last[0]).all():
         last = last[:1]
     return last[:, np.newaxis] * (np.arange(1, thresholds + 1) / (thresholds + 1))
-
-
-class Lines(NamedTuple):
-    """What a branch of plays is between two thresholds: a straight line in its length v.
-
-    ``corners`` are 2 r_j, V, (models, plays), or (1, plays) if all are alike; from as many corners
-    on, the branch is ``steepness`` v + ``level``, um/V and um, both (models, plays + 1).
-    """
-
-    corners: FloatArray
-    steepness: FloatArray
-    level: FloatArray
-
-
-def plays_lines(
-    thresholds: int | tuple[float, ...], name: str, slope: FloatArray, column: Values
-) -> Lines:
-    """Return the lines d v + Σ w_j max(v − 2 r_j, 0), for a ``slope`` d (models,), um/V."""
-    corners = 2 * threshold_volts(thresholds, column)
-    weights = np.stack([column[f"{name}_{j + 1}"] for j in range(corners.shape[1])], axis=1)
-    return Lines(
-        corners,
-        steepness=np.cumsum(np.column_stack([slope, weights]), axis=1),
-        level=np.cumsum(np.column_stack([np.zeros_like(slope), -weights * corners]), axis=1),
-    )
-
-
-def lines_branch(lines: Lines) -> Branch:
-    """Return the Everett function of lines; it costs the same whatever the number of plays."""
-    corners, steepness, level = lines
-    rows = np.arange(len(steepness))[:, np.newaxis]
-
-    def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
-        travel = np.atleast_2d(np.abs(voltage - start))
-        if len(corners) == 1:
-            passed = np.searchsorted(corners[0], travel)
-        else:
-            passed = sum(travel > corner[:, np.newaxis] for corner in corners.T)
-        moved: FloatArray = steepness[rows, passed]
-        moved *= travel
-        moved += level[rows, passed]
-        return moved
-
-    return everett

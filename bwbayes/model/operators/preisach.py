@@ -9,26 +9,20 @@ model; loops of the same size at another mean voltage are not, unlike in Prandtl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, lognormal
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operators.memory import INITIAL, Branch, RemembersExtrema
+from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.elementwise import gone
+from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 
 __all__ = ["DENSITY", "Preisach"]
 
-
-def _rayleigh_prior(context: Context) -> Distribution:
-    ranges = context.ranges
-    return lognormal(0.4 * ranges.gain / ranges.voltage, 1.0)
-
-
-def _saturation_prior(context: Context) -> Distribution:
-    ranges = context.ranges
-    return lognormal(2 * (ranges.voltage + abs(ranges.bias)), 1.0)
+# Beyond this 2 u / u_s no relays are left: tanh is one to machine precision.
+SATURATED = 40.0
 
 
 DENSITY = (
@@ -37,7 +31,7 @@ DENSITY = (
         unit="um/V^2",
         label=r"\alpha_R",
         description="growth of the slope with the length of a branch, about zero volts",
-        default=_rayleigh_prior,
+        default=lambda context: lognormal(0.4 * context.ranges.gain / context.ranges.voltage, 1.0),
         floor=0.0,
         reaches_floor=True,
         loop=True,
@@ -47,7 +41,9 @@ DENSITY = (
         unit="V",
         label="u_s",
         description="voltage beyond which relays become rare",
-        default=_saturation_prior,
+        default=lambda context: lognormal(
+            2 * (context.ranges.voltage + abs(context.ranges.bias)), 1.0
+        ),
         floor=0.0,
         loop=True,
     ),
@@ -79,18 +75,15 @@ class Preisach(RemembersExtrema):
         """d, the density's α_R and u_s, and the start."""
         return (SLOPE, *DENSITY, INITIAL)
 
-    def branch(self, column: Values) -> Branch:
-        """Return E of the start and the voltage."""
-        slope = column["d"][:, np.newaxis]
-        scale = column["saturation"][:, np.newaxis]
-        height = column["rayleigh"][:, np.newaxis] / 2 * scale**2
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d, α_R u_s² / 2 and 2 / u_s."""
+        scale = column["saturation"]
+        return np.column_stack([column["d"], column["rayleigh"] / 2 * scale**2, 2 / scale])
 
-        def everett(start: float | FloatArray, voltage: FloatArray) -> FloatArray:
-            moved: FloatArray = np.tanh(voltage / scale)
-            moved -= np.tanh(start / scale)
-            moved *= moved
-            moved *= height
-            moved += slope * np.abs(voltage - start)
-            return moved
-
-        return everett
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
+        """Return E, by tanh x − tanh y = 2 (g − h) / ((2 − g) (2 − h)) with g = 1 − exp(−2x)."""
+        risen = gone(np.minimum(np.maximum(numbers[2] * voltage, -SATURATED), SATURATED))
+        rose = gone(np.minimum(np.maximum(numbers[2] * start, -SATURATED), SATURATED))
+        difference = 2.0 * (risen - rose) / ((2.0 - risen) * (2.0 - rose))
+        return numbers[0] * np.abs(voltage - start) + numbers[1] * difference * difference

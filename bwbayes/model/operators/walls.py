@@ -117,13 +117,13 @@ class Solver(ABC):
         moving = np.flatnonzero(since < u[-1])
         if moving.size == 0:
             return along[:, 1:], fixed
-        some = walls.rows(moving)
-        part, begin = along[moving], since[moving]
-        start = self.at_rest(some, fixed[moving], begin)
-        end = self._move(some, begin, start, u, part)
-        along[moving] = part
+        movers = walls.rows(moving)
+        path, begin = along[moving], since[moving]
+        start = self.at_rest(movers, fixed[moving], begin)
+        end = self._move(movers, begin, start, u, path)
+        along[moving] = path
         after = fixed.copy()
-        after[moving] = self._irreversible(some, end, float(u[-1]))
+        after[moving] = self._irreversible(movers, end, float(u[-1]))
         return along[:, 1:], after
 
     def at_rest(self, walls: Walls, fixed: FloatArray, u: FloatArray) -> FloatArray:
@@ -156,9 +156,9 @@ class Solver(ABC):
 
     def _slope(self, walls: Walls, u: FloatArray, p: FloatArray) -> FloatArray:
         """Return f = dP/du (models,) while walls move forward under a rising voltage."""
-        ws, e0, a, k, c, most, _ = walls
+        ws, e0, a, k, c, lag_limit, _ = walls
         level, slope = self.curve((u + a * p) / e0)
-        behind = np.clip((ws * level - p) / (1 - c), 0.0, most)
+        behind = np.clip((ws * level - p) / (1 - c), 0.0, lag_limit)
         slope = slope * ws / e0
         forward: FloatArray = (c * slope + (1 - c) * behind / (k - a * behind)) / (
             1 - a * c * slope
@@ -169,17 +169,17 @@ class Solver(ABC):
         self, walls: Walls, u: FloatArray, p: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return f, f_u and f_p (models,)."""
-        ws, e0, a, k, c, most, _ = walls
+        ws, e0, a, k, c, lag_limit, _ = walls
         y = (u + a * p) / e0
         level, slope = self.curve(y)
         bend = self.bend(y, level, slope) * ws / e0**2
-        behind = np.clip((ws * level - p) / (1 - c), 0.0, most)
+        behind = np.clip((ws * level - p) / (1 - c), 0.0, lag_limit)
         slope = slope * ws / e0
-        rest, moving = 1 - a * c * slope, k - a * behind
-        forward = (c * slope + (1 - c) * behind / moving) / rest
+        feedback, moving = 1 - a * c * slope, k - a * behind
+        forward = (c * slope + (1 - c) * behind / moving) / feedback
         # How f grows as walls lag further behind P_an.
-        pull = k / (moving**2 * rest)
-        along = c * (1 + a * forward) / rest * bend + pull * slope
+        pull = k / (moving**2 * feedback)
+        along = c * (1 + a * forward) / feedback * bend + pull * slope
         return forward, along, a * along - pull
 
     def _move(
@@ -200,28 +200,28 @@ class Solver(ABC):
         step = FIRST * (walls.pinning - walls.coupling * walls.lag)
         rows = np.arange(u.size)
         while rows.size:
-            some = walls.rows(rows)
+            subset = walls.rows(rows)
             at, now = u[rows], p[rows]
-            away = np.abs(at + some.coupling * now) / (1 + some.coupling * some.slope)
-            most = np.maximum(FARTHEST * away / some.field, 1.0)
-            notch = np.floor(NOTCHES * np.log2(np.minimum(step[rows] / some.field, most)))
-            best = some.field * np.exp2(notch / NOTCHES)
+            away = np.abs(at + subset.coupling * now) / (1 + subset.coupling * subset.slope)
+            largest = np.maximum(FARTHEST * away / subset.field, 1.0)
+            notch = np.floor(NOTCHES * np.log2(np.minimum(step[rows] / subset.field, largest)))
+            best = subset.field * np.exp2(notch / NOTCHES)
             last = best >= end - at
             h = np.where(last, end - at, best)
-            slope, drift, own = self._slopes(some, at, now)
-            shifted, stages = 1 / (SHIFT * h) - own, list[FloatArray]()
+            slope, drift, jacobian = self._slopes(subset, at, now)
+            shifted, stages = 1 / (SHIFT * h) - jacobian, list[FloatArray]()
             for stage in range(STAGES):
                 if stage > 0:
                     near = now + _weighted(WEIGHTS[stage], stages)
-                    slope = self._slope(some, at + PLACES[stage] * h, near)
+                    slope = self._slope(subset, at + PLACES[stage] * h, near)
                 coupled = _weighted(COUPLINGS[stage], stages) / h
                 stages.append((slope + DRIFTS[stage] * h * drift + coupled) / shifted)
             change = _weighted(END, stages)
-            inner = [_weighted(one, stages) for one in BETWEEN]
+            inner = [_weighted(weights, stages) for weights in BETWEEN]
             # In between it is as good as the slope in the middle says that it is.
-            middle = now + 0.5 * change + 0.25 * (inner[0] + 0.5 * (inner[1] + 0.5 * inner[2]))
+            midpoint = now + 0.5 * change + 0.25 * (inner[0] + 0.5 * (inner[1] + 0.5 * inner[2]))
             off = (
-                self._slope(some, at + 0.5 * h, middle)
+                self._slope(subset, at + 0.5 * h, midpoint)
                 - (change + 0.25 * (inner[1] + inner[2])) / h
             )
             error = np.maximum(np.abs(stages[-1]), np.abs(off / shifted)) / scale[rows]
@@ -239,8 +239,8 @@ class Solver(ABC):
 def _weighted(weights: FloatArray, stages: list[FloatArray]) -> FloatArray:
     """Return the weighted sum of stages (models,), term by term, so that no row sees another."""
     total = np.zeros(())
-    for weight, one in zip(weights, stages, strict=False):
-        total = total + weight * one
+    for weight, stage in zip(weights, stages, strict=False):
+        total = total + weight * stage
     return total
 
 
@@ -258,7 +258,7 @@ def _fill(
     counts = high - low
     which = np.repeat(np.arange(rows.size), counts)
     column = np.arange(which.size) - np.repeat(np.cumsum(counts) - counts - low, counts)
-    part = (points[column] - first[which]) / (last - first)[which]
+    fraction = (points[column] - first[which]) / (last - first)[which]
     change, *inner = (term[which] for term in terms)
-    between = (1 - part) * (inner[0] + part * (inner[1] + part * inner[2]))
-    along[rows[which], column] = start[which] + part * (change + between)
+    between = (1 - fraction) * (inner[0] + fraction * (inner[1] + fraction * inner[2]))
+    along[rows[which], column] = start[which] + fraction * (change + between)

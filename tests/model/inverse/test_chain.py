@@ -171,37 +171,6 @@ def test_without_dynamics_the_inverse_is_a_search_for_each_sample() -> None:
     np.testing.assert_allclose(computed, expected, atol=1e-8)
 
 
-def test_a_piece_goes_on_from_the_state_of_the_one_before() -> None:
-    """Two pieces of a reference, the second from the state that the first one leaves."""
-    creep = Creep((0.1, 1.0))
-    actuator = Actuator("lag", "first", 1e-3, creep=creep, span=SPAN)
-    theta, reference = theta_of(actuator), smooth()
-    whole = inverse(actuator, theta, reference, from_rest=True)[0]
-    _, state = actuator.advance(theta, whole[:200], from_rest=True)
-    rest = inverse(actuator, theta, reference[200:], state)[0]
-    np.testing.assert_allclose(rest, whole[200:], atol=1e-8)
-
-
-def test_models_of_a_batch_are_inverted_alone() -> None:
-    """A batch gives each model what it gets alone, from a state of all of them too."""
-    actuator = Actuator(
-        "lag", "first", 1e-3, made("hysteresis", "plays", HYSTERESIS, {}), span=SPAN
-    )
-    known = {f"weight_{i}": 0.04 for i in range(1, 11)}
-    theta = np.array(
-        [
-            [{**TABLE_1, **known, "threshold": 80.0, "d": d}[name] for name in actuator.parameters]
-            for d in (0.3, 0.4, 0.5)
-        ]
-    )
-    _, state = actuator.advance(theta, decaying_sine(100), from_rest=True)
-    together = inverse(actuator, theta, smooth(), state)
-    for row in range(3):
-        _, alone = actuator.advance(theta[row], decaying_sine(100), from_rest=True)
-        one = inverse(actuator, theta[row], smooth(), alone)[0]
-        np.testing.assert_allclose(together[row], one, atol=1e-9)
-
-
 SYMMETRIC = ("bouc-wen", "backlash-like", "plays", "preisach", "prandtl-ishlinskii", "maxwell-slip")
 
 

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse import together as side
 from bwbayes.model.inverse.chain import inverse
@@ -111,20 +110,6 @@ def test_every_actuator_goes_on_from_where_it_stands(name: str, hold: Hold) -> N
         again = actuator.advance(theta[row], made[row], its)[0][0]
         bound = CLOSE * np.ptp(asked)
         np.testing.assert_allclose(again[late:], asked[row, late:], rtol=0, atol=bound)
-
-
-@pytest.mark.parametrize("hold", ["first", "zero"])
-@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
-@pytest.mark.parametrize("creep", [cases.CREEP, cases.GROWING], ids=["creep", "growing creep"])
-def test_creep_is_undone_as_alone(hold: Hold, dynamics: str, creep: Creep) -> None:
-    """Sample by sample what one model undoes in rounds."""
-    actuator = Actuator(dynamics, hold, 1e-3, creep=creep, span=SPAN)
-    theta = cases.theta(actuator, side.MANY)
-    asked = smooth(120)
-    made = side_by_side(actuator, theta, asked)
-    for row in (0, 9):
-        alone = inverse(actuator, theta[row], asked)[0]
-        np.testing.assert_allclose(made[row], alone, rtol=0, atol=CLOSE * np.ptp(alone))
 
 
 def test_a_spring_that_is_sampled_fast_is_not_undone_sample_by_sample() -> None:

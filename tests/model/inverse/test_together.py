@@ -20,7 +20,6 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.together import MANY
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.one_state import StateMemory
 from tests.control import cases
@@ -99,22 +98,6 @@ def test_side_by_side_as_alone(hold: Hold, dynamics: str, from_rest: bool) -> No
         # A held voltage acts one sample later; the second sample cannot be chosen.
         late = 2 if not from_rest or dynamics != "none" else 0
         assert np.max(np.abs(made - asked)[late:]) < CLOSE * np.ptp(asked)
-
-
-def test_backlash_like_and_a_piece_that_goes_on() -> None:
-    """Another operator of the kind, and a state with as many models, on references of their own."""
-    actuator = Actuator("lag", "first", 1e-3, BacklashLike(), span=SPAN)
-    theta = scattered(actuator)
-    # Without γ, h is twice as steep after a turn as at zero.
-    columns = actuator.columns(theta)
-    columns["alpha"][:] = np.minimum(columns["alpha"], 0.45 * columns["d"])
-    asked = smooth() * np.linspace(0.5, 1.0, len(theta))[:, np.newaxis]
-    _, state = actuator.advance(theta, np.linspace(0.0, 20.0, 50), from_rest=True)
-    together = side_by_side(actuator, theta, asked, state)
-    for row, one in enumerate(theta[:5]):
-        _, its = actuator.advance(one, np.linspace(0.0, 20.0, 50), from_rest=True)
-        alone = inverse(actuator, one, asked[row], its)[0]
-        np.testing.assert_allclose(together[row], alone, atol=CLOSE * np.ptp(alone))
 
 
 def test_steps_as_large_as_the_range_against_a_search() -> None:
@@ -228,20 +211,3 @@ def test_models_whose_gain_turns_back_are_told() -> None:
     for row in rows:
         reached = actuator.displacement(again[row], made[row], from_rest=True)[0]
         np.testing.assert_allclose(reached, drive[row], rtol=0, atol=CLOSE * 90)
-
-
-def test_models_that_are_not_followed_are_told() -> None:
-    """Where the drive falls with the voltage: the others go on, and none of them is disturbed."""
-    actuator = Actuator("none", span=SPAN)
-    theta = scattered(actuator, 4)
-    columns = actuator.columns(theta)
-    columns["initial"][:] = 0.0
-    columns["d"][1] = 0.9 * columns["alpha"][1]
-    drive = np.tile(smooth(150), (4, 1))
-    made, right = followed(actuator.hysteresis, columns, np.zeros(4), drive)
-    assert [True, False, True, True] == right.tolist()
-    columns["offset"][:] = 0.0
-    some = np.column_stack([columns[name] for name in actuator.parameters])[right]
-    for voltage, one in zip(made[right], some, strict=True):
-        alone = inverse(actuator, one, drive[0], from_rest=True)[0]
-        np.testing.assert_allclose(voltage, alone, rtol=0, atol=CLOSE * np.ptp(alone))

@@ -123,7 +123,9 @@ def prior_draws(operator: Operator, size: int, seed: int) -> dict[str, FloatArra
     column: dict[str, FloatArray] = {}
     for declared in operator.parameters:
         prior = declared.default(known)
-        assert isinstance(prior, Distribution)
+        if not isinstance(prior, Distribution):
+            column[declared.name] = np.full(size, prior)
+            continue
         least, most = prior.support
         low, high = np.full(size, max(least, declared.floor)), np.full(size, most)
         if declared.bounds is not None:

@@ -7,7 +7,6 @@ import pytest
 
 from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.operators.backlash_like import BacklashLike
-from bwbayes.model.operators.duhem import Duhem
 from tests.model.operators.differential import by_integration, paths, single, w_of
 from tests.model.references import assert_close
 
@@ -30,11 +29,3 @@ def test_is_bouc_wen_without_gamma(name: str) -> None:
     h = hysteresis(voltage, MODEL["alpha"], MODEL["beta"], 0.0, initial=MODEL["initial"])
     got = w_of(BacklashLike(), single(**MODEL), voltage)
     np.testing.assert_array_equal(got, MODEL["d"] * voltage - h)
-
-
-@pytest.mark.parametrize("name", paths())
-def test_is_duhem_with_constant_slopes(name: str) -> None:
-    voltage = paths()[name]
-    expected = w_of(BacklashLike(), single(**MODEL), voltage)
-    got = w_of(Duhem(), single(**MODEL, d3=0.0, alpha2=0.0), voltage)
-    assert_close(expected, got, 1e-13)

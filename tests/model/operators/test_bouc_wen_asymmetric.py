@@ -130,14 +130,6 @@ def test_h_stays_within_its_ceilings_and_gets_near_them() -> None:
     assert (np.min(h, axis=1) < 0.99 * low)[near].all()
 
 
-def test_an_asymmetric_loop_is_not_symmetric() -> None:
-    voltage = 60 * np.sin(np.linspace(0, 20 * np.pi, 4001))
-    model = {**PLAIN, **NO_TERMS, "gamma": 0.0, "b5": 0.4}
-    h = model["d"] * voltage - w_of(BoucWenAsymmetric(), single(**model), voltage)[0]
-    last = h[-401:]
-    assert abs(last.max() + last.min()) > 0.1 * np.ptp(last)
-
-
 def test_refuses_unknown_terms_and_parameters_by_name() -> None:
     with pytest.raises(InputError, match="terms: 'b7' is unknown"):
         BoucWenAsymmetric(terms=("b7",))

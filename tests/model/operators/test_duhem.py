@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.errors import InputError
-from bwbayes.model.operators.duhem import Duhem, phi_functions
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.relaxing import phi_functions
 from tests.model.operators.differential import by_integration, paths, single, w_of
 from tests.model.references import assert_close
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.conflict import conflicts
 from bwbayes.errors import InputError
-from bwbayes.inference.conflict import conflicts
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -121,12 +121,12 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
     identity = np.eye(mode.size)
     point = PointFit(mode, identity, 0.0, mode[np.newaxis], identity)
     column = of.table.columns(of.prior.theta(draws))
-    remarks = [
-        *identifiability.remarks(of, point, draws),
+    findings = [
+        *identifiability.undetermined(of, point, draws),
         *conflicts(of.prior, draws, {}),
         *of.only.actuator.hysteresis.remarks(column, of.names),
     ]
-    assert all(isinstance(text, str) and text for text in remarks)
+    assert all(str(finding) for finding in findings)
 
 
 def assert_fitted(of: Posterior) -> None:

@@ -187,14 +187,6 @@ def test_pieces_do_not_matter(
 
 
 @every_case
-def test_small_expressions_do_not_matter(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    voltage = walk(8)
-    whole = run(case.operator, case.column, voltage, SPANS[0])
-    monkeypatch.setattr("bwbayes.model.operators.memory.PIECE", 13)
-    np.testing.assert_array_equal(whole, run(case.operator, case.column, voltage, SPANS[0]))
-
-
-@every_case
 @settings(max_examples=15, deadline=None)
 @given(voltage=paths, span=spans)
 def test_a_model_does_not_feel_its_neighbours(
@@ -295,13 +287,6 @@ def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
     got = run(case.operator, case.column, path_down, None)
     first = run(case.operator, case.column, np.array([0.0, min(travel, top) / 2]), None)
     np.testing.assert_allclose(got[:, -2] - got[:, -1], 2 * first[:, -1], rtol=0, atol=1e-11)
-
-
-def test_preisach_does_not_obey_masing() -> None:
-    case = CASES["preisach"]
-    got = run(case.operator, case.column, np.array([0.0, 120.0, 20.0]), None)
-    first = run(case.operator, case.column, np.array([0.0, 50.0]), None)
-    assert np.min(np.abs(got[:, 1] - got[:, 2] - 2 * first[:, 1])) > 1.0
 
 
 @every_case
@@ -450,16 +435,6 @@ def test_ramps_of_no_width_are_relays() -> None:
     column = rows(**BELLS, width=0.0, initial=INITIALS)
     relays = run(Preisach(), column, voltage, SPANS[0])
     assert_close(relays, run(KrasnoselskiiPokrovskii(), column, voltage, SPANS[0]), 1e-13)
-
-
-def test_one_play_of_its_own_threshold_for_each_model() -> None:
-    voltage = walk(11)
-    column = rows(**EVEN, initial=INITIALS)
-    column["threshold"] = np.linspace(10.0, 90.0, 6)
-    together = run(Plays(4), column, voltage, SPANS[0])
-    for row in range(6):
-        one = {name: values[row : row + 1] for name, values in column.items()}
-        np.testing.assert_array_equal(together[row], run(Plays(4), one, voltage, SPANS[0])[0])
 
 
 @pytest.mark.parametrize("saturation", [1e-1, 1.0, 1e2, 1e4])

@@ -66,16 +66,6 @@ def assert_near(operator: OneState, expected: FloatArray, got: FloatArray) -> No
 
 
 @every
-def test_declares_its_parameters(name: str) -> None:
-    declared = OPERATORS[name].parameters
-    assert declared[-1].name == "initial"
-    assert [one.scope for one in declared] == ["actuator"] * (len(declared) - 1) + ["record"]
-    assert all(one.unit and one.label and one.description for one in declared)
-    assert all(one.loop for one in declared[:-1])
-    assert len({one.name for one in declared}) == len(declared)
-
-
-@every
 def test_draws_of_the_default_priors_have_displacements_of_the_right_size(name: str) -> None:
     """The median range of w is within a factor of three of the record's, as is d's of a tenth."""
     operator = OPERATORS[name]
@@ -108,19 +98,6 @@ def finite(operator: OneState, column: dict[str, FloatArray]) -> None:
     voltage = np.array([-40.0, 60.0, 60.0, -39.99, 60.0, 1e-3, 0.0])
     assert np.isfinite(w_of(operator, column, voltage)).all()
     assert np.isfinite(operator.gain(column, SPAN)).all()
-
-
-@every
-@few
-@given(path=corners, seed=st.integers(0, 9), cuts=st.lists(st.integers(0, 8), max_size=4))
-def test_pieces_of_any_length_are_the_whole(
-    name: str, path: list[float], seed: int, cuts: list[int]
-) -> None:
-    operator = OPERATORS[name]
-    column, voltage = models(operator, 3, seed), np.array(path)
-    pieces = sorted({1 + cut for cut in cuts if 1 + cut < voltage.size})
-    whole = w_of(operator, column, voltage)
-    assert_near(operator, whole, w_of(operator, column, voltage, pieces))
 
 
 @every

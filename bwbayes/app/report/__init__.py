@@ -1,1 +1,0 @@
-"""The pages: what a run, a check or a calibration has to say, in one HTML file each."""

@@ -1,0 +1,234 @@
+"""A design: candidates for the next record, ranked by what each would leave, and what is shown.
+
+The numbers are those of :func:`~bwbayes.comparison.design.promises`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import overload
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Picture,
+    Report,
+    Section,
+    Table,
+    TableColumn,
+    kind_of,
+    remarks_banner,
+    standing_banner,
+)
+from bwbayes.results.standing import Standing
+from bwbayes.shown import brief
+
+__all__ = ["Design", "Promise"]
+
+# Standard errors of a difference below which two promises are not told apart.
+SURE = 2.0
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a candidate promises.
+
+    Attributes
+    ----------
+    name
+        The candidate's name.
+    left
+        The part of the standard deviation that would be left: of the parameter, or of the
+        parameter band's mean width along the chosen drive; nan if it is refused.
+    error
+        Its Monte Carlo error.
+    refused
+        Why the amplifier cannot make it; empty if it can.
+    """
+
+    __repr__ = brief
+
+    name: str
+    left: float
+    error: float
+    refused: str = ""
+
+
+@dataclass(frozen=True)
+class Design(Sequence[Promise]):
+    """What to measure next, from a run: a sequence of its promises.
+
+    Attributes
+    ----------
+    run
+        The name of the run that is started from.
+    parameter, drive
+        What is to be known better: a parameter, or the band along a drive of that name.
+    amplifier
+        What can be driven.
+    signals
+        The candidates' voltages (samples,) by name, V.
+    interval
+        Their sampling interval, s.
+    standing
+        How the validation of the run came out.
+    promises
+        What each candidate promises, the best first; the first is not refused.
+    """
+
+    __repr__ = brief
+
+    run: str
+    parameter: str | None
+    drive: str | None
+    amplifier: Limits
+    signals: Mapping[str, FloatArray]
+    interval: float
+    standing: Standing
+    promises: Sequence[Promise]
+
+    @overload
+    def __getitem__(self, index: int) -> Promise: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Promise]: ...
+    def __getitem__(self, index: int | slice) -> Promise | Sequence[Promise]:
+        return self.promises[index]
+
+    def __len__(self) -> int:
+        return len(self.promises)
+
+    @property
+    def best(self) -> Promise:
+        """The best candidate."""
+        return self.promises[0]
+
+    @property
+    def left(self) -> str:
+        """What the promises are parts of, in words."""
+        if self.parameter is not None:
+            return f"sd left of {self.parameter}"
+        return f"width left of the band along {self.drive}"
+
+    @property
+    def alike(self) -> list[str]:
+        """The candidates that cannot be told apart from the best."""
+        best = self.best
+        return [
+            promise.name
+            for promise in self.promises[1:]
+            if promise.left - best.left < SURE * float(np.hypot(promise.error, best.error))
+        ]
+
+    def numbers(self) -> dict[str, object]:
+        """Return what ``design.json`` holds."""
+        return {
+            "validation": self.standing.numbers,
+            "target": self.parameter or self.drive or "",
+            "best": self.best.name,
+            "amplifier": asdict(self.amplifier),
+            "candidates": [asdict(promise) for promise in self.promises],
+        }
+
+    def report(self) -> Report:
+        """Return which signal teaches most, by how much, and what it looks like, to be shown."""
+        from bwbayes.report.figures.design import draw_promises, draw_signal  # noqa: PLC0415
+
+        best, amplifier = self.best, self.amplifier
+        feasible = [promise for promise in self.promises if not promise.refused]
+        remaining, error = (
+            np.array([getattr(promise, key) for promise in feasible]) for key in ("left", "error")
+        )
+        names = [promise.name for promise in feasible]
+        refused = [
+            f"{promise.name} {promise.refused}" for promise in self.promises if promise.refused
+        ]
+        lines = [f"{self.left} after one more record of it: {best.left:.1%} ± {best.error:.1%}"]
+        if self.alike:
+            lines.append(f"not to be told apart from it: {', '.join(self.alike)}")
+        limits = f"{amplifier.low:.4g} to {amplifier.high:.4g} V"
+        if np.isfinite(amplifier.rate):
+            limits += f", at most {amplifier.rate:.4g} V/s"
+        return Report(
+            title="What to measure next",
+            banners=[
+                *standing_banner(self.standing),
+                Banner(kind_of(self.standing), f"Best: {best.name}", lines),
+                *remarks_banner(refused, "What the amplifier cannot make"),
+            ],
+            blocks=[
+                self._table(),
+                Picture(
+                    "promises",
+                    "What each candidate would leave",
+                    "The part that is expected to be left after one more record, with two Monte "
+                    "Carlo errors to either side; at 100 % a signal teaches nothing new.",
+                    partial(draw_promises, names, remaining, error, self.left),
+                ),
+                Picture(
+                    "best",
+                    "The best signal",
+                    "Its voltage, as best.csv has it for the signal generator; dotted, the "
+                    "amplifier's limits.",
+                    partial(
+                        draw_signal,
+                        best.name,
+                        self.signals[best.name],
+                        self.interval,
+                        (amplifier.low, amplifier.high),
+                    ),
+                ),
+                Section(
+                    "Request",
+                    [
+                        Facts(
+                            [
+                                ("Run", self.run),
+                                ("To be known better", self.left.replace(" left", "")),
+                                ("Amplifier", limits),
+                                ("Sampling interval", f"{self.interval:g} s"),
+                            ]
+                        )
+                    ],
+                    folded=False,
+                ),
+            ],
+            numbers=self.numbers(),
+        )
+
+    def _table(self) -> Table:
+        rows = []
+        for promise in self.promises:
+            voltage = self.signals[promise.name]
+            fastest = float(np.max(np.abs(np.diff(voltage)))) / self.interval
+            rows.append(
+                (
+                    promise.name,
+                    "–" if promise.refused else f"{promise.left:.1%}",
+                    "–" if promise.refused else f"{promise.error:.1%}",
+                    f"{voltage.min():.4g} V",
+                    f"{voltage.max():.4g} V",
+                    f"{fastest:,.0f} V/s",
+                    f"{self.interval * voltage.size:.4g} s",
+                )
+            )
+        signal = (
+            TableColumn(title, on="page") for title in ("Lowest", "Highest", "Fastest", "Length")
+        )
+        return Table(
+            "candidates",
+            self.left.capitalize() if self.parameter is None else f"SD left of {self.parameter}",
+            ("Candidate", "Left", "Error", *signal),
+            rows,
+            records=[asdict(promise) for promise in self.promises],
+            note="The error is that of Monte Carlo. Expected from the posterior's draws, with the "
+            "model made linear in its parameters at each: what a new record with an offset of its "
+            "own would add. A stretch that a signal drives several times counts once, because what "
+            "the model is wrong about returns with it.",
+            on="both",
+        )

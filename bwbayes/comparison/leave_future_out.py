@@ -1,0 +1,273 @@
+"""Leave-future-out scores: how probable a model held later readings, given the earlier ones.
+
+Readings that follow one another are no independent votes. What a model is worth on a part of a
+record is the joint density of the part's readings, given all readings before: the noise model
+knows how each reading follows from the last, so that correlation is counted once. That density is
+a ratio of evidences, log p(later | earlier) = log Z(all) − log Z(earlier), and posteriors that
+differ by some readings share enough of their draws for all the ratios on the way from one to the
+other: block by block, which tells how sure the difference of two models is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.bands import Bands
+from bwbayes.results.prediction import thinned
+from bwbayes.sampling.diagnostics import autocorrelation_time
+from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import draws, first_chain, sample
+
+__all__ = ["BLOCKS", "FUTURE", "Part", "bands_part", "cut", "leave_future_out", "log_ratios"]
+
+# What the later half of the training readings is called.
+FUTURE = "later training"
+
+# Blocks of a part.
+BLOCKS = 10
+
+# Draws of a posterior that enter the ratios. Where what is left of them at the far end is worth
+# fewer than the second number, that end is sampled as well.
+DRAWS, MIN_EFFECTIVE = 500, 100.0
+
+# Effective draws of a fit to other readings, and its budget.
+ESS, MAX_STEPS = 400.0, 4000
+
+ROUNDS, ACCURACY = 1000, 1e-8
+
+
+@dataclass(frozen=True)
+class Part:
+    """Later readings, and how probable a model held them.
+
+    Attributes
+    ----------
+    log_scores
+        (blocks,) log density of each block of readings, nats, given all readings before it; of
+        another record the sum of its readings' own log densities.
+    readings
+        Their number.
+    worth
+        Independent readings that the residuals are worth: their number over their integrated
+        autocorrelation time.
+    joint
+        Whether the densities are joint ones. If not, what they count is ``worth``.
+    effective
+        Effective draws behind the scores: their Monte Carlo variance is one over this.
+    """
+
+    log_scores: FloatArray
+    readings: int
+    worth: float
+    joint: bool = True
+    effective: float = np.inf
+
+
+def leave_future_out(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    flat: FloatArray,
+    held_out: Mapping[str, Mapping[str, tuple[slice, ...]]],
+    rng: np.random.Generator,
+    executor: Executor,
+    *,
+    future: bool = True,
+) -> dict[str, Part]:
+    """Score the later half of the training readings, and the held-out windows of the same records.
+
+    Parameters
+    ----------
+    posterior, plan
+        What was fitted, and how.
+    flat
+        (draws, free) its draws, parameters in their own units.
+    held_out
+        Windows by their names, by the names of the training records.
+    rng
+        Starts fits, chooses draws.
+    executor
+        Runs the ensembles.
+    future
+        Whether to score the later half of the training readings, given the earlier one, which
+        takes a fit to the earlier one.
+
+    Returns
+    -------
+    dict[str, Part]
+        By name, in order. Without the later half of the training readings if the fit to the
+        earlier one has not converged, and without a part that has no readings.
+    """
+    parts: dict[str, Part] = {}
+    training = {dataset.name: dataset.training for dataset in posterior.datasets}
+    if future:
+        later = {
+            dataset.name: dataset.readings.rows[dataset.readings.rows.size // 2 :]
+            for dataset in posterior.datasets
+        }
+        edges = {name: _edges(rows) for name, rows in later.items()}
+        path = [
+            posterior.trained({name: cut(training[name], edges[name][k]) for name in edges})
+            for k in range(BLOCKS)
+        ]
+        path.append(posterior)
+        earlier = _fitted(path[0], plan, flat, rng, executor)
+        if earlier is not None:
+            parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng)
+    for record, name, windows in (
+        (record, *part) for record, named in held_out.items() for part in named.items()
+    ):
+        displacement = next(d.displacement for d in posterior.datasets if d.name == record)
+        rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
+        rows = rows[np.isfinite(displacement[rows])]
+        if not rows.size:
+            continue
+        before = training
+        training = training | {record: _merged(training[record], windows)}
+        path = [
+            posterior.trained(before | {record: _merged(before[record], cut(windows, edge))})
+            for edge in _edges(rows)
+        ]
+        path.append(posterior.trained(training))
+        part = _scored(path, {0: flat}, {record: rows}, rng)
+        if part.effective < MIN_EFFECTIVE:
+            longer = _fitted(path[-1], plan, flat, rng, executor)
+            if longer is not None:
+                part = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
+                flat = longer
+        parts[name] = part
+    return parts
+
+
+def bands_part(bands: Bands, judged: BoolArray) -> Part | None:
+    """Return the part that another record is, from its bands; None without a reading.
+
+    ``judged`` (samples,) tells which readings count.
+
+    What its start leaves open, each draw has an answer to of its own, so that its readings' joint
+    density would be that of the luckiest draw: their own densities stand, and count as independent
+    ones do.
+    """
+    if bands.measured is None or bands.log_score is None or not judged.any():
+        return None
+    residual = (bands.measured - bands.mean)[judged]
+    blocks = np.array_split(bands.log_score[judged], BLOCKS)
+    sums = np.array([block.sum() for block in blocks])
+    return Part(sums, residual.size, residual.size / _correlation_time(residual), joint=False)
+
+
+def cut(windows: tuple[slice, ...], end: int) -> tuple[slice, ...]:
+    """Return what windows have of the samples before ``end``."""
+    return tuple(slice(w.start, min(w.stop, end)) for w in windows if w.start < end)
+
+
+def log_ratios(
+    log_likelihood: FloatArray, counts: Mapping[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return log Z less that of the first of some posteriors with one prior, from draws of a few.
+
+    With draws θ of the posteriors j, Nⱼ of each, and all their likelihoods Lₖ(θ):
+
+        Zₖ = Σ over all θ of Lₖ(θ) / Σⱼ Nⱼ Lⱼ(θ) / Zⱼ,
+
+    which is importance sampling if j is one alone, and Bennett's acceptance ratio between two.
+
+    Parameters
+    ----------
+    log_likelihood
+        (posteriors, draws), nats; the draws in the order of ``counts``.
+    counts
+        Draws of each posterior that was sampled, by its row.
+
+    Returns
+    -------
+    tuple[FloatArray, FloatArray]
+        (posteriors,) log ratios, and effective draws at each posterior, 1 / Σ w².
+
+    Notes
+    -----
+    M. R. Shirts and J. D. Chodera, J. Chem. Phys. 129 (2008) 124105.
+    """
+    sampled = [*counts]
+    logs = np.log([*counts.values()])[:, np.newaxis]
+    log_z = np.zeros((len(sampled), 1))
+    for _ in range(ROUNDS):
+        mixture = logsumexp(logs + log_likelihood[sampled] - log_z, axis=0)
+        before = log_z
+        log_z = logsumexp(log_likelihood[sampled] - mixture, axis=1, keepdims=True)
+        log_z -= log_z[0]
+        if np.max(np.abs(log_z - before)) < ACCURACY:
+            break
+    weights = log_likelihood - mixture
+    ratios = logsumexp(weights, axis=1)
+    effective = np.exp(2 * ratios - logsumexp(2 * weights, axis=1))
+    return ratios - ratios[0], effective
+
+
+def _scored(
+    path: Sequence[Posterior],
+    drawn: Mapping[int, FloatArray],
+    rows: Mapping[str, IntArray],
+    rng: np.random.Generator,
+) -> Part:
+    """Score the blocks on the way from the first posterior to the last; ``drawn`` are draws."""
+    chosen = {number: thinned(flat, rng, DRAWS) for number, flat in drawn.items()}
+    theta = path[0].prior.theta(np.concatenate([*chosen.values()]))
+    log_likelihood = np.stack([posterior.log_likelihood(theta) for posterior in path])
+    counts = {number: len(flat) for number, flat in chosen.items()}
+    log_z, effective = log_ratios(log_likelihood, counts)
+    likeliest = theta[np.argmax(log_likelihood[-1]), np.newaxis]
+    several = len(path[-1].datasets) > 1
+    worth = 0.0
+    for dataset in path[-1].datasets:
+        if dataset.name in rows:
+            own = rows[dataset.name]
+            simulated = path[-1].simulate(likeliest, own, dataset.name if several else None)[0]
+            worth += own.size / _correlation_time(dataset.displacement[own] - simulated)
+    readings = sum(own.size for own in rows.values())
+    return Part(np.diff(log_z), readings, worth, effective=float(np.min(effective)))
+
+
+def _fitted(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    flat: FloatArray,
+    rng: np.random.Generator,
+    executor: Executor,
+) -> FloatArray | None:
+    """Draw from the posterior of other readings, from draws of one nearby; None if that fails."""
+    prior = posterior.prior
+    coordinates = prior.unconstrain(thinned(flat, rng, DRAWS))
+    density = posterior.log_density(coordinates)
+    best = coordinates[np.argmax(density)]
+    wide = np.atleast_2d(np.cov(prior.unconstrain(prior.draw(rng, DRAWS)), rowvar=False))
+    # With less readings a posterior is wider.
+    covariance = 2 * np.atleast_2d(np.cov(coordinates, rowvar=False))
+    point = PointFit(best, covariance, float(np.max(density)), best[np.newaxis], wide)
+    short = replace(plan, ess=min(ESS, plan.ess), most_steps=min(MAX_STEPS, plan.most_steps))
+    chain = first_chain(posterior, point, short, rng)
+    if not sample(posterior, short, chain, executor).converged:
+        return None
+    return draws(posterior, chain).reshape(-1, len(posterior.names))
+
+
+def _edges(rows: IntArray) -> list[int]:
+    """Return the rows where blocks begin."""
+    return [int(rows[k * rows.size // BLOCKS]) for k in range(BLOCKS)]
+
+
+def _merged(windows: tuple[slice, ...], others: tuple[slice, ...]) -> tuple[slice, ...]:
+    return tuple(sorted((*windows, *others), key=lambda window: window.start))
+
+
+def _correlation_time(residual: FloatArray) -> float:
+    """Integrated autocorrelation time of residuals (readings,), in readings; at least 1."""
+    time = autocorrelation_time(residual[np.newaxis])
+    return max(time, 1.0) if np.isfinite(time) else 1.0

@@ -1,0 +1,217 @@
+"""Which model: differences to the best, a recommendation, and what speaks against it.
+
+One rule. What a model is worth is the joint log density of the later readings, given the earlier
+ones (:mod:`~bwbayes.comparison.leave_future_out`), summed over the later half of the training
+readings and all that was held out. A part worth fewer than five independent readings has no vote.
+Models tie if their sums differ by less than four nats, or than the 95 % limit of blocks longer than
+the correlation time. Of those that tie, the log evidence leaves out what is less probable by odds
+of twenty to one; of what is then left the plainest is recommended, and the tie is said. Where no
+part has a vote, the log evidence decides alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from bwbayes.comparison.candidates import Candidate
+from bwbayes.comparison.compared import Comparison, Difference
+
+__all__ = ["difference", "recommend"]
+
+# Odds of 20 to 1, nats: log evidences that differ by less do not tell models apart.
+MIN_LOG_ODDS = float(np.log(20))
+
+# Nats over all later readings below which a difference is small whatever its error: models that
+# predict nearly the same differ by the luck of one fit (T. Sivula, M. Magnusson, A. Vehtari,
+# arXiv:2008.10296).
+SMALL = 4.0
+
+# Independent readings that a part must be worth to have a vote: as many blocks tell its error.
+MIN_WORTH = 5
+
+# A Monte Carlo error of the log evidence above this leaves it out, nats.
+MAX_ERROR = 0.5
+
+
+def recommend(candidates: Sequence[Candidate]) -> Comparison:
+    """Compare models that were fitted to the same readings; their names differ."""
+    usable = [candidate for candidate in candidates if candidate.converged]
+    unusable = tuple(candidate for candidate in candidates if not candidate.converged)
+    unconverged = tuple(
+        f"{candidate.name} has not converged ({candidate.stop_reason}) and is not judged"
+        for candidate in unusable
+        if not candidate.screened
+    )
+    if not usable:
+        none = ("no model has converged, so none is recommended",)
+        return Comparison(tuple(candidates), (), None, {}, None, (), none, unconverged)
+    worth = {
+        name: max(candidate.parts[name].worth for candidate in usable)
+        for name in usable[0].parts
+        if all(name in candidate.parts for candidate in usable)
+    }
+    voting = tuple(name for name, independent in worth.items() if independent >= MIN_WORTH)
+
+    def value(candidate: Candidate) -> float:
+        return candidate.log_score(voting) if voting else candidate.log_evidence
+
+    counted = [_count_independent(candidate, worth) for candidate in usable]
+    ordered = sorted(counted, key=lambda candidate: -value(candidate))
+    best = ordered[0]
+    differences = {
+        candidate.name: difference(candidate, best, voting)
+        if voting
+        else _evidence_difference(candidate, best)
+        for candidate in ordered
+    }
+    near = [candidate for candidate in ordered if not differences[candidate.name].worse]
+    tied = near
+    if voting and all(_is_known(candidate) for candidate in near):
+        top = max(near, key=_log_evidence)
+        tied = [candidate for candidate in near if not _evidence_difference(candidate, top).worse]
+    recommended = min(tied, key=lambda candidate: (candidate.free, -value(candidate)))
+    others = tuple(candidate.name for candidate in tied if candidate is not recommended)
+    comparison = Comparison(
+        (*ordered, *sorted(unusable, key=lambda candidate: -candidate.log_evidence)),
+        voting,
+        best.name,
+        differences,
+        recommended.name,
+        others,
+        (),
+        (),
+    )
+    lines = tuple(_summarize(comparison, recommended, ordered, near))
+    without_vote = (
+        f"{name} is worth {independent:.1f} independent readings only and has no vote"
+        for name, independent in worth.items()
+        if name not in voting
+    )
+    caveats = (*_list_caveats(comparison, recommended, ordered), *without_vote, *unconverged)
+    return replace(comparison, lines=lines, caveats=caveats)
+
+
+def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> Difference:
+    """Return the log score of a model less that of the best, over parts by their names, nats.
+
+    Its error is that of sums over blocks of each part, ten, or five where either model's residuals
+    leave no ten independent ones; the Monte Carlo errors of both are in it.
+    """
+    if candidate is best:
+        return Difference(0.0, 0.0, 0.0)
+    total, variance, freedom = 0.0, 0.0, 0
+    with np.errstate(invalid="ignore"):  # both may hold a reading for impossible
+        for first, second in ((candidate.parts[name], best.parts[name]) for name in voting):
+            gains = first.log_scores - second.log_scores
+            blocks = gains.size if min(first.worth, second.worth) >= gains.size else MIN_WORTH
+            sums = gains.reshape(blocks, -1).sum(axis=1)
+            total += float(np.sum(sums))
+            variance += blocks * float(np.var(sums, ddof=1))
+            variance += 1 / first.effective + 1 / second.effective
+            freedom += blocks - 1
+    error = float(np.sqrt(variance))
+    return Difference(total, error, max(SMALL, float(stats.t.ppf(0.975, freedom)) * error))
+
+
+def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Candidate:
+    """Let readings that were scored one by one count as independent ones do."""
+    parts = {
+        name: part
+        if part.joint or name not in worth
+        else replace(part, log_scores=part.log_scores * worth[name] / part.readings)
+        for name, part in candidate.parts.items()
+    }
+    return replace(candidate, parts=parts)
+
+
+def _evidence_difference(candidate: Candidate, best: Candidate) -> Difference:
+    """Return the log evidence of a model less that of the best."""
+    if candidate is best:
+        return Difference(0.0, 0.0, 0.0)
+    errors = [c.evidence.error for c in (candidate, best) if c.evidence is not None]
+    error = float(np.linalg.norm(errors)) if len(errors) > 1 else np.inf
+    return Difference(candidate.log_evidence - best.log_evidence, error, MIN_LOG_ODDS + 2 * error)
+
+
+def _log_evidence(candidate: Candidate) -> float:
+    return candidate.log_evidence
+
+
+def _is_known(candidate: Candidate) -> bool:
+    return candidate.evidence is not None and candidate.evidence.error < MAX_ERROR
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _summarize(
+    comparison: Comparison,
+    recommended: Candidate,
+    ordered: Sequence[Candidate],
+    near: Sequence[Candidate],
+) -> Iterator[str]:
+    """Say what is recommended, and why."""
+    screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
+    if comparison.tied:
+        names = _listed([recommended.name, *comparison.tied])
+        yield f"{names} cannot be told apart; the plainest of them is {recommended.name}"
+    elif len(ordered) > 1 or screened:
+        yield f"{recommended.name} is recommended"
+    else:
+        yield f"{recommended.name} is the only model that has converged"
+    if not recommended.hysteresis:
+        yield "the record shows no hysteresis: a model without any does as well"
+    elif any(not comparison[name].hysteresis for name in comparison.tied):
+        yield "whether there is any hysteresis cannot be told"
+    worse = [candidate for candidate in ordered if candidate not in near]
+    if worse:
+        nearest = comparison.differences[worse[0].name]
+        which = f"{worse[0].name} " if len(worse) > 1 else ""
+        yield (
+            f"by the {comparison.measure} {_listed([candidate.name for candidate in worse])} "
+            f"{'is' if len(worse) == 1 else 'are'} worse, "
+            f"{which}by {-nearest.value:.3g} ± {nearest.error:.2g} nats"
+        )
+    tied = (recommended.name, *comparison.tied)
+    less_probable = [candidate for candidate in near if candidate.name not in tied]
+    if less_probable:
+        top = max(comparison[name].log_evidence for name in tied)
+        margin = top - max(candidate.log_evidence for candidate in less_probable)
+        yield (
+            f"the {comparison.measure} does not tell "
+            f"{_listed([candidate.name for candidate in less_probable])} apart, "
+            f"but the log evidence is lower by {margin:.1f} nats or more"
+        )
+    if screened:
+        yield f"only screened, as too far behind at the MAP estimate: {_listed(screened)}"
+
+
+def _list_caveats(
+    comparison: Comparison, recommended: Candidate, ordered: Sequence[Candidate]
+) -> Iterator[str]:
+    """Say what speaks against the recommendation."""
+    best = ordered[0]
+    if recommended is not best:
+        lost = comparison.differences[recommended.name]
+        yield (
+            f"{best.name} has the best {comparison.measure}, "
+            f"by {-lost.value:.2g} ± {lost.error:.2g} nats"
+        )
+    yield from comparison.standing.said
+    if not comparison.voting:
+        yield "the evidence decides alone, which takes priors and noise at their word"
+    top = max(ordered, key=_log_evidence)
+    against = _evidence_difference(recommended, top)
+    if comparison.voting and _is_known(top) and against.worse:
+        assert top.evidence is not None
+        assert recommended.evidence is not None
+        share = recommended.evidence.prior_share - top.evidence.prior_share
+        yield (
+            f"the log evidence is for {top.name}, by {-against.value:.1f} nats, "
+            f"of which {share:.1f} are the priors' share"
+        )

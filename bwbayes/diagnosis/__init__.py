@@ -1,0 +1,1 @@
+"""Diagnosis: what is wrong with a record, a fit or its bands, and what to do about it."""

@@ -1,0 +1,205 @@
+"""Priors and posterior: where they disagree, press against a bound, or differ in unit.
+
+A finding's kind is the parameter, and its fix a line of config. The same findings come from the
+point fit, before any sampling, by :func:`around`, and from the posterior's draws.
+
+How often good runs have one: the score of a parameter that its prior describes is beyond three
+once in 400 times, and less where the posterior is wide; a posterior that is flat between its bounds
+or has its peak inside does not press. In the tests, 40 simulated records with default priors give
+none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.pointfit import PointFit
+from bwbayes.model.declaration import Values
+from bwbayes.model.distributions import Distribution
+
+__all__ = ["around", "conflicts", "effective"]
+
+# Prior sds between a prior and the posterior's mean beyond which they disagree.
+DISAGREE = 3.0
+
+# A bound is pressed against where more than this part of the draws lies within half a posterior sd
+# of it: 0.14 for a flat posterior, 0.24 for half a normal one with its peak on the bound, 0.30 for
+# what a bound leaves of a normal one a sd beyond it, 0.39 for an exponential one.
+NEAR = 0.5
+PRESSES = 0.3
+
+# A ratio between -1 and 1 that the record hardly tells leans on a bound by chance.
+TOLD = 0.05
+
+# A prior's scale looks like another unit's from this factor on, and this many sds of the default.
+ANOTHER_UNIT = 100.0
+UNLIKELY = 2.5
+
+# Draws that stand for a prior, or for a Gaussian posterior.
+DRAWS = 4000
+
+
+def effective(prior: JointPrior, generator: np.random.Generator) -> FloatArray:
+    """Return the 2.5 %, 50 % and 97.5 % quantiles of the joint prior, (3, free).
+
+    The physical constraints cut the joint prior, so they are not those of the stated priors: where
+    |γ| ≤ β, small β become less probable, and an initial state inside the hysteresis ceiling makes
+    α larger.
+    """
+    quantiles: FloatArray = np.quantile(prior.draw(generator, DRAWS), [0.025, 0.5, 0.975], axis=0)
+    return quantiles
+
+
+def around(prior: JointPrior, point: PointFit, generator: np.random.Generator) -> FloatArray:
+    """Return draws (draws, free) of the Gaussian approximation around a point fit."""
+    spread = np.linalg.cholesky(point.covariance)
+    moves = generator.standard_normal((DRAWS, point.mode.size)) @ spread.T
+    free, density = prior.constrain(point.mode + moves)
+    return free[np.isfinite(density)]
+
+
+def conflicts(
+    prior: JointPrior, draws: FloatArray, defaults: Mapping[str, Distribution]
+) -> list[Finding]:
+    """Return where priors and posterior do not go together.
+
+    Parameters
+    ----------
+    prior
+        The priors of the run.
+    draws
+        (draws, free), of the posterior or from :func:`around`.
+    defaults
+        The default priors of the same record by name.
+    """
+    columns = dict(zip(prior.free_names, draws.T, strict=True))
+    findings = []
+    for parameter in prior.parameters:
+        default = defaults.get(parameter.name)
+        finding = default and _another_unit(parameter, default)
+        if not finding and parameter.prior is not None:
+            finding = _disagreement(parameter, columns[parameter.name], default)
+        if finding:
+            findings.append(finding)
+    return [*findings, *_pressed(prior, columns)]
+
+
+def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None:
+    """Find that a positive parameter's scale is far from what the record's ranges suggest."""
+    if not parameter.positive or parameter.prior == default:
+        return None
+    expected, sd = float(default.frozen.median()), _log_sd(default)
+    label, value = "fixed value", parameter.fixed
+    if parameter.prior is not None:
+        label, value = "prior's median", float(parameter.prior.frozen.median())
+    if value is None or value <= 0:
+        return None
+    distance = float(np.log(value / expected))
+    if abs(distance) < max(np.log(ANOTHER_UNIT), UNLIKELY * sd):
+        return None
+    return Finding(
+        parameter.name,
+        f"its {label}, {value:.3g} {parameter.unit}, is {np.exp(distance):.0e} times what the "
+        f"record's ranges suggest ({expected:.3g})",
+        f"check its unit; the default is {_line(parameter.name, default)}",
+    )
+
+
+def _disagreement(
+    parameter: Parameter, values: FloatArray, default: Distribution | None
+) -> Finding | None:
+    """Find that the posterior lies some sds from a parameter's prior."""
+    assert parameter.prior is not None
+    low, high = (np.asarray(end) for end in parameter.support)
+    scores = np.clip(parameter.prior.to_normal(values, low, high), -37, 37)
+    score = float(np.mean(scores))
+    if abs(score) <= DISAGREE:
+        return None
+    side = "above" if score > 0 else "below"
+    text = (
+        f"posterior mean {np.mean(values):.3g} {parameter.unit} is {abs(score):.1f} SD {side} its "
+        f"prior {parameter.prior}"
+    )
+    wider = parameter.prior if default is None or parameter.prior == default else default
+    if wider is parameter.prior:
+        wider = _widened(wider)
+    line = _line(parameter.name, wider)
+    fix = f"check the units of prior and record; if both are right, give {line}"
+    return Finding(parameter.name, text, fix)
+
+
+def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:
+    """Yield bounds that the posterior leans on."""
+    fixed = {p.name: p.fixed for p in prior.parameters if p.fixed is not None}
+    size = next(iter(columns.values())).size
+    values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
+    for parameter in prior.free:
+        name, (low, high) = parameter.name, parameter.support
+        if parameter.declared and parameter.declared.reaches_floor and low == parameter.floor:
+            if _near(values[name] - low):
+                yield Finding(
+                    name, f"lies on its bound {low:g}", f"give {name} = {{ fixed = {low:.1f} }}"
+                )
+        elif np.isfinite(low) and low != 0 and _near(values[name] - low):
+            yield _given_bound(parameter, "lower", low)
+        if np.isfinite(high) and _near(high - values[name]):
+            yield _given_bound(parameter, "upper", high)
+    for parameter in prior.parameters:
+        visible = prior.seen(values, parameter.record)
+        yield from _pressed_by_others(parameter, values[parameter.name], visible)
+
+
+def _pressed_by_others(parameter: Parameter, x: FloatArray, values: Values) -> Iterator[Finding]:
+    """Yield bounds of draws x (draws,) that other parameters set."""
+    if parameter.declared is None:
+        return
+    for side, bound in zip(("lower", "upper"), parameter.limits(values), strict=True):
+        advice = parameter.declared.pressed.get(side)
+        if advice is None or not np.isfinite(bound).all():
+            continue
+        gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
+        # Beyond a bound that does not hold here nothing ends.
+        if float(np.min(gap)) >= 0 and np.std(gap) < TOLD and _near(gap):
+            stated = parameter.declared.stated_bounds
+            yield Finding(parameter.name, f"lies on its {side} bound of {stated}", advice)
+
+
+def _near(gap: FloatArray) -> bool:
+    """Tell whether draws (draws,) of the distance to a bound pile up at zero."""
+    sd = float(np.std(gap))
+    return sd > 0 and float(np.mean(gap < NEAR * sd)) > PRESSES
+
+
+def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
+    configured = parameter.lower if side == "lower" else parameter.upper
+    assert parameter.prior is not None
+    fix = f"move parameters.{parameter.name}.{side}"
+    if configured != bound:
+        fix = f"widen its prior {parameter.prior}, which ends there"
+    return Finding(parameter.name, f"lies on its {side} bound {bound:.4g} {parameter.unit}", fix)
+
+
+def _log_sd(distribution: Distribution) -> float:
+    low, high = distribution.frozen.ppf([0.16, 0.84])
+    return float(np.log(high / low)) / 2
+
+
+def _widened(distribution: Distribution) -> Distribution:
+    """Return a prior twice as wide, if it has a width by name."""
+    wider = {
+        key: 2 * value if key in ("sd", "sigma", "scale") else value
+        for key, value in distribution.arguments.items()
+    }
+    return Distribution(distribution.name, wider)
+
+
+def _line(name: str, distribution: Distribution) -> str:
+    """Write a prior as a config's line under ``[parameters]``."""
+    arguments = "".join(f", {key} = {value:.6g}" for key, value in distribution.arguments.items())
+    key = name if name.isidentifier() else f'"{name}"'
+    return f'{key} = {{ prior = {{ distribution = "{distribution.name}"{arguments} }} }}'

@@ -1,0 +1,84 @@
+"""Why bands fail: every extension of the fitted model that there is, ranked by evidence.
+
+An explanation is a small extension of the fitted model, fitted from the mode that there is. It is
+worth what the log evidence rises by, nats. The likely cause is the best one, if it is worth more
+than :data:`LIMIT`; two that tie are both named. A fix that leaves readings out must beat all that
+keep them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from bwbayes.diagnosis import drive, model, noise, sensor
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.scene import Explanation, Scene
+
+__all__ = ["ADDITIONS", "CHANGES", "LIMIT", "TIED", "explain", "followed_causes", "likely_causes"]
+
+# A line an explanation: each yields what it finds of a fit. The first are small additions, which a
+# good fit refuses at once; the others are for fits of which something is known to be wrong.
+ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
+    sensor.transient,
+    sensor.drift,
+    sensor.step,
+    sensor.oscillation,
+    sensor.moving_gain,
+    sensor.reversed_sign,
+    drive.delay,
+    noise.heavy_tails,
+    noise.growing_noise,
+)
+CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
+    drive.saturation,
+    drive.slew_limit,
+    drive.backlash,
+    model.nonlinearity,
+    model.creep,
+    model.dynamics,
+    model.hold,
+    model.operator,
+)
+
+# Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
+# inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
+LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
+
+# Odds of twenty to one, nats: explanations nearer than this are both named.
+TIED = float(np.log(20))
+
+# A parameter that moves by more of its sds is another one.
+SHIFTED = 3.0
+
+
+def explain(scene: Scene, *, thorough: bool) -> tuple[Explanation, ...]:
+    """Fit explanations, and rank them, the best first.
+
+    Unless ``thorough``, only the first of them, and all if any of these is worth anything.
+    """
+    explanations = [explanation for kind in ADDITIONS for explanation in kind(scene)]
+    if thorough or any(explanation.nats > 0 for explanation in explanations):
+        explanations += [explanation for kind in CHANGES for explanation in kind(scene)]
+    return tuple(sorted(explanations, key=lambda explanation: -explanation.nats))
+
+
+def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return the best of ranked explanations and those that tie with it; none below the limit."""
+    leading = [found for found in ranked if found.nats > max(LIMIT, ranked[0].nats - TIED)]
+    keeping = [found for found in leading if not found.removes]
+    return tuple(keeping or leading)
+
+
+def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
+    """Return what a fit may have followed although the actuator has not done it.
+
+    What is beyond chance is enough by itself: parameters that followed it need not find back. Even
+    odds are enough where a parameter moves as well: a good fit hardly has both.
+    """
+    best = max((found.nats for found in ranked), default=0.0)
+    near = [found for found in ranked if found.nats > max(0.0, best - TIED)]
+    return tuple(
+        found for found in near if found.foreign and (found.nats > LIMIT or found.shift > SHIFTED)
+    )

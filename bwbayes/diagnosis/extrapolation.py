@@ -1,0 +1,195 @@
+"""Where a prediction leaves what was fitted: in voltage, speed, slowness or duration.
+
+There the bands know how sure the parameters are, and of what else the actuator does only the creep
+after slower drives, by its prior (:mod:`bwbayes.inference.untried`): it saturates at higher
+voltages, lags behind faster ones, and drifts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.drive import fastest, time_between_turns
+
+__all__ = ["beyond_training"]
+
+# Part of the fitted voltages' range that others may lie beyond it: a sensor's noise.
+SLACK = 0.02
+
+# A voltage that moves faster than the fitted one by more than this factor tells more of the lag
+# than the record did. Noise and the sampling change a speed by a tenth or so.
+FASTER = 1.5
+
+# Part of the time between turning points over which a speed is taken: a sine's peak speed is then
+# 0.4 % too low, and noise of 1 % of its range adds a tenth.
+PART = 0.1
+
+# Times that are longer than the fitted ones by more than this factor leave creep that the record
+# does not show. Creep goes with the logarithm of the time, by one or two percent of a change each
+# decade: half a decade is half of the one or two percent that a model misses anyway.
+LONGER = 3.0
+
+# Slow means are looked at over times that are so many to a factor of ten.
+A_DECADE = 8
+
+# The sides to which a mean may leave others: low and high.
+SIDES = np.array([[-1.0], [1.0]])
+
+
+def beyond_training(
+    posterior: Posterior,
+    voltage: FloatArray,
+    interval: float,
+    window: slice = slice(None),
+) -> list[Finding]:
+    """Return in what a drive leaves those that the model was fitted to.
+
+    Findings of kind "range" and "speed" leave what any model knows; "slow" and "duration" leave
+    room for creep and drift, which may be as small as the bands allow.
+
+    Parameters
+    ----------
+    posterior
+        The posterior of the records that were fitted.
+    voltage
+        The drive from its first sample on, (samples,), V.
+    interval
+        Its sampling interval, s.
+    window
+        The samples that are predicted; those before are what the actuator went through.
+    """
+    found = [
+        _range(posterior, voltage[window]),
+        _speed(posterior, voltage[window], interval),
+        _slow(posterior, voltage, interval, window),
+        _duration(posterior, voltage[: window.stop].size * interval),
+    ]
+    return [one for one in found if one is not None]
+
+
+def _fitted_range(posterior: Posterior) -> tuple[float, float]:
+    windows = [one.voltage[window] for one in posterior.datasets for window in one.training]
+    return min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
+
+
+def _turn_times(posterior: Posterior) -> list[float]:
+    """Return the typical time between turning points in each record that was fitted, s."""
+    every = posterior.datasets
+    return [time_between_turns(one.voltage, one.actuator.interval, one.training) for one in every]
+
+
+def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
+    low, high = _fitted_range(posterior)
+    slack = SLACK * (high - low)
+    if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
+        return None
+    return Finding(
+        "range",
+        f"voltage {np.min(voltage):.4g} to {np.max(voltage):.4g} V exceeds the training range "
+        f"{low:.4g} to {high:.4g} V; the bands extrapolate",
+        "train on a record that spans this range",
+    )
+
+
+def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Finding | None:
+    before = now = math.inf
+    for one, a_turn in zip(posterior.datasets, _turn_times(posterior), strict=True):
+        own = one.actuator.interval
+        over = PART * min(a_turn, time_between_turns(voltage, interval))
+        its, this = fastest(one.voltage, own, over, one.training), fastest(voltage, interval, over)
+        # Of several records the one that comes nearest to the drive.
+        if this * before <= now * its or before == math.inf:
+            before, now = its, this
+    if now <= FASTER * before:
+        return None
+    return Finding(
+        "speed",
+        f"voltage speed of up to {now:.3g} V/s exceeds the {before:.3g} V/s of training; the bands "
+        "extrapolate, because the lag is not known that well",
+        "train on a record that is as fast",
+    )
+
+
+def _slow(
+    posterior: Posterior, voltage: FloatArray, interval: float, window: slice
+) -> Finding | None:
+    """Hold the voltage's means over some times T against those of training.
+
+    Creep with the time T follows the mean over T. The creep that training does not show is as large
+    as ∫ (mean now − mean then) d log T, where means go beyond those of training.
+    """
+    low, high = _fitted_range(posterior)
+    # What is beyond the range is said by itself.
+    inside = np.clip(voltage[: window.stop], low, high)
+    longest, shortest = inside.size * interval, PART * min(_turn_times(posterior))
+    decades = max(math.log10(longest / shortest), 0.0)
+    times = longest / 10 ** (np.arange(1 + math.ceil(A_DECADE * decades)) / A_DECADE)
+    planned = _slow_means(inside, interval, times, [window])
+    fitted = [
+        _slow_means(one.voltage, one.actuator.interval, times, one.training)
+        for one in posterior.datasets
+    ]
+    now, before = SIDES * planned, np.max([SIDES * _filled(means) for means in fitted], axis=0)
+    # A mean over a longer time is that over a shorter one somewhere.
+    before = np.maximum.accumulate(before, axis=1)
+    excess = np.maximum(np.nan_to_num(now - before), 0.0)
+    # In volts times decades of time; a sine over the whole range has half the range to either side.
+    unknown = np.sum(excess, axis=1) / A_DECADE
+    if unknown.max() <= math.log10(LONGER) * (high - low) / 2:
+        return None
+    side = int(np.argmax(unknown))
+    at = int(np.argmax(excess[side] >= excess[side].max() / 2))
+    reached = f"at {('least', 'most')[side]} {(SIDES * before)[side, at]:.3g} V"
+    return Finding(
+        "slow",
+        f"voltage averages {planned[side, at]:.3g} V over {times[at]:.3g} s, in training {reached}"
+        "; the bands extrapolate, with slow creep at its prior",
+        "train on a record that is as slow, or is held as long",
+    )
+
+
+def _filled(means: FloatArray) -> FloatArray:
+    """Replace each nan of (sides, times) by the first number after it: that of the next time."""
+    known = np.flatnonzero(np.isfinite(means[0]))
+    filled: FloatArray = means[:, known[np.searchsorted(known, np.arange(means.shape[1]))]]
+    return filled
+
+
+def _duration(posterior: Posterior, duration: float) -> Finding | None:
+    before = max(one.training[-1].stop * one.actuator.interval for one in posterior.datasets)
+    if duration <= LONGER * before:
+        return None
+    return Finding(
+        "duration",
+        f"duration of {duration:.4g} s exceeds the {before:.4g} s of training; the bands "
+        "extrapolate, with slow creep at its prior and no drift",
+        "train on a record that is as long",
+    )
+
+
+def _slow_means(
+    voltage: FloatArray, interval: float, times: FloatArray, windows: Sequence[slice]
+) -> FloatArray:
+    """Return the lowest and the highest mean voltage over some times, (2, times), V.
+
+    The mean over the time T before a sample is what creep with that time follows, of all samples in
+    the windows that have so much before them; nan, if none has.
+    """
+    spans = [window.indices(voltage.size)[:2] for window in windows]
+    total = np.concatenate([[0.0], np.cumsum(voltage[: spans[-1][1]])])
+    extremes = np.full((2, times.size), np.nan)
+    for i, length in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
+        for start, stop in spans:
+            # Means over many samples change slowly: the last one, and one in a fiftieth of them.
+            ends = np.arange(stop, max(start, length - 1), -max(length // 50, 1))
+            if ends.size:
+                means = (total[ends] - total[ends - length]) / length
+                extremes[0, i] = np.fmin(extremes[0, i], means.min())
+                extremes[1, i] = np.fmax(extremes[1, i], means.max())
+    return extremes

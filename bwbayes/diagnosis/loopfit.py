@@ -1,0 +1,195 @@
+"""What the voltage alone says about the displacement: a quick regression that knows of loops.
+
+A displacement follows the voltage with a lag and along hysteresis loops. :func:`fit_loop` fits a
+sum of play operators of the lagged voltage (any loop that closes is one, nearly) by least squares:
+no physics to be had from it, but what it misses is what no actuator does by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.data.record import Record
+from bwbayes.diagnosis.series_patterns import DecayingStart, turning_points
+
+__all__ = ["LoopFit", "fit_loop"]
+
+# Half widths of the plays, as parts of half the voltage's range.
+WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])
+FREE_STARTS = slice(2, None, 2)  # plays whose state at the start is free
+MOST_ROWS = 3000  # of each kind: evenly spaced, and extremes of the voltage
+EARLY_ROWS = 400
+LAGS = 9
+DECAYS = 20
+
+
+@dataclass(frozen=True)
+class LoopFit:
+    """What a record's displacement has to do with its voltage.
+
+    Parameters
+    ----------
+    rows : array (rows,)
+        The samples that were looked at, all with readings.
+    residual : array (rows,), um
+        What the loops, the decay and the trend do not explain.
+    gain : float, um/V
+        Displacement per volt of a large, slow drive.
+    lag : float, s
+        Time constant with which the displacement follows.
+    decay : Decay
+        What dies out from the first reading on, whatever the voltage does; um and s.
+    start : float, um
+        How far off the displacement starts in all: the decay, and what another state of the plays
+        would change.
+    trend : float, um
+        How far the displacement goes from the first reading to the last at equal voltages.
+    trend_told : float
+        Part of a trend that loops do not imitate, at most 1; with little of it `trend` means none.
+    explained : float
+        Part of the displacement's variance that the voltage explains, at most 1.
+    """
+
+    rows: IntArray
+    residual: FloatArray
+    gain: float
+    lag: float
+    decay: DecayingStart
+    start: float
+    trend: float
+    trend_told: float
+    explained: float
+
+
+def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
+    """Fit loops to a record without the samples that are `left_out`, (samples,)."""
+    assert record.displacement is not None
+    usable = record.has_reading if left_out is None else record.has_reading & ~left_out
+    rows = _rows(record.voltage, np.flatnonzero(usable))
+    judged = usable[rows]
+    displacement = record.displacement[rows[judged]]
+    time = record.time[rows]
+    centred = displacement - displacement.mean()
+
+    elapsed = time[judged] - time[judged][0]
+    trend_shape = elapsed / elapsed[-1] - 0.5
+    times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, DECAYS)
+    decays = np.exp(-elapsed[:, np.newaxis] / times)
+
+    best: tuple[float, FloatArray, float, int] | None = None
+    lags = _lags(record)
+    lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
+    for lag, loops in zip(lags, _bases(np.array(lagged_voltages), judged), strict=True):
+        basis = np.column_stack([loops, trend_shape])
+        remainder, which = _best_decay(basis, decays, centred)
+        if best is None or remainder < best[0]:
+            best = remainder, basis, lag, which
+    assert best is not None
+    _, basis, lag, which = best
+    design = np.column_stack([basis, decays[:, which]])
+    products = _products(design, centred[:, np.newaxis])
+    among = _products(design, design)
+    coefficients = _inverse(among) @ products[:, 0]
+    shared = among[:-2, -2]  # the products of the loops' columns with the trend's
+    imitated = float(shared @ _inverse(among[:-2, :-2]) @ shared)
+    residual = centred - (design * coefficients).sum(axis=1)
+    undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
+    driven = centred - undriven
+    lagged = basis[:, 1] - basis[:, 1].mean()
+    return LoopFit(
+        rows[judged],
+        residual,
+        float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
+        lag,
+        DecayingStart(float(coefficients[-1]), float(times[which])),
+        float(design[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :])
+        + coefficients[-2] / 2,
+        float(coefficients[-2]),
+        1 - imitated / float(trend_shape @ trend_shape),
+        1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
+    )
+
+
+def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
+    """Return the samples to look at: the voltage's extremes all along, and readings, more early."""
+    evenly = readings[:: -(-readings.size // MOST_ROWS)]
+    early = readings[np.geomspace(1, readings.size, EARLY_ROWS).astype(np.int64) - 1]
+    size = -(-2 * voltage.size // MOST_ROWS)
+    blocks = voltage[: voltage.size // size * size].reshape(-1, size)
+    first = size * np.arange(len(blocks))
+    extremes = np.concatenate([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)])
+    return np.unique(np.concatenate([[0], evenly, early, extremes]))
+
+
+def _lags(record: Record) -> FloatArray:
+    """Return the lags to try, s: none, and from half an interval to a part of a half turn."""
+    smallest_turn = 0.1 * float(np.ptp(record.voltage))
+    turns = turning_points(record.voltage, smallest_turn)
+    slowest = 0.3 * record.interval * float(np.median(np.diff(turns)))
+    lags = np.geomspace(0.5 * record.interval, max(slowest, record.interval), LAGS)
+    return np.concatenate([[0.0], lags])
+
+
+def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
+    """Return the voltage behind a first-order lag that is settled at its start."""
+    if samples == 0:
+        return voltage
+    decay = np.exp(-1 / samples)
+    shifted = voltage - voltage[0]
+    lagged: FloatArray = voltage[0] + lfilter([1 - decay], [1.0, -decay], shifted)
+    return lagged
+
+
+def _bases(voltages: FloatArray, judged: BoolArray) -> Iterator[FloatArray]:
+    """Yield columns that span the loops of each of some voltages (lags, rows), where judged."""
+    low, high = voltages.min(axis=1), voltages.max(axis=1)
+    half = np.maximum((high - low) / 2, 1e-300)
+    scaled = (voltages - ((low + high) / 2)[:, np.newaxis]) / half[:, np.newaxis]
+    widths = np.concatenate([WIDTHS, WIDTHS[FREE_STARTS]])
+    state = scaled[:, :1] + np.concatenate([np.zeros(WIDTHS.size), WIDTHS[FREE_STARTS]])
+    # One row after the other, all lags side by side.
+    lower = scaled.T[:, :, np.newaxis] - widths
+    upper = scaled.T[:, :, np.newaxis] + widths
+    plays = np.empty((scaled.shape[1], *state.shape))
+    for row in range(len(plays)):
+        state = np.minimum(np.maximum(state, lower[row]), upper[row], out=plays[row])
+    for outputs, x, size in zip(plays.swapaxes(0, 1), scaled, half, strict=True):
+        # What another state at the start would change, until the drive has wiped it out.
+        unknown = outputs[:, WIDTHS.size :] - outputs[:, : WIDTHS.size][:, FREE_STARTS]
+        shown = size * outputs[:, : WIDTHS.size]
+        yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[judged]
+
+
+def _best_decay(basis: FloatArray, decays: FloatArray, values: FloatArray) -> tuple[float, int]:
+    """Return the least sum of squares with the basis and one decay, and which decay that is."""
+    columns = np.column_stack([decays, values])
+    among = _products(basis, columns)
+    remainder = _products(columns, columns) - among.T @ _inverse(_products(basis, basis)) @ among
+    power = np.diag(remainder)[:-1]
+    distinct = power > 1e-3 * (decays**2).sum(axis=0)
+    gained = np.where(distinct, remainder[-1, :-1] ** 2 / np.maximum(power, 1e-300), 0.0)
+    which = int(np.argmax(gained))
+    return float(remainder[-1, -1] - gained[which]), which
+
+
+def _products(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return ``left.T @ right`` of tall matrices, without the threads of a linear algebra library.
+
+    Their start takes many times longer than the work.
+    """
+    result: FloatArray = np.einsum("ni,nj->ij", first, second)
+    return result
+
+
+def _inverse(products: FloatArray) -> FloatArray:
+    """Return the inverse of a matrix of products, without directions that are nearly dependent."""
+    scale = np.sqrt(np.maximum(np.diag(products), 1e-300))
+    sizes, directions = np.linalg.eigh(products / np.outer(scale, scale))
+    axes = directions[:, sizes > 1e-9 * sizes[-1]] / scale[:, np.newaxis]
+    result: FloatArray = (axes / sizes[sizes > 1e-9 * sizes[-1]]) @ axes.T
+    return result

@@ -1,0 +1,262 @@
+"""A fitted record as explanations see it: what was fitted, its scales, and how to fit more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data.io.grid import clock
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.laplace import Effect, LocalFit, climb
+from bwbayes.errors import InputError
+from bwbayes.inference import pointfit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.drive import rate, time_between_turns
+
+__all__ = ["Explanation", "Reconfigure", "Scene"]
+
+# Fraction of the readings without which other places to start from are found.
+BEGINNING = 0.2
+
+# Readings that are looked at: an explanation takes some hundred passes over them, and what a model
+# misses shows in fewer.
+READINGS = 4_000
+
+# A gain of less, nats, pays for no parameter: such a climb may end early.
+PAYS = 1.0
+
+# Returns the posterior of the same record with other values of keys of [model], and what
+# [parameters] says of parameters that only the new model has.
+Reconfigure = Callable[[Mapping[str, object], Mapping[str, Mapping[str, Any]]], Posterior]
+
+
+@dataclass(frozen=True)
+class Explanation(Finding):
+    """An extension of a fitted model, worth ``nats`` of log evidence.
+
+    ``rmse`` is the root mean square of the residual, um, without it and with it; ``held_out`` is
+    that of the readings that were held out, nan without any. ``shift`` is by how many sds of both
+    fits the actuator's parameter moves that moves most. What is ``foreign`` the actuator has not
+    done, so that a fit without it has followed it. ``changes`` are the values of keys of [model]
+    that make it a part of the model, and ``parameters`` what [parameters] says of new ones.
+    """
+
+    rmse: tuple[float, float] = (np.nan, np.nan)
+    held_out: tuple[float, float] = (np.nan, np.nan)
+    shift: float = 0.0
+    foreign: bool = False
+    changes: Mapping[str, object] = field(default_factory=dict)
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def worth(self) -> str:
+        """What it is worth, in words: nats, and errors with it instead of without it."""
+        errors = ((self.rmse, "RMSE"), (self.held_out, "held out"))
+        texts = [
+            f"{name} {after:.3g} um instead of {before:.3g} um"
+            for (before, after), name in errors
+            if np.isfinite(after)
+        ]
+        return ", ".join([f"{self.nats:.3g} nats", *texts])
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it."""
+        return {
+            "kind": self.kind,
+            "text": self.text,
+            "fix": self.fix,
+            "nats": self.nats,
+            "rmse_um": self.rmse[1],
+            "rmse_without_um": self.rmse[0],
+            "held_out_rmse_um": self.held_out[1],
+            "held_out_rmse_without_um": self.held_out[0],
+            "shift_sds": self.shift,
+        }
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A fit of one record, and other places from which its extensions are fitted too.
+
+    Attributes
+    ----------
+    fit
+        The fit without any extension.
+    places
+        Coordinates (places, free) to climb from, those of the fit first.
+    generator
+        Starts the point fits of other models.
+    held_out
+        Windows of the record that were held out.
+    begin
+        Time of the record's first sample, s.
+    reconfigure
+        Builds other models of the same record, if these are asked.
+    """
+
+    fit: LocalFit
+    places: FloatArray
+    generator: np.random.Generator
+    held_out: tuple[slice, ...] = ()
+    begin: float = 0.0
+    reconfigure: Reconfigure | None = None
+
+    @classmethod
+    def of(
+        cls,
+        posterior: Posterior,
+        optima: FloatArray,
+        generator: np.random.Generator,
+        held_out: Sequence[slice] = (),
+        begin: float = 0.0,
+        reconfigure: Reconfigure | None = None,
+    ) -> Scene:
+        """Fit a posterior of one record once more, from its optima (optima, free).
+
+        Something at the start of the record may have drawn the fit to an optimum that the rest of
+        it does not have: a fit of the rest says where else to start from.
+        """
+        rows = posterior.only.readings.rows
+        if rows.size > READINGS:
+            # Every so many of them: the voltage stays whole.
+            kept = rows[:: -(-rows.size // READINGS)]
+            thinned = posterior.only.displacement.copy()
+            thinned[np.setdiff1d(rows, kept)] = np.nan
+            posterior, rows = posterior.altered(displacement=thinned), kept
+        first = int(rows[int(BEGINNING * rows.size)])
+        windows = posterior.only.training
+        later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
+        places = optima
+        try:
+            point = pointfit.fit(posterior.altered(training=later), generator)
+            places = np.concatenate([optima, point.optima])
+        except InputError:
+            pass  # the rest has too few readings for these priors
+        fits = [climb(posterior, place[np.newaxis]) for place in places]
+        best = max(fits, key=lambda fit: fit.log_evidence)
+        # As they are: with the start of the record they would be drawn to where the fit is.
+        starts = np.concatenate([best.coordinates[np.newaxis], places])
+        return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior that was fitted."""
+        return self.fit.posterior
+
+    @property
+    def interval(self) -> float:
+        """Sampling interval, s."""
+        return self.posterior.only.actuator.interval
+
+    @property
+    def time(self) -> FloatArray:
+        """Time since the first reading (samples,), s, along the whole record."""
+        record = self.posterior.only
+        samples = np.arange(record.voltage.size) - record.readings.rows[0]
+        time: FloatArray = self.interval * np.maximum(samples, 0.0)
+        return time
+
+    @property
+    def duration(self) -> float:
+        """Time from the first reading to the last, s."""
+        rows = self.posterior.only.readings.rows
+        return self.interval * max(float(rows[-1] - rows[0]), 1.0)
+
+    @property
+    def voltage(self) -> FloatArray:
+        """Voltage (samples,) up to the last reading, V."""
+        return self.posterior.only.voltage[: self.posterior.only.readings.samples]
+
+    @property
+    def rate(self) -> FloatArray:
+        """Slope of the voltage (samples,), V/s."""
+        return rate(self.voltage, self.interval)
+
+    @property
+    def turn_time(self) -> float:
+        """Typical time between two reversals of the voltage, s."""
+        return time_between_turns(self.voltage, self.interval)
+
+    @property
+    def extent(self) -> float:
+        """Range of the readings, um."""
+        return self.posterior.only.extent
+
+    @property
+    def innovations(self) -> FloatArray:
+        """Innovations of the fit (readings,), in sds."""
+        record, readings = self.posterior.only, self.posterior.only.readings
+        residual = readings.values - self.posterior.simulate(self.fit.theta, readings.rows)[0]
+        noise = record.table.noise(self.fit.theta)
+        white: FloatArray = self.posterior.likelihood.spaced.whiten(
+            noise, residual[np.newaxis, np.newaxis], readings.skipped
+        )[0][0, 0]
+        return white
+
+    def clock(self, time: float) -> str:
+        """Write a time since the first reading as one of the record, s."""
+        first = self.begin + self.interval * float(self.posterior.only.readings.rows[0])
+        return clock(first + time, self.interval)
+
+    def extended(self, effect: Effect) -> LocalFit:
+        """Fit the model with an effect."""
+        return self.climbed(self.posterior, self.places, effect)
+
+    def rebuilt(
+        self,
+        changes: Mapping[str, object],
+        parameters: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    ) -> Posterior | None:
+        """Return the posterior of another model and the same readings, if it can be built."""
+        if self.reconfigure is None:
+            return None
+        posterior = self.reconfigure(changes, parameters)
+        return posterior.altered(displacement=self.posterior.only.displacement)
+
+    def climbed(
+        self, posterior: Posterior, places: FloatArray, effect: Effect | None = None
+    ) -> LocalFit:
+        """Fit another model, as long as it may become more probable than that without extension."""
+        return climb(posterior, places, effect, self.fit.log_density + PAYS)
+
+    def explained(
+        self,
+        kind: str,
+        text: str,
+        fix: str,
+        fit: LocalFit,
+        cost: float = 0.0,
+        **facts: Any,
+    ) -> Explanation:
+        """Compare a fit with that without any extension.
+
+        ``cost`` nats are those of its choice; ``facts`` are other fields of the explanation.
+        """
+        return Explanation(
+            kind,
+            text,
+            fix,
+            nats=fit.log_evidence - self.fit.log_evidence - cost,
+            rmse=(self.fit.rmse, fit.rmse),
+            held_out=(self.fit.error(self.held_out), fit.error(self.held_out)),
+            shift=self.shift(fit) if fit.posterior is self.posterior else 0.0,
+            **facts,
+        )
+
+    def shift(self, fit: LocalFit) -> float:
+        """Return the largest shift of the actuator's parameters, in sds of both fits together."""
+        table = self.posterior.only.table
+        mine = [
+            row
+            for row, name in enumerate(self.posterior.names)
+            if name in self.posterior.table.physical and name not in table.of_scope("record")
+        ]
+        variance = np.diag(self.fit.covariance)[mine] + np.diag(fit.covariance)[mine]
+        moved = np.abs(fit.coordinates[mine] - self.fit.coordinates[mine]) / np.sqrt(variance)
+        return float(np.max(moved, initial=0.0))

@@ -1,0 +1,177 @@
+"""Shapes in a series of numbers: turning points, runs, spikes, trends and decays.
+
+They know nothing of records: :mod:`bwbayes.diagnosis.record_checks` looks for them in voltages,
+displacements and the part of a displacement that the voltage does not explain; a fit's residual
+can be looked at in the same way.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = [
+    "DecayingStart",
+    "decay",
+    "find_gross_outliers",
+    "runs",
+    "scatter",
+    "spikes",
+    "trend",
+    "turning_points",
+]
+
+# A normal distribution's sd over its median absolute deviation.
+NORMAL = 1.4826
+
+# Samples in the median that a spike is held against: two beside each other are a spike still.
+NEIGHBOURS = 5
+
+# Times the range of a line through the values, and of most residuals, that no actuator's
+# hysteresis, lag, creep or ringing lies off that line.
+GROSS = 2.0
+
+# Rounds of reweighting to the line of least absolute deviations.
+REWEIGHTED = 30
+
+
+class DecayingStart(NamedTuple):
+    """``size exp(-t / time)`` from the first sample on: size in the values' unit, time in s."""
+
+    size: float
+    time: float
+
+
+def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the first index and the length of every run of true values."""
+    edges = np.diff(mask.astype(np.int8), prepend=0, append=0)
+    first = np.flatnonzero(edges == 1)
+    return first, np.flatnonzero(edges == -1) - first
+
+
+def scatter(values: FloatArray) -> float:
+    """Return the sd of values about their median, whatever a minority of them is."""
+    return NORMAL * float(np.median(np.abs(values - np.median(values))))
+
+
+def turning_points(values: FloatArray, least: float) -> IntArray:
+    """Return the samples at which values (samples,) turn by more than `least`, ends included."""
+    steps = np.sign(np.diff(values))
+    moving = np.flatnonzero(steps)
+    if not moving.size:
+        return np.array([0, values.size - 1])
+    turns = moving[1:][np.diff(steps[moving]) != 0]
+    kept = [0]
+    direction, extreme = 0.0, 0
+    # Over local extremes alone; an extreme counts once the way back from it is long enough.
+    for at in [*turns.tolist(), values.size - 1]:
+        value = values[at]
+        if direction == 0.0:
+            if abs(value - values[0]) > least:
+                direction, extreme = float(np.sign(value - values[0])), at
+        elif direction * (value - values[extreme]) >= 0:
+            extreme = at
+        elif direction * (values[extreme] - value) > least:
+            kept.append(extreme)
+            direction, extreme = -direction, at
+    last = extreme if direction else values.size - 1
+    return np.array([*kept, *([last] if last != kept[-1] else [])])
+
+
+def spikes(
+    values: FloatArray,
+    drive: FloatArray | None = None,
+    least: float = 0.0,
+    *,
+    ends: bool = False,
+) -> IntArray:
+    """Return the samples of isolated outliers in values (samples,).
+
+    A spike is one or two samples that lie off the median of their neighbourhood by eight times what
+    is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
+    unit, has a spike of its own nearby, the values may have one of twice its size. With `ends` the
+    first and the last value may be spikes too, though a fast transient begins like one.
+    """
+    off = _off_median(values, ends)
+    allowed = np.zeros_like(values)
+    if drive is not None:
+        allowed = 2 * maximum_filter1d(np.abs(_off_median(drive, ends)), 2 * NEIGHBOURS + 1)
+    usual = scatter(off[off != 0]) if np.any(off) else 0.0
+    limit = max(8 * usual, least) + allowed
+    suspects = np.flatnonzero(np.abs(off) > limit)
+    # A spike moves its neighbours' medians too. The largest comes first, and a straight line takes
+    # its place before the next is judged.
+    half = NEIGHBOURS // 2
+    rest = np.pad(values, half, mode="reflect" if ends else "edge")
+    isolated = np.zeros(rest.size, dtype=np.bool_)
+    for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
+        middle = np.sort(rest[at - half : at + half + 1])[half]
+        if abs(rest[at] - middle) > limit[at - half]:
+            isolated[at] = True
+            before = after = at
+            while isolated[before]:
+                before -= 1
+            while isolated[after]:
+                after += 1
+            rest[before : after + 1] = np.linspace(rest[before], rest[after], after - before + 1)
+    return np.flatnonzero(isolated[half:])
+
+
+def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
+    """Return the samples of isolated values (samples,) that are far off the range of all others.
+
+    They lie off the line of least absolute deviations through `values` over `drive` (samples,),
+    which a minority does not move, by more than twice the range of that line and of the central
+    80% of the residuals. Ranges and fits are to be taken without them.
+    """
+    line = np.stack([np.ones_like(drive), drive - drive.mean()])
+    weights = np.ones_like(values)
+    for _ in range(REWEIGHTED):
+        # Sums, without the threads of a linear algebra library.
+        products = np.einsum("in,n,jn->ij", line, weights, line)
+        pulls = np.einsum("in,n,n->i", line, weights, values)
+        coefficients = np.linalg.lstsq(products, pulls)[0]
+        off = np.abs(values - coefficients @ line)
+        weights = 1 / np.maximum(off, 1e-6 * max(float(np.median(off)), 1e-300))
+        weights /= weights.max()
+    low, high = np.quantile(values - coefficients @ line, (0.1, 0.9))
+    far = off > GROSS * (abs(coefficients[1]) * np.ptp(drive) + high - low)
+    first, length = runs(far)
+    short = length <= NEIGHBOURS // 2
+    gross: IntArray = np.union1d(first[short], (first + length - 1)[short])
+    return gross
+
+
+def _off_median(values: FloatArray, ends: bool) -> FloatArray:
+    mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
+    off: FloatArray = values - median_filter(values, NEIGHBOURS, mode=mode)
+    return off
+
+
+def decay(time: FloatArray, values: FloatArray, longest: float) -> DecayingStart:
+    """Return the exponential decay from the first sample on that explains most of the values.
+
+    Parameters
+    ----------
+    time, values : arrays (samples,)
+        Times in s, not necessarily uniform; a constant in the values is taken out.
+    longest : float, s
+        Longest time constant to look for; the shortest is the first interval.
+    """
+    elapsed = time - time[0]
+    times = np.geomspace(max(elapsed[1], longest * 1e-6), longest, 40)
+    shapes = np.exp(-elapsed[:, np.newaxis] / times)
+    shapes -= shapes.mean(axis=0)
+    centred = values - values.mean()
+    sizes = shapes.T @ centred / (shapes**2).sum(axis=0)
+    best = int(np.argmax(sizes**2 * (shapes**2).sum(axis=0)))
+    return DecayingStart(float(sizes[best]), float(times[best]))
+
+
+def trend(time: FloatArray, values: FloatArray) -> float:
+    """Return how far a straight line through the values goes from the first to the last time."""
+    return float(np.polyfit(time - time.mean(), values, 1)[0] * np.ptp(time))

@@ -1,0 +1,132 @@
+"""Creep that a record cannot show, added to a fit for what it is to predict.
+
+Every piezo actuator creeps, by one or two percent of the displacement a decade of time, and a short
+record of a fast drive cannot tell: what creeps within a period is part of the gain there, and what
+takes longer than the record is not in it. A slow plan or a long hold brings it out. So a fit that
+has no creep is extended for its predictions: lags reach from the drive that was fitted to the
+plan's length, and their strengths keep the prior where the readings say nothing of them.
+
+The coordinates z of the longer model are found from the fit's by Gauss and Newton's steps,
+
+    H = I + Q,   z → z + H⁻¹ (u − Q z),
+
+where u and I are what the likelihood says of the slopes of the readings in z, the noise held
+(:meth:`~bwbayes.inference.likelihood.Likelihood.score`), and Q is the prior's precision: one, but
+between the strengths, which are alike. Strengths c are drawn from the normal distribution of that
+mode, and each draw of the fit moves with its own, by the mode's move and −H_φφ⁻¹ H_φc (c − ĉ): the
+gain of a fast drive gives way to the creep in it, and what is predicted of such a drive stays as it
+was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.creep import Creep, creep_times
+from bwbayes.model.drive import time_between_turns
+from bwbayes.model.operator import Span
+
+__all__ = ["with_creep"]
+
+# Strengths a decade of time apart are alike: creep goes with the logarithm of the time.
+ALIKE = 0.9
+
+# Creep that is so many times as fast as the drive between turning points is part of its gain.
+FAST = 100.0
+
+# Step of the slopes, in prior sds, and steps to the mode.
+STEP, ROUNDS = 1e-3, 4
+
+
+def with_creep(
+    posterior: Posterior, draws: FloatArray, duration: float, generator: np.random.Generator
+) -> tuple[Posterior, FloatArray]:
+    """Return a fit's posterior with creep in its model, and its draws with strengths of creep.
+
+    Parameters
+    ----------
+    posterior
+        What was fitted. A model with creep of its own is returned as it is.
+    draws
+        Its draws, (draws, free), parameters in their own units.
+    duration
+        What is to be predicted, s.
+    generator
+        Draws the strengths.
+    """
+    if any(one.actuator.creep for one in posterior.datasets):
+        return posterior, draws
+    creep = _creep(posterior, duration)
+    extended = _extended(posterior, creep)
+    columns = dict(zip(posterior.names, draws.T, strict=True))
+    columns |= {name: np.zeros(len(draws)) for name in creep.names}
+    places = extended.prior.unconstrain(np.stack([columns[n] for n in extended.names], axis=1))
+    strengths = np.array([extended.names.index(name) for name in creep.names])
+    moving = [i for i, n in enumerate(extended.names) if n in extended.table.physical]
+    others = np.setdiff1d(moving, strengths)
+    apart = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
+    prior = np.eye(len(extended.names))
+    prior[np.ix_(strengths, strengths)] = np.linalg.inv(ALIKE**apart)
+
+    begin = places.mean(axis=0)
+    mode, bend = begin.copy(), prior
+    for _ in range(ROUNDS):
+        pull, information = _score(extended, mode)
+        bend = information + prior
+        step = np.linalg.solve(bend[np.ix_(moving, moving)], (pull - prior @ mode)[moving])
+        mode[moving] += step
+    follow = np.linalg.solve(bend[np.ix_(others, others)], bend[np.ix_(others, strengths)])
+    precision = bend[np.ix_(strengths, strengths)] - bend[np.ix_(strengths, others)] @ follow
+    covariance = np.linalg.inv((precision + precision.T) / 2)
+    crept = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))
+    places[:, others] += (mode - begin)[others] - (crept - mode[strengths]) @ follow.T
+    places[:, strengths] = crept
+    return extended, extended.prior.constrain(places)[0]
+
+
+def _creep(posterior: Posterior, duration: float) -> Creep:
+    """Return creep from what is as fast as the drives that were fitted to a plan's length."""
+    turns = [
+        time_between_turns(one.voltage, one.actuator.interval, one.training)
+        for one in posterior.datasets
+    ]
+    interval = max(min(one.actuator.interval for one in posterior.datasets), min(turns) / FAST)
+    longest = max(one.voltage.size * one.actuator.interval for one in posterior.datasets)
+    spans = [one.span for one in posterior.datasets]
+    span = Span(min(span.low for span in spans), max(span.high for span in spans))
+    return Creep(tuple(creep_times(interval, max(duration, longest))), reference=span)
+
+
+def _extended(posterior: Posterior, creep: Creep) -> Posterior:
+    """Return the posterior of the same records with creep."""
+    datasets = tuple(
+        replace(one, actuator=replace(one.actuator, creep=creep)) for one in posterior.datasets
+    )
+    known = {parameter.name: parameter for parameter in posterior.prior.parameters}
+    known |= {one.name: Parameter.of(one, creep.strength) for one in creep.parameters}
+    joint = replace(posterior.table, table=datasets[0].table)
+    prior = JointPrior((known[name] for name in joint.names), posterior.prior.constraint)
+    return Posterior(datasets, prior, posterior.engine, joint)
+
+
+def _score(posterior: Posterior, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return u (free,) and I (free, free) of the coordinates at a place (free,)."""
+    steps = STEP * np.eye(place.size)
+    around = np.concatenate([[place], place + steps, place - steps])
+    theta = posterior.prior.theta(posterior.prior.constrain(around)[0])
+    pull, information = np.zeros(place.size), np.zeros((place.size, place.size))
+    for one, likelihood in zip(posterior.datasets, posterior.likelihoods, strict=True):
+        own = posterior.table.of(theta, one.name)
+        voltage = one.voltage[: one.readings.samples]
+        model = one.table.actuator(own)
+        simulated = likelihood.simulate(model, voltage)[:, one.readings.rows]
+        here, plus, minus = np.split(simulated, [1, 1 + place.size])
+        score = likelihood.score(own[:1], (plus - minus) / (2 * STEP), here)
+        pull += score.pull[0]
+        information += score.information[0]
+    return pull, information

@@ -1,0 +1,163 @@
+"""An operator's step, compiled: the same function as NumPy's, for one model after the other.
+
+What is compiled takes a step as an argument, whose type it is compiled for: so an operator of any
+module is as fast as one of this package, and a run compiles what it needs. What is kept on disk is
+that of the sources as they are.
+
+It needs numba, which is loaded when something is compiled, not before.
+"""
+
+from __future__ import annotations
+
+import inspect
+import linecache
+import math
+from collections.abc import Callable, Mapping
+from hashlib import sha256
+from typing import Any, cast
+
+import numpy as np
+from numba import njit, types
+from numba.extending import (
+    NativeValue,
+    models,
+    overload,
+    register_jitable,
+    register_model,
+    typeof_impl,
+    unbox,
+)
+
+from bwbayes.model import elementwise
+from bwbayes.model.elementwise import anywhere, gone, look_up, select
+from bwbayes.model.operators.memory import RemembersExtrema
+from bwbayes.model.step import HysteresisStep
+
+__all__ = ["INNER", "FormulaType", "compiled", "everett", "move"]
+
+# What is called at each sample allocates nothing: to count who holds an array would take longer
+# than all of the arithmetic. It becomes a part of its caller's loop, or there would be no vectors.
+INNER: Mapping[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "nsz"},
+    "_nrt": False,
+    "forceinline": True,
+}
+
+
+# exp(r) by its series, for |r| up to log(2) / 2; log(2) in two parts, the first of few bits; and a
+# number that leaves no bits for less than one.
+SERIES = tuple(1 / math.factorial(order) for order in range(1, 15))
+LOG_2_HIGH, LOG_2_LOW = 0.6931471803691238, 1.9082149292705877e-10
+WHOLE = 1.5 * 2.0**52
+
+
+class FormulaType(types.Type):
+    """The type of what brings a formula, by its class and a digest of the formula's sources.
+
+    A step brings its ``move``, an operator that remembers extrema its ``everett``.
+    """
+
+    def __init__(self, kind: type, digest: str) -> None:
+        super().__init__(name=f"{kind.__module__}:{kind.__qualname__}@{digest}")
+        self.kind = kind
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let what is kept on disk be found again by the class's name."""
+        return FormulaType, (self.kind, self.name.rsplit("@", 1)[1])
+
+
+@typeof_impl.register(HysteresisStep)
+@typeof_impl.register(RemembersExtrema)
+def _type_of(formula: HysteresisStep | RemembersExtrema, _: Any) -> FormulaType:
+    kind: Any = type(formula)
+    # To read the sources takes longer than a short record: a class does so once.
+    if "_numba_type_" not in vars(kind):
+        function = kind.everett if issubclass(kind, RemembersExtrema) else kind.move
+        files = sorted({inspect.getfile(inner) for inner in _functions(function)})
+        # Which knows the cells of a notebook too.
+        lines = (line for file in files for line in linecache.getlines(file))
+        kind._numba_type_ = FormulaType(kind, sha256("".join(lines).encode()).hexdigest()[:16])
+    return cast("FormulaType", kind._numba_type_)
+
+
+register_model(FormulaType)(models.OpaqueModel)
+
+
+@unbox(FormulaType)  # type: ignore[no-untyped-call, untyped-decorator]
+def _unboxed(kind: Any, formula: Any, context: Any) -> Any:  # noqa: ARG001  # its type says all
+    return NativeValue(context.context.get_dummy_value())  # type: ignore[no-untyped-call]
+
+
+def move(step: Any, parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+    """Return what the ``move`` of a step's class does: of numbers here, where it is compiled."""
+    result: tuple[Any, Any] = step.move(parameters, memory, voltage, after)
+    return result
+
+
+@overload(move, jit_options=cast("Any", INNER), strict=False)
+def _move(step: Any, parameters: Any, memory: Any, voltage: Any, after: Any) -> Any:  # noqa: ARG001
+    """Return the function of a step's class, with all that it calls made known to numba."""
+    inner = compiled(step.kind.move)
+    return lambda step, parameters, memory, voltage, after: inner(  # noqa: ARG005
+        parameters, memory, voltage, after
+    )
+
+
+def everett(operator: Any, numbers: Any, start: Any, voltage: Any) -> Any:
+    """Return what the ``everett`` of an operator's class does: of numbers, where it is compiled."""
+    return operator.everett(numbers, start, voltage)
+
+
+@overload(everett, jit_options=cast("Any", INNER), strict=False)
+def _everett(operator: Any, numbers: Any, start: Any, voltage: Any) -> Any:  # noqa: ARG001
+    """Return the function of an operator's class, with all that it calls made known to numba."""
+    inner = compiled(operator.kind.everett)
+    return lambda operator, numbers, start, voltage: inner(numbers, start, voltage)  # noqa: ARG005
+
+
+def compiled[Function: Callable[..., Any]](function: Function) -> Function:
+    """Return a function of numbers, compiled, with all that it calls made known to numba."""
+    for helper in _functions(function)[1:]:
+        register_jitable(**INNER)(helper)
+    return cast("Function", njit(**INNER)(function))
+
+
+def _functions(function: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """Return a function and all of Python's that it calls, but those that numba knows already."""
+    functions, names = [function], set(function.__code__.co_names)
+    for name in sorted(names - set(elementwise.__all__)):
+        helper = function.__globals__.get(name)
+        if inspect.isfunction(helper):
+            functions += [f for f in _functions(helper) if f not in functions]
+    return functions
+
+
+overload(anywhere)(lambda condition: lambda condition: condition)  # noqa: ARG005
+overload(select)(
+    lambda condition, yes, no: lambda condition, yes, no: yes if condition else no  # noqa: ARG005
+)
+overload(look_up)(lambda rows, index: lambda rows, index: rows[np.intp(index)])  # noqa: ARG005
+
+
+@overload(gone, jit_options=cast("Any", INNER))
+def _gone(z: Any) -> Any:  # noqa: ARG001
+    """Return 1 − exp(−z) without a call, so that a compiler makes vectors of it.
+
+    exp(−z) is 2⁻ᵏ exp(r) with k whole, whose bits are put where a number's exponent is.
+    """
+
+    def without_call(z: Any) -> Any:
+        z = min(z, 708.0)
+        shifted = z * (1.0 / math.log(2.0)) + WHOLE
+        k = shifted - WHOLE
+        r = (k * LOG_2_HIGH - z) + k * LOG_2_LOW
+        series = SERIES[12]
+        for order in range(11, -1, -1):
+            series = SERIES[order] + r * series
+        bits = np.float64(shifted).view(np.int64)
+        scale = np.int64((np.int64(1023) << 52) - (bits << 52)).view(np.float64)
+        return (1.0 - scale) - scale * (r * series)
+
+    return without_call

@@ -1,0 +1,268 @@
+"""Hysteresis that relaxes along the voltage's path, as a step: Bouc-Wen with n = 1 and its kin.
+
+The hysteretic displacement h behind a curve f follows the voltage u with a strength a and a rate c,
+
+    w = f(u) − h,   f = d u + d₂ u² + d₃ u³,   dg/dv = a(u) − c g,   a = α + α₁ u + α₂ u²,
+
+along a piece of direction s, with v = |u − u₀| and g = s h. The rate may be one below g = 0 and
+another above, and may depend on the signs of s and u. Between zeros of g and u it is exact:
+
+    g = g₀ + v [(a(u₀) − c g₀) φ₁ + v (s a′(u₀) φ₂ + v a″ φ₃)],   φ at −c v.
+
+So Bouc-Wen with n = 1, asymmetric or not, backlash-like and Duhem loops are one step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.elementwise import anywhere, select
+from bwbayes.model.operator import Span
+from bwbayes.model.step import OneStateStep
+from bwbayes.shown import brief
+
+__all__ = [
+    "BENT", "SHORT", "RelaxingStep", "bent", "phi_functions", "relax", "relaxed",
+    "series", "third",
+]  # fmt: skip
+
+# Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
+TINY = 1e-100
+
+# With a rate below zero, h has left any start and passed zero when it has grown by exp of this.
+LARGEST = 100.0
+
+# With a rate below zero, h = α / c is a state of unstable rest, and for β = 0 it is the ceiling
+# itself. A start that rounding puts on it or beyond is taken to lie this fraction of the way there.
+INSIDE = 1 - 1e-14
+
+# φ₁(−z) = Σ (−z)^k / (k + 1)! and φ₃(−z) = Σ (−z)^k / (k + 3)!, to 3e-14 up to so large a z.
+SHORT, BENT = 0.1, 0.25
+SERIES, THIRD = (
+    tuple((-1.0) ** k / math.factorial(k + order) for k in range(9)) for order in (1, 3)
+)
+
+# Below this argument the φ functions are summed as a series of so many terms, which is exact there;
+# above it nothing cancels in their recursion.
+NEAR, TERMS = 1.0, 16
+INVERSE_FACTORIALS = tuple(1 / math.factorial(order) for order in range(TERMS + 2, 2, -1))
+
+
+@dataclass(frozen=True)
+class RelaxingStep(OneStateStep):
+    """w = f(u) − h, with h that relaxes along the voltage's path: dg/dv = a(u) − c g, g = s h.
+
+    Parameters
+    ----------
+    curve
+        d, d₂ and d₃, (3, models), um/V, um/V² and um/V³.
+    strength
+        α, α₁ and α₂, (3, models), um/V, um/V² and um/V³.
+    against, ahead
+        c for g < 0 and from there on, 1/V, (2, 2, models): for s and the voltage's sign of −1 and
+        1. Where one is not the other, α₁ and α₂ are zero.
+    """
+
+    __repr__ = brief
+
+    curve: FloatArray
+    strength: FloatArray
+    against: FloatArray
+    ahead: FloatArray
+
+    @classmethod
+    def alike(
+        cls, d: FloatArray, alpha: FloatArray, against: FloatArray, ahead: FloatArray
+    ) -> RelaxingStep:
+        """Return one with constants d, α, um/V, and rates that know no signs, 1/V, (models,)."""
+        curve, strength = np.zeros((2, 3, d.size))
+        curve[0], strength[0] = d, alpha
+        rates = np.empty((2, 2, 2, d.size))
+        rates[0], rates[1] = against, ahead
+        return cls(curve, strength, *rates)
+
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """d, d2, d3, α, α1, α2, and the rates c against and ahead, by direction and sign."""
+        numbers = np.empty((self.curve.shape[1], 14))
+        rows = numbers.T
+        rows[:3], rows[3:6] = self.curve, self.strength
+        rows[6:10], rows[10:] = self.against.reshape(4, -1), self.ahead.reshape(4, -1)
+        rates = numbers[:, 6:]
+        rates[np.abs(rates) < TINY] = TINY
+        return numbers
+
+    @cached_property
+    def signed(self) -> bool:
+        """Whether any model's rates know the signs of the voltage or its direction."""
+        rates = self.parameters[:, 6:].reshape(-1, 2, 4)
+        return bool((rates != rates[..., :1]).any())
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return f(u) − h and its slope f′ − a + c g."""
+        alpha, alpha1, alpha2 = parameters[3], parameters[4], parameters[5]
+        start, up = memory[0], voltage >= memory[0]
+        s, travel = select(up, 1.0, -1.0), np.abs(voltage - start)
+        # The travel to zero volts, if that is ahead: there the rates may change.
+        early = select(s * start < 0.0, np.minimum(np.abs(start), travel), travel)
+        toward = s * start < 0.0
+        against = select(
+            toward,
+            select(up, parameters[8], parameters[7]),
+            select(up, parameters[9], parameters[6]),
+        )
+        ahead = select(
+            toward,
+            select(up, parameters[12], parameters[11]),
+            select(up, parameters[13], parameters[10]),
+        )
+        strength, tilt = alpha + start * (alpha1 + start * alpha2), alpha1 + 2.0 * start * alpha2
+        g, rate = relaxed(s * memory[1], early, strength, s * tilt, 2.0 * alpha2, against, ahead)
+        if anywhere(travel > early):
+            late = travel - early
+            against = select(up, parameters[9], parameters[6])
+            ahead = select(up, parameters[13], parameters[10])
+            further, faster = relaxed(g, late, alpha, s * alpha1, 2.0 * alpha2, against, ahead)
+            g, rate = select(late > 0.0, further, g), select(late > 0.0, faster, rate)
+        after[0], after[1] = voltage, s * g
+        w = voltage * (parameters[0] + voltage * (parameters[1] + voltage * parameters[2])) - s * g
+        slope = parameters[0] + voltage * (2.0 * parameters[1] + 3.0 * voltage * parameters[2])
+        return w, slope - (alpha + voltage * (alpha1 + voltage * alpha2)) + rate * g
+
+    def along(
+        self, start: float, state: FloatArray, voltage: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w and h along voltages that go one way, as of :class:`OneStateStep`."""
+        d, d2, d3 = self.parameters.T[:3, :, np.newaxis]
+        s = -1.0 if voltage[-1] < start else 1.0
+        g, early = np.empty((state.size, voltage.size)), 0
+        if self.signed and s * start < 0.0:
+            # At zero volts the rates change.
+            early = int(np.searchsorted(s * voltage, 0.0))
+            to_zero = np.append(voltage[:early], 0.0)
+            before = self._with_sign(-s, s, start, s * state, to_zero)
+            g[:, :early], state, start = before[:, :-1], s * before[:, -1], 0.0
+        if early < voltage.size:
+            g[:, early:] = self._with_sign(s, s, start, s * state, voltage[early:])
+        h = s * g
+        return voltage * (d + voltage * (d2 + voltage * d3)) - h, h
+
+    def _with_sign(
+        self, sign: float, s: float, start: float, g: FloatArray, voltage: FloatArray
+    ) -> FloatArray:
+        """Return g = s h (models, samples) along voltages (samples,) with a sign, from a start."""
+        numbers, pair = self.parameters.T[:, :, np.newaxis], 2 * (s > 0) + (sign > 0)
+        alpha, alpha1, alpha2, against = *numbers[3:6], numbers[6 + pair]
+        strength, tilt = alpha + start * (alpha1 + start * alpha2), alpha1 + 2.0 * start * alpha2
+        lowest = np.where(against < 0.0, INSIDE * strength / against, -np.inf)
+        begin, travel = np.maximum(g[:, np.newaxis], lowest), np.abs(voltage - start)
+        ahead, bend = numbers[10 + pair], 2.0 * alpha2
+        g, _ = relaxed(begin, travel, strength, s * tilt, bend, against, ahead)
+        return g
+
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
+        """Return d − α + c g at the ceilings: h is steepest just after a turn. f and a are even."""
+        d, alpha = self.curve[0], self.strength[0]
+        tops = alpha / np.maximum(self.ahead.min(axis=1), TINY)
+        lowest = alpha + np.max(np.maximum(self.against, 0.0) * tops[::-1, np.newaxis], axis=(0, 1))
+        highest = np.max(self.ahead * tops[:, np.newaxis], axis=(0, 1)) - alpha
+        return d - lowest, d + np.maximum(highest, 0.0)
+
+    def coefficients(self) -> dict[str, tuple[Any, str]]:
+        """Return d to d₃ and α to α₂, but zeros, and the rates, by signs if they differ."""
+        names = ("d", "d2", "d3", "alpha", "alpha1", "alpha2")
+        units = ("um/V", "um/V^2", "um/V^3") * 2
+        values = self.parameters[0, :6].tolist()
+        rows = zip(names, values, units, strict=True)
+        slopes = {name: (value, unit) for name, value, unit in rows if value or name == "d"}
+        rates = {"against": self.parameters[0, 6:10], "ahead": self.parameters[0, 10:]}
+        return slopes | {
+            name: (rate.reshape(2, 2).tolist() if self.signed else float(rate[0]), "1/V")
+            for name, rate in rates.items()
+        }
+
+
+def relaxed(
+    g: Any, travel: Any, strength: Any, tilt: Any, bend: Any, against: Any, ahead: Any
+) -> tuple[Any, Any]:
+    """Return g = s h after a travel, V, in direction s, and the rate c then.
+
+    dg/dv = a − c g, with the rate c against for g < 0 and ahead from there on, 1/V, and a, um/V, at
+    first the strength, with the first derivative tilt and the second one bend by v.
+    """
+    rate = select(g < 0.0, against, ahead)
+    reached = relax(g, travel, strength, rate, phi(rate * travel))
+    if anywhere((tilt != 0.0) | (bend != 0.0)):
+        phi_1, phi_2, phi_3 = phi_functions(rate * travel)
+        reached = bent(g, travel, strength, rate, tilt, bend, phi_1, phi_2, phi_3)
+    passed = (g < 0.0) & (reached > 0.0) & (against != ahead)
+    if anywhere(passed):
+        # Models that do not pass need not have a place where they would.
+        lost = np.maximum(-np.minimum(g, 0.0) * against / strength, -INSIDE)
+        remaining = np.maximum(travel - np.log1p(lost) / against, 0.0)
+        reached = select(passed, strength * remaining * phi(ahead * remaining), reached)
+        rate = select(passed, ahead, rate)
+    return reached, rate
+
+
+def relax(g: Any, travel: Any, strength: Any, rate: Any, phi_1: Any) -> Any:
+    """Return g after a travel with a constant strength, with φ₁ at minus the rate times it."""
+    return g + (strength - rate * g) * (travel * phi_1)
+
+
+def bent(
+    g: Any, travel: Any, strength: Any, rate: Any, tilt: Any, bend: Any, phi_1: Any, phi_2: Any,
+    phi_3: Any,
+) -> Any:  # fmt: skip
+    """Return the same where the strength changes, with φ₁, φ₂ and φ₃ there."""
+    return g + travel * (
+        (strength - rate * g) * phi_1 + travel * (tilt * phi_2 + travel * (bend * phi_3))
+    )
+
+
+def series(z: Any) -> Any:
+    """Return φ₁(−z) = (1 − exp(−z))/z where z is small."""
+    end = SERIES[4] + z * (SERIES[5] + z * (SERIES[6] + z * SERIES[7]))
+    return SERIES[0] + z * (SERIES[1] + z * (SERIES[2] + z * (SERIES[3] + z * end)))
+
+
+def third(z: Any) -> Any:
+    """Return φ₃(−z) = (1/2 − φ₂(−z))/z where z is small."""
+    end = THIRD[4] + z * (THIRD[5] + z * (THIRD[6] + z * (THIRD[7] + z * THIRD[8])))
+    return THIRD[0] + z * (THIRD[1] + z * (THIRD[2] + z * (THIRD[3] + z * end)))
+
+
+def phi(z: Any) -> Any:
+    """Return φ₁(−z) = (1 − exp(−z))/z, by its series where z is small."""
+    if anywhere(np.abs(z) > SHORT):
+        grown = np.expm1(np.minimum(-z, LARGEST))
+        return select(z == 0.0, 1.0, -grown / select(z == 0.0, 1.0, z))
+    return series(z)
+
+
+def phi_functions(z: Any) -> tuple[Any, Any, Any]:
+    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0, a number or an array, to rounding.
+
+    φ₁(−z) = (1 − exp(−z))/z, φ₂(−z) = (1 − φ₁)/z, φ₃(−z) = (1/2 − φ₂)/z; at zero they are 1, 1/2
+    and 1/6. Each falls with z and stays positive.
+    """
+    near = np.minimum(z, NEAR)
+    phi_3 = 0.0 * near
+    for order in range(TERMS):
+        phi_3 = phi_3 * -near + INVERSE_FACTORIALS[order]
+    phi_2 = 0.5 - near * phi_3
+    phi_1 = 1.0 - near * phi_2
+    if anywhere(z > NEAR):
+        large = np.maximum(z, NEAR)
+        one_far = -np.expm1(-large) / large
+        two_far = (1.0 - one_far) / large
+        phi_3 = select(z > NEAR, (0.5 - two_far) / large, phi_3)
+        phi_2, phi_1 = select(z > NEAR, two_far, phi_2), select(z > NEAR, one_far, phi_1)
+    return phi_1, phi_2, phi_3

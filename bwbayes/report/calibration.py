@@ -1,0 +1,187 @@
+"""What a simulation-based calibration says: verdict, tests and their power, numbers, pictures."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import product
+
+from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
+from bwbayes.report.words import symbol, unit_text
+from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration, summary
+from bwbayes.results.replicates import RANKED
+
+__all__ = ["calibration_report"]
+
+# What is ranked besides parameters: its name, and its unit.
+EXTRA_WORDS = {
+    "log_likelihood": ("log likelihood", "-"),
+    "opening": ("loop opening", "um"),
+    "range": ("displacement range", "um"),
+}
+
+
+def calibration_report(calibration: Calibration) -> Report:
+    """Return what a calibration says: whether it has passed, the tests, and what was run."""
+    bands = _bands(calibration)
+    return Report(
+        title=f"{calibration.name}, simulation-based calibration",
+        heading=f"Simulation-based calibration: {calibration.name}",
+        banners=_banners(calibration),
+        blocks=[
+            _statistics(calibration),
+            *[Section("Bands on samples that were not fitted", [bands], folded=False)]
+            * bool(bands.rows),
+            Section("Pictures", _pictures(calibration), folded=False),
+            Section("Tests", _tests(calibration), folded=False),
+            Section("Priors", [_priors(calibration)]),
+            Section("Settings", [Facts(calibration.facts)]),
+        ],
+        numbers=summary(calibration),
+    )
+
+
+def _banners(calibration: Calibration) -> list[Banner]:
+    unconverged = calibration.unconverged
+    counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
+    if not calibration.passed:
+        verdict = Banner("bad", "NOT PASSED", [counts], calibration.shortcomings)
+    elif calibration.telling:
+        verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
+    else:
+        verdict = Banner(
+            "note",
+            "Passed, with too few replicates",
+            [f"{counts}; so few replicates may well miss sds a fifth too small; make more"],
+        )
+    numbers = ", ".join(str(number) for number in unconverged)
+    line = f"not converged, and counted with the others: replicates {numbers}"
+    return [verdict, *[Banner("note", "Replicates that did not converge", [line])] * bool(numbers)]
+
+
+def _statistics(calibration: Calibration) -> Table:
+    """Return a row for each statistic, and the limits of its intervals' coverage."""
+    words = {p.name: (p.description, p.unit) for p in calibration.parameters} | EXTRA_WORDS
+    rows = [
+        (
+            name,
+            words[name][0],
+            unit_text(words[name][1]),
+            f"{uniformity.p:.2g}",
+            f"{uniformity.adjusted:.2g}",
+            "leaves band" if uniformity.outside else "inside",
+            *(f"{uniformity.covered[level]:.1%}" for level in LEVELS),
+        )
+        for name, uniformity in calibration.statistics.items()
+    ]
+    limits = (
+        f"{low:.1%} to {high:.1%}" for low, high in map(calibration.limits.__getitem__, LEVELS)
+    )
+    rows.append(("", "99 % binomial limits", "", "", "", "", *limits))
+    return Table(
+        "statistics",
+        "Ranks and intervals",
+        (
+            TableColumn("Name", on="screen"),
+            TableColumn("Statistic", on="page"),
+            TableColumn("Unit", on="page"),
+            "p",
+            "p adjusted",
+            "ECDF",
+            *(f"{level} %" for level in LEVELS),
+        ),
+        rows,
+        note="p: of the smooth test of the ranks; adjusted for the number of statistics, by Holm. "
+        "ECDF: whether their distribution leaves its band. Percent: how often the central interval "
+        "holds the truth; shown with its limits, judged through the ranks.",
+        on="both",
+    )
+
+
+def _bands(calibration: Calibration) -> Table:
+    """Return a row for each kind of band of held-out windows and of other records, if any."""
+    rows = []
+    for record, kind in product(calibration.predicted, KINDS):
+        coverages = [calibration.bands[f"{record} {kind} {level}".strip()] for level in LEVELS]
+        texts = (f"{coverage.mean:.1%} ± {coverage.error:.1%}" for coverage in coverages)
+        rows.append((kind, record or "held-out samples", *texts))
+    return Table(
+        "bands",
+        "Coverage of the bands",
+        ("Band", "Of", *(f"{level} %" for level in LEVELS)),
+        rows,
+        note=f"Mean over replicates, and its standard error from the spread between them; from "
+        f"{JUDGED_FROM} replicates on, each must be within 3 of what the band promises (by chance, "
+        "at most one sound calibration of 40 has one that is not). The parameter band should hold "
+        "the model's displacement at the true parameters, the displacement band the simulated "
+        "displacement with its discrepancy, the sensor band the simulated reading. Another record "
+        "is made with the same truth, and has a start and an offset of its own.",
+        on="both",
+    )
+
+
+def _pictures(calibration: Calibration) -> list[Picture]:
+    from bwbayes.report.figures import calibration as figures  # noqa: PLC0415  # slow to load
+
+    return [
+        Picture(
+            "rank_histograms",
+            "Ranks",
+            "Where the truth lies among the posterior's draws, over all replicates. Level is "
+            "right; a bowl means posteriors that are too narrow, a hump too wide, a slope a bias.",
+            partial(figures.draw_histograms, calibration),
+        ),
+        Picture(
+            "rank_ecdf",
+            "Distribution of the ranks",
+            "The ranks' cumulative distribution less that of even ranks, with the band that even "
+            "ranks leave anywhere no more often than the stated level allows; p of the smooth "
+            "test.",
+            partial(figures.draw_ecdf, calibration),
+        ),
+        Picture(
+            "coverage",
+            "Coverage",
+            "Left: how often the posteriors' central intervals hold the truth. Right: how far the "
+            "coverage of the bands on held-out samples is off what they promise.",
+            partial(figures.draw_coverage, calibration),
+        ),
+    ]
+
+
+def _tests(calibration: Calibration) -> list[Text]:
+    count = len(calibration.statistics)
+    power = ", ".join(
+        f"{text} with a probability of {power:.2f}" for text, power in calibration.power.items()
+    )
+    return [
+        Text(
+            "Each replicate draws parameters from the prior, simulates a record with them, and "
+            "fits it as a run does. The truth is then ranked among "
+            f"{RANKED} independent draws of the posterior. If prior, model, likelihood and sampler "
+            "are right, every rank is as likely as any other."
+        ),
+        Text(
+            f"{2 * count} tests, two for each of {count} statistics, with a false alarm in "
+            f"{FAMILY_LEVEL:.0%} of sound calibrations: Neyman's smooth test with two terms, and "
+            "the simultaneous band around the ranks' distribution function."
+        ),
+        Text(
+            "The power of the smooth test of one statistic, with so many replicates: it finds "
+            f"posterior sds that are {power}.",
+            on="both",
+        ),
+    ]
+
+
+def _priors(calibration: Calibration) -> Table:
+    return Table(
+        "priors",
+        "Priors",
+        ("Parameter", "Symbol", "Prior", "Unit"),
+        [
+            (p.name, symbol(p).html, str(p.prior), unit_text(p.unit))
+            for p in calibration.parameters
+            if p.fixed is None
+        ],
+    )

@@ -1,0 +1,132 @@
+"""Reports as a page: one HTML file that needs nothing else, with one template for all of them.
+
+The numbers of a table come twice: rounded, to be read, and as they are, in the CSV behind its
+button. No script runs in a page but its own, and nothing is fetched.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from itertools import groupby
+from typing import NamedTuple
+from urllib.parse import quote
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from bwbayes.report.report import Report, Table, TableColumn
+
+__all__ = ["PagePlots", "Script", "csv_link", "fragment", "render"]
+
+# What a cell with a number begins with, or what stands for a number that is not known.
+NUMBER = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script of the page, and the digest by which the page allows it and no other."""
+
+    text: Markup
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256, as a Content-Security-Policy names it."""
+        return "sha256-" + b64encode(sha256(self.text.encode()).digest()).decode("ascii")
+
+
+class PagePlots(NamedTuple):
+    """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
+
+    What makes either is ``bwbayes.report.figures.interactive``.
+    """
+
+    drawn: Mapping[str, Markup]
+    scripts: Sequence[Script]
+
+
+NO_PLOTS = PagePlots({}, ())
+
+
+def render(report: Report, pictures: Mapping[str, bytes], plots: PagePlots = NO_PLOTS) -> str:
+    """Return a report's page.
+
+    Parameters
+    ----------
+    report
+        What is shown.
+    pictures
+        PNG files by name. A picture of the report without one is left out.
+    plots
+        What is shown in place of pictures where scripts run.
+    """
+    is_plotted = any(name in plots.drawn for name in pictures)
+    scripts = plots.scripts if is_plotted else ()
+    return (
+        _environment(pictures, plots)
+        .get_template("page.html.j2")
+        .render(report=report, scripts=scripts)
+    )
+
+
+def fragment(report: Report) -> str:
+    """Return what a notebook shows of a report, as HTML: what a screen shows."""
+    return _environment({}, NO_PLOTS).get_template("notebook.html.j2").render(report=report)
+
+
+def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment:
+    """Return the room of the templates, which know pictures and plots by name."""
+    environment = Environment(
+        loader=PackageLoader("bwbayes.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals |= {"pictures": pictures, "plots": plots.drawn}
+    environment.filters |= {
+        "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
+        "pixels": _pixels,
+        "csv_link": csv_link,
+        "is_wordy": _is_wordy,
+        "spans": _spans,
+    }
+    return environment
+
+
+def _pixels(png: bytes) -> tuple[int, int] | None:
+    """Return a picture's width and height, or None if it is no whole PNG."""
+    if not png.startswith(b"\x89PNG\r\n\x1a\n") or len(png) < 24:
+        return None
+    width, height = struct.unpack(">2I", png[16:24])
+    return width, height
+
+
+def _is_wordy(rows: Sequence[Sequence[str]]) -> list[bool]:
+    """Return, for each column, whether it holds words, which go to the left."""
+    return [not all(NUMBER.match(text) for text in column) for column in zip(*rows, strict=True)]
+
+
+def _spans(columns: Sequence[TableColumn]) -> list[tuple[str, int]]:
+    """Return the titles above those of the columns, but the first, with how many each spans."""
+    groups = groupby(columns[1:], key=lambda column: column.group)
+    return [(title, len(list(spanned))) for title, spanned in groups]
+
+
+def csv_link(table: Table) -> str:
+    """Return a table as CSV, as a data URI."""
+    if table.records:
+        frame = pd.DataFrame(table.records)
+    else:
+        columns, rows = table.cells("page")
+        titles, *texts = (
+            [Markup(escape(text)).striptags() for text in row]
+            for row in ([column.title for column in columns], *rows)
+        )
+        frame = pd.DataFrame(texts, columns=titles)
+    return "data:text/csv;charset=utf-8," + quote(frame.to_csv(index=False))

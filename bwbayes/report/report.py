@@ -1,0 +1,253 @@
+"""What a product has to say: a title, banners, tables, pictures and texts, in their order.
+
+A product describes itself by a :class:`Report`; :mod:`~bwbayes.report.screen`,
+:mod:`~bwbayes.report.page` and :mod:`~bwbayes.report.saving` show it. The page has all of it. The
+screen has the banners, and those tables and texts that are meant for it. A text is escaped where it
+is shown; a :class:`~markupsafe.Markup` is taken as HTML.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from bwbayes.results.standing import Standing
+
+if TYPE_CHECKING:
+    from matplotlib import figure
+
+__all__ = [
+    "Banner",
+    "Block",
+    "Facts",
+    "Figure",
+    "Glossary",
+    "Kind",
+    "Picture",
+    "Report",
+    "Section",
+    "SideBySide",
+    "Table",
+    "TableColumn",
+    "Text",
+    "kind_of",
+    "remarks_banner",
+    "standing_banner",
+]
+
+# A figure of matplotlib, which is loaded when something is drawn.
+type Figure = figure.Figure
+
+Target = Literal["both", "page", "screen", "nowhere"]
+Kind = Literal["good", "note", "bad"]
+
+type Block = Table | Picture | Facts | Text | Glossary | Section | SideBySide
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """A column of a table: its title, that of the columns about it, and where it is shown."""
+
+    title: str
+    group: str = ""
+    on: Target = "both"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a header for each row and column.
+
+    Parameters
+    ----------
+    name
+        Names it within the page, and its CSV.
+    caption
+        What it holds.
+    columns
+        A column each, or its title; the first one shown holds the headers of the rows.
+    rows
+        The texts of each row, one for each column.
+    records
+        The rows of the CSV behind the page's button, by column: numbers as they are. By default the
+        texts that are shown.
+    note
+        What is to be said below it on the page.
+    on
+        Where it is shown.
+    """
+
+    kind: ClassVar = "table"
+
+    name: str
+    caption: str
+    columns: Sequence[str | TableColumn]
+    rows: Sequence[Sequence[str]]
+    records: Sequence[Mapping[str, object]] = ()
+    note: str = ""
+    on: Target = "page"
+
+    def cells(self, target: Target) -> tuple[list[TableColumn], list[list[str]]]:
+        """Return the columns, and the texts of each row, that are shown on a screen or a page."""
+        columns = [
+            TableColumn(column) if isinstance(column, str) else column for column in self.columns
+        ]
+        shown = [i for i, column in enumerate(columns) if column.on in ("both", target)]
+        return [columns[i] for i in shown], [[row[i] for i in shown] for row in self.rows]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with what is said below it.
+
+    Parameters
+    ----------
+    name
+        Names it within the page, ``#loop``, and its file.
+    title, caption
+        What it shows, in a few words and at length.
+    draw
+        Draws it; none if it is drawn elsewhere.
+    alt
+        What one would see, for those who do not; by default the title.
+    """
+
+    kind: ClassVar = "picture"
+
+    name: str
+    title: str
+    caption: str
+    draw: Callable[[], Figure] | None = None
+    alt: str = ""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Subjects, and what is said of each: a table of two columns."""
+
+    kind: ClassVar = "facts"
+
+    pairs: Sequence[tuple[str, str]]
+    on: Target = "page"
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; a note in small letters."""
+
+    kind: ClassVar = "text"
+
+    text: str
+    note: bool = False
+    on: Target = "page"
+
+
+@dataclass(frozen=True)
+class Glossary:
+    """Terms and what they mean, in small letters."""
+
+    kind: ClassVar = "glossary"
+
+    pairs: Sequence[tuple[str, str]]
+    note: bool = True
+
+
+@dataclass(frozen=True)
+class Section:
+    """Blocks below a heading; folded, they are closed until the reader opens them."""
+
+    kind: ClassVar = "section"
+
+    title: str
+    blocks: Sequence[Block]
+    folded: bool = True
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Columns of blocks: beside each other where there is room."""
+
+    kind: ClassVar = "side"
+
+    columns: Sequence[Sequence[Block]]
+
+
+@dataclass(frozen=True)
+class Banner:
+    """How something came out: a headline in a color, with paragraphs, items of a list, and blocks.
+
+    On the screen the first line follows the headline, and ``label`` stands before each item, by
+    default the headline; ``blocks`` are for the page alone; ``name`` is for links to the banner.
+    """
+
+    kind: Kind
+    headline: str
+    lines: Sequence[str] = ()
+    items: Sequence[str] = ()
+    blocks: Sequence[Block] = ()
+    label: str = ""
+    on: Target = "both"
+    name: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """All that a product says.
+
+    Parameters
+    ----------
+    title
+        On the browser's tab, and at the top of the page unless ``heading`` is.
+    heading, about
+        The page's name, and what it is about in a line.
+    banners
+        How it came out; the first thing to see.
+    blocks
+        The answer, then why one may believe it, then what only some readers ask for.
+    numbers
+        What the JSON file holds, if there is one.
+    csv
+        The text of the CSV file, if there is one.
+    """
+
+    title: str
+    heading: str = ""
+    about: str = ""
+    banners: Sequence[Banner] = ()
+    blocks: Sequence[Block] = ()
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    csv: str = ""
+
+    def all_blocks(self) -> Iterator[Block]:
+        """Yield all blocks, those within others too, in their order."""
+        yield from _flat(self.blocks)
+
+
+def _flat(blocks: Sequence[Block]) -> Iterator[Block]:
+    for block in blocks:
+        if isinstance(block, Section):
+            yield from _flat(block.blocks)
+        elif isinstance(block, SideBySide):
+            for column in block.columns:
+                yield from _flat(column)
+        else:
+            yield block
+
+
+def kind_of(standing: Standing, *, good: bool = True) -> Kind:
+    """Return the kind of a banner: good only if the run's validation passed, too."""
+    return "good" if good and standing.holds else "note"
+
+
+def remarks_banner(remarks: Sequence[str], headline: str = "Remarks") -> list[Banner]:
+    """Return a banner with what a user should know, if there is anything."""
+    return [Banner("note", headline, items=remarks, label="note", name="remarks")] * bool(remarks)
+
+
+def standing_banner(standing: Standing, on: Target = "both") -> list[Banner]:
+    """Return a banner with what does not hold of the run that a product builds on, if anything."""
+    if not standing.lines:
+        return []
+    about = [Text("Validation of the run that this report builds on:")]
+    kind: Kind = "note" if standing.holds is None else "bad"
+    return [Banner(kind, standing.headline, items=standing.lines, blocks=about, on=on)]

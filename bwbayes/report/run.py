@@ -1,0 +1,386 @@
+"""What a run says: the answer, why one may believe it, and all the rest.
+
+What does not hold is said first. Without convergence nothing is said of parameters or displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from markupsafe import Markup
+
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.report import tables
+from bwbayes.report.captions import caption
+from bwbayes.report.figures import Drawings, drawings
+from bwbayes.report.figures.style import title
+from bwbayes.report.priors import priors_table
+from bwbayes.report.report import (
+    Banner,
+    Block,
+    Facts,
+    Glossary,
+    Kind,
+    Picture,
+    Report,
+    Section,
+    SideBySide,
+    Text,
+    remarks_banner,
+)
+from bwbayes.report.words import covered, error_text, mark
+from bwbayes.results.bands import Bands
+from bwbayes.results.result import Result
+from bwbayes.results.scores import Scores
+from bwbayes.results.standing import Standing
+from bwbayes.results.verdict import Verdict
+
+__all__ = ["prediction_report", "run_report"]
+
+# Figures of the evidence, besides those of the bands.
+EVIDENCE = ("agreement", "coverage", "innovations", "spectrum")
+
+LEVEL = 95  # %, of the bands that the answer speaks of
+
+
+def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
+    """Return what a run says.
+
+    Parameters
+    ----------
+    result
+        The run.
+    numbers
+        As :func:`bwbayes.results.result.summary` returns them; ``seed``, ``wall_s``, ``versions``
+        and ``data_sha256`` are shown too if they are there, and without convergence ``go_on``, the
+        command that goes on.
+    """
+    pictures = _pictures(drawings(result))
+    converged = result.outcome.converged
+    blocks = _answer(result, numbers, pictures) if converged else _chains(result, numbers, pictures)
+    if converged:
+        blocks += _evidence(result, numbers, pictures)
+    return Report(
+        title=result.name,
+        about=_about(result),
+        banners=[
+            *_verdict_banners(result, numbers),
+            *remarks_banner(result.remarks),
+        ],
+        blocks=[*blocks, *_details(result, numbers, pictures)],
+    )
+
+
+def prediction_report(
+    name: str,
+    scores: Scores | None,
+    verdict: Verdict | None,
+    remarks: Sequence[str],
+) -> Report:
+    """Return how one prediction turned out, if there are readings, and what to know of it."""
+    table = []
+    if scores is not None and verdict is not None:
+        table = [tables.scores_table({name: scores}, {name: verdict}, {name: name})]
+    return Report(
+        title=name,
+        banners=[
+            *_standing_on_screen(Standing.of([verdict] if verdict else [])),
+            *remarks_banner(remarks),
+        ],
+        blocks=table,
+    )
+
+
+def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]:
+    """Return how the run came out, on the page and on the screen."""
+    standing = result.standing
+    if not result.outcome.converged:
+        return [_not_converged(result, numbers)]
+    if not standing.headline:
+        return [Banner("good", _headline(result), blocks=_results(result), on="page")]
+    open_verdicts = [v for v in result.verdicts.values() if v.holds is standing.holds]
+    meaning = (
+        "the readings do not tell whether the bands hold"
+        if standing.holds is None
+        else "the bands fail validation; the parameters may be biased too"
+    )
+    explained = Glossary([(v.where, _explained(v)) for v in open_verdicts], note=False)
+    blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), explained]
+    on_page = Banner(_kind(standing), standing.headline, blocks=blocks, on="page")
+    return [on_page, *_standing_on_screen(standing)]
+
+
+def _standing_on_screen(standing: Standing) -> list[Banner]:
+    if not standing.lines:
+        return []
+    return [Banner(_kind(standing), standing.headline, items=standing.lines, on="screen")]
+
+
+def _kind(standing: Standing) -> Kind:
+    return "note" if standing.holds is None else "bad"
+
+
+def _explained(verdict: Verdict) -> Markup:
+    """Return why a verdict is what it is, with the likeliest cause and what to do."""
+    text = Markup("{}.").format("; ".join(verdict.reasons))
+    if verdict.cause is not None:
+        text += Markup("<br>Likely cause: {}.<br>Fix: {}.").format(
+            verdict.cause.text, verdict.cause.fix
+        )
+    return text
+
+
+def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
+    resume = numbers.get("go_on") or "bwbayes resume FOLDER --steps N"
+    return Banner(
+        "bad",
+        "NOT CONVERGED",
+        blocks=[
+            Text(f"Stopped: {result.outcome.stop_reason}. {_sampled(result)}"),
+            Text(
+                "The chain has not converged, so no parameter or displacement intervals are shown. "
+                "What to do:"
+            ),
+        ],
+        items=[
+            Markup("Resume with more steps (no draws are lost): <code>{}</code>.").format(resume),
+            Markup(
+                'Look at <a href="#trace">trace</a> and <a href="#ranks">ranks</a> below: '
+                "ensembles that stay apart sit in different modes, ensembles that drift need more "
+                "steps."
+            ),
+            "Check the priors: a parameter that the record does not determine wanders as far as "
+            "its prior lets it; narrow its prior or fix it.",
+        ],
+        on="page",
+    )
+
+
+def _sampled(result: Result) -> str:
+    check = result.outcome.check
+    return f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted."
+
+
+def _headline(result: Result) -> str:
+    """Return what may be said of a converged run none of whose bands fail."""
+    if any(not verdict.training for verdict in result.verdicts.values()):
+        return "Converged; validation passed on held-out data"
+    return "Converged; validation passed on the training data" if result.verdicts else "Converged"
+
+
+def _results(result: Result) -> list[Text]:
+    """Return what the bands did on readings that were not fitted, or else on those that were."""
+    texts = []
+    judged = [bands for bands in _held_out_first(result) if bands.name in result.scores]
+    for bands in [bands for bands in judged if not bands.training] or judged:
+        scores, verdict = result.scores[bands.name], result.verdicts.get(bands.name)
+        status = Markup("validation {}. ").format(mark(verdict.status)) if verdict else ""
+        texts.append(
+            Markup(
+                "<b>{}</b>: {}Coverage of the 95% sensor band: <b>{}</b>. Mean width: <b>{}</b>. "
+                "NRMSE: {}. Max error: {}."
+            ).format(
+                f"{title(bands)}, {_span(bands)}",
+                status,
+                covered(scores, "sensor", LEVEL),
+                f"{scores.width_um[LEVEL]:.2f} µm",
+                error_text(scores),
+                f"{scores.max_error_um:.2f} µm",
+            )
+        )
+    if not texts:
+        texts.append(Markup("There are no readings to check the bands against."))
+    sampling = Markup("Sampling: {}. {}").format(result.outcome.stop_reason, _sampled(result))
+    if result.remarks:
+        link = Markup(' <a href="#remarks">Remarks: {}</a>.')
+        sampling += link.format(len(result.remarks))
+    return [Text(text) for text in (*texts, sampling)]
+
+
+def _held_out_first(result: Result) -> list[Bands]:
+    return sorted(result.bands, key=lambda bands: bands.training)
+
+
+def _answer(
+    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
+) -> list[Block]:
+    parameters: list[Block] = [
+        tables.parameters_table(result, numbers),
+        Text(
+            "The sensor band covers a new reading, the displacement band the actuator's "
+            "displacement, 95 times in 100. The parameter band covers the model output only, not "
+            "the actuator.",
+            note=True,
+        ),
+    ]
+    results: list[Block] = [*_results(result)] if result.standing.headline else []
+    loop = [[pictures["loop"]]] if "loop" in pictures else []
+    return [*results, SideBySide([parameters, *loop])]
+
+
+def _evidence(
+    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
+) -> list[Block]:
+    ordered = _held_out_first(result)
+    # Of several records "innovations_NAME" is one of the innovations.
+    names = [f"bands_{bands.name}" for bands in ordered]
+    names += [name for kind in EVIDENCE for name in pictures if name.partition("_")[0] == kind]
+    shown = [pictures[name] for name in names if name in pictures]
+    validation: list[Block] = []
+    if result.scores:
+        titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}
+        scores = {name: result.scores[name] for name in titles}
+        records = tables.flat_records({name: numbers["validation"][name] for name in titles})
+        validation = [
+            tables.scores_table(scores, result.verdicts, titles, records),
+            Section(
+                "Other scores",
+                [tables.other_scores_table(scores, titles, records), Glossary(SCORE_TERMS)],
+            ),
+        ]
+    blocks: list[Block] = [
+        Section("Readings against the bands", [*shown[:1], *validation, *shown[1:]], folded=False)
+    ]
+    loops, steps = tables.loops_table(result, numbers), tables.steps_table(result, numbers)
+    if loops is not None:
+        drawn = [pictures["loops"]] if "loops" in pictures else []
+        blocks.append(Section("Loops", [loops, *drawn, Glossary(LOOP_TERMS)], folded=False))
+    if steps is not None:
+        drawn = [pictures["steps"]] if "steps" in pictures else []
+        blocks.append(Section("Step responses", [steps, *drawn], folded=False))
+    return [*blocks, Text(_moves(result), on="screen")]
+
+
+def _moves(result: Result) -> str:
+    """Say in one line how the moves did."""
+    check = result.outcome.check
+    accepted = ", ".join(
+        f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
+    )
+    cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
+    return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
+
+
+def _chains(
+    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
+) -> list[Block]:
+    sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
+    return [Section("Sampling", sampling, folded=False), Text(_moves(result), on="screen")]
+
+
+def _details(
+    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
+) -> Iterator[Section]:
+    priors = priors_table(JointPrior(result.parameters))
+    yield Section("Priors and fixed values", [replace(priors, on="page")])
+    learned = tables.learned_table(result)
+    if learned is not None and result.learned is not None:
+        remarks = [Text(str(finding)) for finding in result.learned.findings]
+        yield Section("What the record taught", [learned, *remarks])
+    if result.replicated:
+        note = (
+            "Each number of the fitted readings, among those of records that posterior draws make "
+            "anew with their own noise; p: the part of these that is larger. Odd: among the "
+            "outermost 1 %."
+        )
+        checks = tables.replicated_tables(result)
+        yield Section("Would the model make this record?", [*checks, Text(note, note=True)])
+    if result.outcome.converged:
+        if "corner" in pictures:
+            yield Section("Posterior", [pictures["corner"]])
+        chains = [pictures[name] for name in ("trace", "ranks")]
+        yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
+    yield Section("Moves", [tables.moves_table(result)])
+    yield Section("What was run", [Facts([*result.facts.items(), *_circumstances(numbers)])])
+
+
+def _pictures(drawn: Drawings) -> dict[str, Picture]:
+    pictures = {}
+    for name, draw in drawn.items():
+        words = caption(name)
+        pictures[name] = Picture(name, words.title, words.text, draw, words.alt)
+    return pictures
+
+
+def _about(result: Result) -> str:
+    """Return what was fitted to what, in a line."""
+    facts = result.facts
+    texts = [
+        f"{subject.capitalize()}: {fact}"
+        for subject, fact in facts.items()
+        if subject.partition(" ")[0] == "record"
+    ]
+    texts += [f"fitted {facts['fitted']}"] if "fitted" in facts else []
+    held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
+    texts += [f"predicted {', '.join(held_out)}"] if held_out else []
+    texts += [f"{subject} {facts[subject]}" for subject in ("model", "noise") if subject in facts]
+    return "; ".join(texts)
+
+
+def _span(bands: Bands) -> str:
+    windows = [bands.time[window] for window in bands.windows]
+    return ", ".join(f"{time[0]:g} to {time[-1]:g}" for time in windows) + " s"
+
+
+def _circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what the summary knows of the run besides its results."""
+    if "seed" in numbers:
+        yield "seed", str(numbers["seed"])
+    if isinstance(wall := numbers.get("wall_s"), int | float):
+        yield "wall time", f"{wall:.0f} s"
+    if "data_sha256" in numbers:
+        yield "data, SHA-256", str(numbers["data_sha256"])
+    if isinstance(versions := numbers.get("versions"), Mapping):
+        yield "versions", ", ".join(f"{name} {version}" for name, version in versions.items())
+
+
+SCORE_TERMS = (
+    (
+        "Sensor band",
+        "Where a new sensor reading lies, sensor noise included; the only band that a measurement "
+        "can check.",
+    ),
+    (
+        "Displacement band",
+        "Where the actuator's displacement lies, model discrepancy included; it can be checked "
+        "only where the displacement without noise is known.",
+    ),
+    (
+        "Parameter band",
+        "Where the model's displacement lies because its parameters are uncertain; it makes no "
+        "promise about the actuator or the sensor.",
+    ),
+    (
+        "CRPS and interval score",
+        "They reward bands that are narrow and right; smaller is better.",
+    ),
+)
+
+LOOP_TERMS = (
+    (
+        "Opening at zero voltage",
+        "Displacement with falling less that with rising voltage, at 0 V.",
+    ),
+    (
+        "Widest opening",
+        "The largest such difference at any voltage, as a part of the range: what data sheets call "
+        "hysteresis.",
+    ),
+    (
+        "Remanence",
+        "Displacement left at 0 V after the highest voltage, against the middle between the loop's "
+        "ends.",
+    ),
+    (
+        "Coercive voltage",
+        "Half of the loop's width in voltage where the displacement passes that middle; in a loop "
+        "that is symmetric about 0 V the voltage that takes the displacement back to it.",
+    ),
+    (
+        "Area",
+        "−∮ x du over one cycle, positive where the displacement lags; times the actuator's force "
+        "per volt (N/V) the energy lost in a cycle, in µJ.",
+    ),
+)

@@ -1,0 +1,117 @@
+"""How numbers and symbols are written: as exactly as they are known, in plain characters."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from markupsafe import Markup
+
+from bwbayes.inference.parameters import Parameter
+from bwbayes.report.report import Kind
+from bwbayes.results.scores import Scores
+
+__all__ = [
+    "STATUS_KINDS",
+    "Symbol",
+    "covered",
+    "digits",
+    "error_text",
+    "label_with_unit",
+    "mark",
+    "symbol",
+    "unit_text",
+]
+
+# The kind of banner that goes with how a validation, or a record of a campaign, ended; else "bad".
+STATUS_KINDS: Mapping[str, Kind] = {
+    "passed": "good",
+    "inconclusive": "note",
+    "validation inconclusive": "note",
+}
+
+
+class Symbol(NamedTuple):
+    """A symbol in plain characters: its base, and what stands below."""
+
+    base: str
+    below: str
+
+    @property
+    def html(self) -> Markup:
+        """The symbol with its subscript."""
+        below = Markup("<sub>{}</sub>").format(self.below) if self.below else Markup("")
+        return Markup("<i>{}</i>").format(self.base) + below
+
+
+def symbol(parameter: Parameter) -> Symbol:
+    r"""Return a parameter's LaTeX label in plain characters, or its name if that cannot be done.
+
+    Greek letters, one subscript and ``\mathrm`` are understood.
+    """
+    text = re.sub(r"\\mathrm\{(\w*)\}", r"\1", parameter.label)
+    text = re.sub(r"\\([A-Za-z]+)", _greek, text)
+    match = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
+    if match is None:
+        return Symbol(parameter.name, "")
+    return Symbol(match[1], match[2] or match[3] or "")
+
+
+def _greek(match: re.Match[str]) -> str:
+    """Return the Greek letter that a LaTeX command stands for, or the command."""
+    size = "CAPITAL" if match[1][0].isupper() else "SMALL"
+    try:
+        return unicodedata.lookup(f"GREEK {size} LETTER {match[1].upper()}")
+    except KeyError:
+        return match[0]
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit for people: um as µm, nothing for a pure number."""
+    return "" if unit == "-" else re.sub(r"\bum\b", "µm", unit)
+
+
+def label_with_unit(name: str, unit: str) -> str:
+    """Return a name with its unit in brackets, if it has one."""
+    return f"{name} ({unit_text(unit)})" if unit_text(unit) else name
+
+
+def digits(value: float, sd: float) -> str:
+    """Write a value as exactly as its standard deviation with two digits is written.
+
+    ``digits(0.69712, 0.0061234)`` is ``0.6971``. Far from one, with a power of ten.
+    """
+    if not (math.isfinite(value) and math.isfinite(sd) and sd > 0):
+        return f"{value:.6g}"
+    exponent = int(f"{sd:.1e}".partition("e")[2]) - 1
+    if exponent < -7 or exponent > 3:
+        leading = int(f"{value:e}".partition("e")[2]) if value else exponent
+        return f"{value:.{max(leading - exponent, 0)}e}"
+    # Adding zero takes the sign from a negative zero.
+    return f"{round(value, -exponent) + 0.0:.{max(-exponent, 0)}f}"
+
+
+def mark(status: str) -> Markup:
+    """Write how something ended: on green if it passed, amber if inconclusive, red otherwise."""
+    return Markup('<span class="mark {}">{}</span>').format(STATUS_KINDS.get(status, "bad"), status)
+
+
+def covered(scores: Scores, kind: str, level: int) -> str:
+    """Write how much a band covers, with its standard error; nothing if that is not known."""
+    share, error = scores.coverage[kind], scores.coverage_error[kind]
+    if share is None:
+        return ""
+    text = f"{100 * share[level]:.1f}"
+    return f"{text} %" if error is None else f"{text} ± {100 * error[level]:.1f} %"
+
+
+def error_text(scores: Scores) -> str:
+    """Write the NRMSE, of the training range too where that is another than the record's own."""
+    text, full = f"{100 * scores.nrmse:.2f}%", scores.nrmse_full
+    # A range is another where it differs by more than this part.
+    if full is None or abs(full - scores.nrmse) <= 0.05 * scores.nrmse:
+        return text
+    return f"{text} ({100 * full:.2f}% of the training range)"

@@ -1,0 +1,103 @@
+"""What a run worked out is read from its folder, and anything else is worked out again."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import bwbayes as bw
+from bwbayes.app.fit import fitted
+from bwbayes.app.running.assembling import assemble
+from bwbayes.app.running.cache import load, save
+
+
+def assert_same(first: Any, second: Any) -> None:
+    """Assert that two values are of one type and equal, arrays to the bit."""
+    assert type(first) is type(second)
+    if isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype
+        np.testing.assert_array_equal(first, second)
+    elif is_dataclass(first):
+        for item in fields(first):
+            assert_same(getattr(first, item.name), getattr(second, item.name))
+    elif isinstance(first, dict):
+        assert list(first) == list(second)
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, tuple | list):
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    else:
+        np.testing.assert_equal(first, second)
+
+
+def refuse(*_: object) -> None:
+    raise AssertionError("worked out again")
+
+
+def test_an_opened_run_works_nothing_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = bw.open_run(run)
+    worked_out = assemble(expected.problem, expected.chain, expected.outcome)
+    monkeypatch.setattr(fitted, "assemble", refuse)
+    monkeypatch.setattr(fitted, "sample", refuse)
+    opened = bw.open_run(run)
+    assert opened.converged
+    for name in ("bands", "scores", "verdicts", "loops", "innovations", "explanations", "learned"):
+        assert_same(getattr(worked_out, name), getattr(opened.result, name))
+    assert opened.bands
+    assert "converged" in str(opened)
+
+
+@pytest.mark.parametrize("damage", ["cut", "missing", "config"])
+def test_what_is_damaged_or_of_another_state_is_worked_out_again(
+    run: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    if damage == "cut":
+        content = (folder / "result.npz").read_bytes()
+        (folder / "result.npz").write_bytes(content[: len(content) // 2])
+    elif damage == "missing":
+        (folder / "result.npz").unlink()
+    else:
+        config = (folder / "config.toml").read_text(encoding="utf-8")
+        (folder / "config.toml").write_text(f'name = "other"\n{config.partition(chr(10))[2]}')
+    monkeypatch.setattr(fitted, "assemble", refuse)
+    with pytest.raises(AssertionError, match="worked out again"):
+        _ = bw.open_run(folder).result
+
+
+@pytest.mark.parametrize("kind", ["os:system", "subprocess:Popen", "bwbayes.errors:InputError"])
+def test_nothing_but_a_dataclass_of_the_package_comes_out_of_a_file(
+    kind: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "result.npz"
+    save(path, "now", {"bands": 1.0})
+    assert {"bands": 1.0} == load(path, "now")
+    assert load(path, "then") is None
+    text = '{"state": "now", "values": {"class": "' + kind + '", "fields": []}}'
+    np.savez(path, text=np.array(text))
+    assert load(path, "now") is None
+
+
+@given(cut=st.floats(0, 1, exclude_max=True), data=st.data())
+def test_a_damaged_file_is_none(cut: float, data: st.DataObject) -> None:
+    """Cut off anywhere, or with another byte in any place, it is not read or as it was."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "result.npz"
+        save(path, "now", {"bands": np.arange(5.0)})
+        whole = path.read_bytes()
+        path.write_bytes(whole[: int(cut * len(whole))])
+        assert load(path, "now") is None
+        place = data.draw(st.integers(0, len(whole) - 1))
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        values = load(path, "now")
+        assert values is None or values["bands"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]

@@ -1,0 +1,149 @@
+"""How long a person waits for what is done ten times a day, against another checkout.
+
+``python -m tests.benchmarks waits --against ../before`` does each thing with this checkout and with
+the other one, in turns, each in a process of its own with the checkout's own ``.venv``, and prints
+CPU seconds of all its processes and their ratio: the machine may be busy with other things. What
+one step leaves (a run's folder) is what the next ones open.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+from rich.console import Console
+
+from tests.benchmarks.cases import ROOT
+from tests.benchmarks.tables import Cell, Table, printed
+
+PREAMBLE = """
+import os, resource, sys
+sys.path.insert(0, "")
+
+def spent():
+    return sum(os.times()[:4])
+
+def command(*words):
+    from bwbayes.app.commands.cli import main
+    sys.argv = ["bwbayes", *words, "--quiet"]
+    try:
+        main()
+    except SystemExit as ended:
+        assert ended.code in (0, 3, 5), ended.code
+
+def stand(samples, dynamics="none", **keys):
+    import numpy as np
+    import bwbayes
+    t = np.linspace(0, 20, samples)
+    u = 100 * np.exp(-t / 20) * np.sin(2 * np.pi * t)
+    noise = np.random.default_rng(1).normal(0, 0.05, samples)
+    x = 0.7 * u - bwbayes.hysteresis(u, alpha=0.36, beta=0.027, gamma=0.017).ravel() + noise
+    record = bwbayes.Record.from_arrays(u, x, interval=float(t[1]))
+    return bwbayes.fit(record, dynamics=dynamics, progress=False, **keys)
+
+def plan():
+    import numpy as np
+    import bwbayes
+    u = 90 * np.sin(2 * np.pi * 0.7 * np.arange(10_000) / 1000)
+    return bwbayes.Record.from_arrays(u, None, interval=1e-3)
+
+out = os.environ["WAITS"]
+result = None
+"""
+
+RING = 'command("run", "runs/ring_bender.toml", "--out", out + "/{}")'
+
+# What is waited for: what comes before it and is not measured, what is measured, and the part of
+# the baseline's time that it may take (None: there is no such target).
+WAITS: dict[str, tuple[str, str, float | None]] = {
+    "first run, everything compiled": ("", RING.format("cold"), 0.5),
+    "run": ("", RING.format("warm"), 0.6),
+    "bwbayes.fit, the name": ("", "import bwbayes; bwbayes.fit", None),
+    "open_run": ("", "import bwbayes; bwbayes.open_run(out + '/warm')", 0.1),
+    "open_run and its bands": ("", "import bwbayes; bwbayes.open_run(out + '/warm').bands", 0.1),
+    "predict 10,000 samples": (
+        "import bwbayes; fit = bwbayes.open_run(out + '/warm'); record = plan(); fit.converged",
+        "fit.predict(record)",
+        0.1,
+    ),
+    "fit of 20 readings": ("", "stand(20)", None),
+    "fit of 300 readings": ("", "stand(300)", None),
+    "fit with creep": ("", "stand(20_000, creep=True, folder=out + '/creep')", 0.2),
+    "predict with creep": (
+        "import bwbayes; fit = bwbayes.open_run(out + '/creep'); record = plan(); fit.converged",
+        "fit.predict(record)",
+        0.1,
+    ),
+    "joint campaign": (
+        "",
+        'command("run", "runs/ring_bender_campaign.toml", "--out", out + "/joint")',
+        0.5,
+    ),
+    "compare seven models": (
+        "",
+        'command("compare", "runs/ring_bender.toml", "--out", out + "/models")',
+        0.4,
+    ),
+    "memory of a fit of a million samples, GiB": (
+        "",
+        "stand(1_000_000)\nresult = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20",
+        None,
+    ),
+}
+
+
+def waited(name: str, checkout: Path, folder: Path) -> float | None:
+    """Return the CPU seconds (or what the step measures) of a step; None if it fails there."""
+    before, measured, _ = WAITS[name]
+    python = checkout / ".venv" / "bin" / "python"
+    code = (
+        f"{PREAMBLE}\n{before}\nbegin = spent()\n{measured}\n"
+        "print(spent() - begin if result is None else result)"
+    )
+    environment = {
+        "WAITS": str(folder),
+        "NUMBA_CACHE_DIR": str(folder / "numba"),
+        "OMP_NUM_THREADS": "1",
+    }
+    ended = subprocess.run(
+        [python if python.exists() else sys.executable, "-W", "ignore", "-c", code],
+        cwd=checkout,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return float(ended.stdout.split()[-1]) if ended.returncode == 0 else None
+
+
+def measured_row(name: str, target: float | None, results: list[float | None]) -> dict[str, Cell]:
+    """Return what is printed of a step: here, there, their ratio, and the target."""
+    here, there = results[0], results[1] if len(results) > 1 else None
+    ratio = here / there if here is not None and there else None
+    return {"wait": name, "here": here, "there": there, "ratio": ratio, "target": target}
+
+
+@click.command()
+@click.option("--against", type=click.Path(path_type=Path, file_okay=False, exists=True))
+@click.option("--only", multiple=True, help="Part of a step's name; may be given again.")
+def waits(*, against: Path | None, only: tuple[str, ...]) -> None:
+    """Measure what a person waits for, here and in another checkout."""
+    console, rows = Console(), []
+    checkouts = [ROOT, *([against.resolve()] if against else [])]
+    with TemporaryDirectory() as folder:
+        homes = [Path(folder) / str(number) for number in range(len(checkouts))]
+        for home in homes:
+            home.mkdir()
+        for name, (*_, target) in WAITS.items():
+            if not only or any(word in name for word in only):
+                results = [
+                    waited(name, root, home) for root, home in zip(checkouts, homes, strict=True)
+                ]
+                rows.append(measured_row(name, target, results))
+                console.print(f"{name}: {results}", highlight=False)
+    note = "CPU seconds of all processes, once; `-`: it fails there"
+    printed(Table("waits", "What a person waits for", note, rows), console)

@@ -1,0 +1,193 @@
+"""What is recommended follows from the numbers, and what cannot be told is called so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.comparison.candidates import Candidate
+from bwbayes.comparison.evidence import Evidence
+from bwbayes.comparison.leave_future_out import FUTURE, Part
+from bwbayes.comparison.recommendation import difference, recommend
+from bwbayes.report.report import Table
+
+
+def noise(seed: int, size: int = 10) -> FloatArray:
+    return np.random.default_rng(seed).normal(size=size)
+
+
+COMMON = -100 + 10 * noise(1)
+
+
+def model(
+    name: str,
+    scores: FloatArray | None,
+    log_evidence: float = 0.0,
+    free: int = 5,
+    *,
+    hysteresis: bool = True,
+    worth: float = 50.0,
+) -> Candidate:
+    """Return a converged model with those log scores of one part."""
+    parts = {} if scores is None else {FUTURE: Part(scores, 200, worth)}
+    evidence = Evidence(log_evidence, 0.02, 0.0, 1000.0, 7.0, log_evidence + 20)
+    return Candidate(
+        name, name, True, "converged", free, 1000, hysteresis, parts=parts, evidence=evidence
+    )
+
+
+def test_the_better_score_is_recommended_whatever_the_evidence_says() -> None:
+    worse = model("other", COMMON - 5 + noise(2), 100.0)
+    comparison = recommend([worse, model("rich", COMMON, 0.0, 9)])
+    assert comparison.recommended == comparison.best == "rich"
+    assert comparison.tied == ()
+    assert "by the log score other is worse, by 5" in comparison.lines[1]
+    assert comparison.caveats[0].startswith("the log evidence is for other, by 100.0 nats, of")
+
+
+def test_scores_that_tie_are_told_apart_by_the_evidence_if_it_is_sure() -> None:
+    near = COMMON + 0.1 * noise(2)
+    comparison = recommend([model("plain", COMMON), model("rich", near, 10.0, 9)])
+    assert (comparison.recommended, comparison.tied) == ("rich", ())
+    assert any("log evidence is lower by 10.0" in line for line in comparison.lines)
+    comparison = recommend([model("plain", COMMON), model("rich", near, 2.0, 9)])
+    assert (comparison.recommended, comparison.tied) == ("plain", ("rich",))
+    expected = "plain and rich cannot be told apart; the plainest of them is plain"
+    assert comparison.lines[0] == expected
+
+
+def test_less_than_four_nats_do_not_tell_models_apart_however_small_their_error() -> None:
+    """Three nats at many errors tie, five do not; at large errors fifteen tie."""
+    for gain, spread, worse in ((3.0, 1e-3, False), (5.0, 1e-3, True), (15.0, 3.0, False)):
+        changed = noise(2) - np.mean(noise(2))
+        less = COMMON - gain / 10 + spread * changed
+        comparison = recommend([model("plain", less), model("rich", COMMON, 0.0, 9)])
+        assert comparison.differences["plain"].value == pytest.approx(-gain)
+        assert comparison.differences["plain"].worse == worse
+        assert comparison.recommended == ("rich" if worse else "plain")
+
+
+def test_a_part_worth_fewer_than_five_independent_readings_has_no_vote() -> None:
+    """The evidence then decides; a part that is worth more outvotes it."""
+    tempting = model("tempting", COMMON + 30, 0.0, worth=1.6)
+    truth = model("truth", COMMON, 51.0, 9, worth=1.6)
+    comparison = recommend([tempting, truth])
+    assert (comparison.measure, comparison.recommended) == ("log evidence", "truth")
+    assert any("worth 1.6 independent readings only" in line for line in comparison.caveats)
+    held_out = {"later": Part(COMMON, 200, 30.0)}
+    better = {"later": Part(COMMON + 3 + 0.1 * noise(3), 200, 30.0)}
+    comparison = recommend(
+        [
+            replace(tempting, parts={**tempting.parts, **held_out}),
+            replace(truth, parts={**truth.parts, **better}),
+        ]
+    )
+    assert comparison.voting == ("later",)
+    assert (comparison.measure, comparison.recommended) == ("log score", "truth")
+
+
+def test_readings_scored_one_by_one_count_as_independent_ones() -> None:
+    """200 correlated readings worth 20 count a tenth of the same densities in a joint score."""
+    gain = 2 + 0.1 * noise(3)
+    for joint, total in ((True, np.sum(gain)), (False, np.sum(gain) / 10)):
+        rich, plain = (
+            replace(
+                model(name, None),
+                parts={"other": Part(scores, 200, 20.0, joint)},
+            )
+            for name, scores in (("rich", COMMON + gain), ("plain", COMMON))
+        )
+        comparison = recommend([plain, rich])
+        assert comparison.differences["plain"].value == pytest.approx(-total)
+
+
+def test_errors_cover_differences_of_correlated_blocks() -> None:
+    """400 pairs whose difference has a mean of zero, in blocks of twice their correlation time.
+
+    The share of them beyond the 95 % limit is 0.05 for exact errors; the twin, taken for certain
+    to within independent readings, has far more.
+    """
+    rng = np.random.default_rng(7)
+    beyond = naive = 0
+    for _ in range(400):
+        series = np.zeros(700)
+        for i, fresh in enumerate(rng.normal(size=699), start=1):
+            series[i] = 0.7 * series[i - 1] + fresh
+        series = series[100:]
+        part = Part(COMMON + series.reshape(10, -1).sum(axis=1), 600, 100.0)
+        first = replace(model("first", None), parts={"part": part})
+        second = replace(model("second", None), parts={"part": replace(part, log_scores=COMMON)})
+        got = difference(first, second, ["part"])
+        beyond += abs(got.value) > got.limit
+        naive += abs(got.value) > 2 * np.sqrt(series.size * np.var(series))
+    assert beyond < 0.1 * 400
+    assert naive > 0.25 * 400
+
+
+def test_an_evidence_that_is_not_known_decides_nothing() -> None:
+    unknown = replace(
+        model("rich", COMMON + 0.1 * noise(2), free=9),
+        evidence=Evidence(np.nan, np.inf, 0.0, 0.0),
+    )
+    comparison = recommend([model("plain", COMMON, 10.0), unknown])
+    assert {*comparison.tied, comparison.recommended} == {"plain", "rich"}
+
+
+def test_without_hysteresis_it_says_so() -> None:
+    linear = model("linear", COMMON, 2.0, 3, hysteresis=False)
+    rich = model("rich", COMMON + 0.1 * noise(2))
+    comparison = recommend([linear, rich])
+    assert comparison.recommended == "linear"
+    assert comparison.lines[1].startswith("the record shows no hysteresis")
+    # One that is alike, but not the plainest, leaves it open.
+    comparison = recommend([replace(linear, free=9), rich])
+    assert "whether there is any hysteresis cannot be told" in comparison.lines
+
+
+def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
+    lost = Candidate("lost", "lost", False, "budget used up", 4, 1000)
+    comparison = recommend([lost, model("plain", COMMON)])
+    assert comparison.recommended == "plain"
+    assert comparison.candidates[-1] is lost
+    expected = "lost has not converged (budget used up) and is not judged"
+    assert comparison.caveats[-1] == expected
+    comparison = recommend([lost])
+    assert comparison.recommended is None
+    assert "not converged" in str(comparison)
+
+
+def test_what_was_only_screened_is_in_the_table_and_no_caveat() -> None:
+    evidence = Evidence(-300.0, np.inf, 0.0, 0.0, 5.0, -290.0)
+    far = Candidate("far", "far", False, "", 4, 1000, evidence=evidence, screened=True)
+    comparison = recommend([far, model("plain", COMMON)])
+    assert comparison.caveats == ()
+    assert comparison.lines[0] == "plain is recommended"
+    assert comparison.lines[-1].startswith("only screened")
+    assert "only screened" in str(comparison)
+    assert "about -300" in str(comparison)
+
+
+def test_a_reading_held_for_impossible_settles_it() -> None:
+    broken = np.where(np.arange(10) == 7, -np.inf, COMMON)
+    comparison = recommend([model("broken", broken), model("fine", COMMON, 0.0, 9)])
+    assert comparison.recommended == "fine"
+
+
+def test_table_numbers_and_page_have_every_model() -> None:
+    comparison = recommend([model("plain", COMMON), model("rich", COMMON - 9)])
+    numbers = comparison.numbers()["models"]
+    assert isinstance(numbers, Mapping)
+    names = ["plain", "rich"]
+    assert list(numbers) == list(comparison.to_pandas().index) == names
+    models, differences = (
+        block for block in comparison.report().all_blocks() if isinstance(block, Table)
+    )
+    assert [row[0] for row in models.rows] == names
+    assert [row[0] for row in differences.rows] == ["rich"]
+    rich = comparison.to_pandas().loc["rich"]
+    assert rich["difference_value"] == pytest.approx(-90)
+    assert rich["parts_later training_log_score"] == pytest.approx(np.sum(COMMON) - 90)

@@ -1,0 +1,228 @@
+"""Priors that the record contradicts, bounds leaned on and foreign units are said; good runs not.
+
+False alarms: none of 40 simulated records with default priors, judged at the Gaussian
+approximation around the point fit. Power: each kind of planted mistake is said, by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.conflict import around, conflicts, effective
+from bwbayes.inference.defaults import default_priors, ranges_of
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.pointfit import fit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.declaration import Ranges
+from bwbayes.model.distributions import Distribution
+from tests.declared import context, declared, joint, parameter
+from tests.inference.problems import INTERVAL, joint_prior, short_posterior
+
+RANGES = Ranges(voltage=100.0, displacement=60.0, middle=0.0, time=0.5)
+NAMES = (
+    "d", "alpha", "beta", "gamma", "exponent", "initial", "lag", "offset", "sensor_sd",
+    "discrepancy_sd", "discrepancy_time",
+)  # fmt: skip
+DEFAULTS = default_priors([declared(name) for name in NAMES], context(RANGES))
+
+# What a good run's posterior is like: mean and sd.
+GOOD = {
+    "d": (0.7, 0.005), "alpha": (0.36, 0.01), "beta": (0.027, 0.001), "gamma": (0.017, 0.003),
+    "initial": (0.5, 1.0), "lag": (0.004, 0.001), "offset": (0.3, 0.5), "sensor_sd": (0.5, 0.003),
+    "discrepancy_sd": (1.5, 0.3), "discrepancy_time": (0.5, 0.2),
+}  # fmt: skip
+
+
+def normal(mean: float, sd: float) -> Distribution:
+    return Distribution("normal", {"mean": mean, "sd": sd})
+
+
+def lognormal(median: float, sigma: float) -> Distribution:
+    return Distribution("lognormal", {"median": median, "sigma": sigma})
+
+
+def with_prior(name: str, prior: Distribution | float, upper: float = np.inf) -> JointPrior:
+    """Return the default joint prior but for one parameter."""
+    known = joint_prior(NAMES, RANGES, {})
+    other = parameter(name, prior, upper=upper)
+    return joint([other if p.name == name else p for p in known.parameters])
+
+
+def posterior_draws(prior: JointPrior, **other: FloatArray) -> FloatArray:
+    """Return draws (2000, free) of a good run, but for other columns."""
+    generator = np.random.default_rng(1)
+    columns = {
+        name: np.abs(mean + sd * generator.standard_normal(2000))
+        for name, (mean, sd) in GOOD.items()
+    }
+    return np.stack([(columns | other)[name] for name in prior.free_names], axis=1)
+
+
+def said(prior: JointPrior, **other: FloatArray) -> list[str]:
+    return [*map(str, conflicts(prior, posterior_draws(prior, **other), DEFAULTS))]
+
+
+def test_good_run_raises_no_remark() -> None:
+    assert [] == said(joint_prior(NAMES, RANGES, {}))
+
+
+@pytest.mark.parametrize(("mean", "side"), [(0.5, "above"), (0.9, "below")])
+def test_posterior_some_sds_from_its_prior_is_said_with_the_default_as_fix(
+    mean: float, side: str
+) -> None:
+    (remark,) = said(with_prior("d", normal(mean, 0.04)))
+    assert f"d: posterior mean 0.7 um/V is 5.0 SD {side} its prior normal(mean = {mean}" in remark
+    assert 'give d = { prior = { distribution = "lognormal", median = 0.96, sigma = 0.6 } }' in (
+        remark
+    )
+    assert [] == said(with_prior("d", normal(mean, 0.08)))
+
+
+def test_default_that_does_not_fit_is_widened() -> None:
+    prior = joint_prior(NAMES, RANGES, {})
+    (remark,) = said(prior, d=np.full(2000, 12.0))
+    assert "sigma = 1.2 } }" in remark
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "times"),
+    [
+        ("d", lognormal(700.0, 0.3), "7e+02"),
+        ("lag", lognormal(4.0, 1.0), "2e+03"),
+        ("sensor_sd", lognormal(500.0, 1.0), "1e+03"),
+        ("beta", lognormal(27.0, 1.0), "2e+04"),
+        ("discrepancy_sd", lognormal(1500.0, 0.5), "3e+06"),
+        ("lag", 4.0, "2e+03"),
+        ("d", 7e-7, "7e-07"),
+    ],
+)
+def test_scale_that_is_off_by_powers_of_ten_may_be_another_unit(
+    name: str, given: Distribution | float, times: str
+) -> None:
+    prior = with_prior(name, given)
+    (remark,) = [r for r in said(prior) if r.startswith(f"{name}: its ")]
+    assert f"{times} times what the record's ranges suggest" in remark
+    assert "Fix: check its unit" in remark
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("lag", lognormal(1e-4, 1.0)),
+        ("discrepancy_sd", lognormal(1.5, 0.5)),
+        ("offset", normal(0.0, 1e4)),
+        ("initial", normal(0.5, 0.5)),
+        ("d", 0.7),
+    ],
+)
+def test_informed_prior_is_no_other_unit(name: str, given: Distribution | float) -> None:
+    assert not [r for r in said(with_prior(name, given)) if "check its unit" in r]
+
+
+def piled_up(bound: float, width: float) -> FloatArray:
+    """Return draws (2000,) whose density is highest at a bound."""
+    draws: FloatArray = bound + width * np.random.default_rng(2).exponential(size=2000)
+    return draws
+
+
+def test_gamma_on_beta_is_said_with_the_switch() -> None:
+    prior = joint_prior(NAMES, RANGES, {})
+    beta = np.random.default_rng(3).normal(0.02, 1e-3, 2000)
+    (remark,) = said(prior, beta=beta, gamma=beta - piled_up(0, 2e-4))
+    assert remark.startswith("gamma: lies on its upper bound of |gamma| <= beta")
+    assert "passive = false" in remark
+    (remark,) = said(prior, beta=beta, gamma=-beta + piled_up(0, 2e-4))
+    assert remark.startswith("gamma: lies on its lower bound of |gamma| <= beta")
+
+
+def test_gamma_anywhere_between_its_bounds_is_not_said() -> None:
+    """The twin: a gamma of which the record tells nothing, and one that may pass beta."""
+    prior = joint_prior(NAMES, RANGES, {})
+    share = np.random.default_rng(3).uniform(-1, 1, 2000)
+    assert [] == said(prior, beta=np.full(2000, 0.02), gamma=0.02 * share)
+    assert [] == said(prior, gamma=np.random.default_rng(4).normal(0.03, 0.003, 2000))
+
+
+def test_alpha_on_d_is_said() -> None:
+    prior = joint_prior(NAMES, RANGES, {})
+    d = np.full(2000, 0.7)
+    (remark,) = said(prior, d=d, alpha=d - piled_up(0, 1e-3))
+    assert remark.startswith("alpha: lies on its upper bound of 0 < alpha < d")
+
+
+def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:
+    upper = with_prior("lag", lognormal(0.005, 1.0), upper=0.003)
+    (remark,) = said(upper, lag=0.003 - piled_up(0, 1e-4))
+    assert remark == "lag: lies on its upper bound 0.003 s. Fix: move parameters.lag.upper."
+    uniform = with_prior("d", Distribution("uniform", {"lower": 0.8, "upper": 2.0}))
+    (remark,) = said(uniform, d=piled_up(0.8, 0.01))
+    assert remark.startswith("d: lies on its lower bound 0.8 um/V. Fix: widen its prior uniform(")
+
+
+def test_free_exponent_at_one_may_be_fixed() -> None:
+    prior = with_prior("exponent", Distribution("uniform", {"lower": 1.0, "upper": 3.0}))
+    (remark,) = said(prior, exponent=piled_up(1, 0.02))
+    assert "exponent = { fixed = 1.0 }" in remark
+
+
+def test_scale_parameter_that_may_be_zero_is_not_on_a_bound() -> None:
+    """A half-normal prior of a discrepancy that is not there ends at zero, as it should."""
+    prior = with_prior("discrepancy_sd", Distribution("halfnormal", {"scale": 1.0}))
+    assert [] == said(prior, discrepancy_sd=piled_up(0, 0.05))
+
+
+def judged(posterior: Posterior, ranges: Ranges) -> list[str]:
+    """Return the remarks at the point fit."""
+    generator = np.random.default_rng(1)
+    point = fit(posterior, generator)
+    draws = around(posterior.prior, point, generator)
+    defaults = default_priors(posterior.only.table.declarations, context(ranges))
+    return [*map(str, conflicts(posterior.prior, draws, defaults))]
+
+
+@pytest.mark.slow
+def test_forty_good_records_raise_no_remark() -> None:
+    """With white noise and a discrepancy, with and without a lag, from rest and not."""
+    alarms = []
+    for seed in range(40):
+        posterior = short_posterior(
+            "discrepancy" if seed % 2 else "white",
+            200,
+            "lag" if seed % 4 < 2 else "none",
+            {"initial": 0.0} if seed % 8 < 4 else {},
+            seed=seed,
+        )
+        ranges = ranges_of(posterior.only.voltage, posterior.only.displacement, INTERVAL)
+        alarms += judged(posterior, ranges)
+    assert [] == alarms
+
+
+def test_displacement_in_another_unit_contradicts_an_informed_prior() -> None:
+    """A record in nm that is taken for um, and a user who knows the actuator's d."""
+    good = short_posterior("white", 200, priors={"d": normal(0.7, 0.07)})
+    wrong = good.altered(displacement=4 * good.only.displacement)
+    ranges = ranges_of(wrong.only.voltage, wrong.only.displacement, INTERVAL)
+    known = joint_prior(good.prior.names, ranges, {"initial": 0.0}, {"d": normal(0.7, 0.07)})
+    remarks = judged(replace(wrong, prior=known), ranges)
+    assert any(remark.startswith("d: ") for remark in remarks), remarks
+
+
+def test_effective_quantiles_are_those_of_the_cut_prior() -> None:
+    """With h0 free alpha's median is above the stated one, and beta's too: |gamma| <= beta."""
+    prior = joint_prior(NAMES, RANGES, {})
+    quantiles = dict(
+        zip(prior.free_names, effective(prior, np.random.default_rng(1)).T, strict=True)
+    )
+    stated = {p.name: p.prior.frozen.ppf([0.025, 0.5, 0.975]) for p in prior.free if p.prior}
+    for name in ("lag", "offset", "sensor_sd", "discrepancy_time"):
+        (single,) = (p.prior for p in prior.free if p.name == name)
+        assert single is not None
+        np.testing.assert_allclose(
+            single.frozen.cdf(quantiles[name]), [0.025, 0.5, 0.975], atol=0.03, err_msg=name
+        )
+    assert quantiles["beta"][1] > 2 * stated["beta"][1]
+    assert quantiles["alpha"][2] < stated["alpha"][2]

@@ -1,0 +1,149 @@
+"""A prediction that leaves what was fitted says so, and one that stays within it says nothing.
+
+False alarms: none in 300 drives of the fitted kind, with noise and other sampling rates; of drives
+of ten kinds in one of 100 at most, of which a quarter is held out, slowness or duration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from tests.data.spoilt import good
+from tests.inference.problems import short_posterior
+
+
+def sine(
+    frequency: float, interval: float, amplitude: float = 75.0, periods: float = 3.0
+) -> FloatArray:
+    """Return a drive (samples,) from 0 V to twice the amplitude."""
+    time = np.arange(0, periods / frequency, interval)
+    voltage: FloatArray = amplitude * (1 - np.cos(2 * np.pi * frequency * time))
+    return voltage
+
+
+def fitted(voltage: FloatArray, interval: float) -> Posterior:
+    """Return a posterior trained with a drive; only its voltage matters here."""
+    return short_posterior(samples=20).altered(
+        voltage=voltage,
+        displacement=0.5 * voltage,
+        training=(slice(0, voltage.size),),
+        actuator=Actuator("none", "first", interval),
+    )
+
+
+SLOW = fitted(sine(0.1, 0.05), 0.05)
+
+
+def test_drive_fifty_times_as_fast_as_the_fitted_one_is_said() -> None:
+    """A fit of 0.1 Hz at 20 Hz tells nothing of a 5 Hz record's lag."""
+    (speed,) = beyond_training(SLOW, sine(5.0, 1e-3), 1e-3)
+    assert "speed" == speed.kind
+    assert "V/s exceeds the 47" in speed.text
+    assert "; the bands extrapolate" in speed.text
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3, 2.0, 5.0])
+@pytest.mark.parametrize("interval", [1e-3, 0.02])
+def test_speed_is_remarked_on_from_a_factor_of_one_and_a_half(
+    factor: float, interval: float
+) -> None:
+    remarks = beyond_training(SLOW, sine(0.1 * factor, interval), interval)
+    assert (factor > 1.5) == bool(remarks)
+
+
+def kinds(posterior: Posterior, voltage: FloatArray, interval: float) -> list[str]:
+    return [one.kind for one in beyond_training(posterior, voltage, interval)]
+
+
+def test_step_is_faster_than_a_sine_and_no_sine_than_a_step() -> None:
+    step = np.repeat([0.0, 150.0], 100)
+    assert "speed" in kinds(fitted(sine(1.0, 0.01), 0.01), step, 0.01)
+    assert "speed" not in kinds(fitted(step, 0.01), sine(5.0, 0.01), 0.01)
+
+
+def test_range_and_speed_are_said_one_by_one() -> None:
+    assert ["range", "speed"] == kinds(SLOW, sine(5.0, 1e-3, 100.0), 1e-3)
+    (wide,) = beyond_training(SLOW, sine(0.1, 0.05, 100.0), 0.05)
+    assert wide.text == (
+        "voltage 0 to 200 V exceeds the training range 0 to 150 V; the bands extrapolate"
+    )
+
+
+TIME = np.arange(0, 16, 0.005)
+FAST = fitted(75 * np.sin(4 * np.pi * TIME), 0.005)
+
+
+def test_a_slow_sine_and_a_hold_are_said() -> None:
+    """Of a fit of 2 Hz for 16 s that holds, the bands cover 34 % of the one, 0.3 % of the other."""
+    long = np.arange(0, 100, 0.005)
+    slow, duration = beyond_training(FAST, 75 * np.sin(0.04 * np.pi * long), 0.005)
+    assert ("slow", "duration") == (slow.kind, duration.kind)
+    assert slow.text.startswith("voltage averages 50.2 V over 23.7 s, in training at most 0.")
+    assert duration.text.startswith("duration of 100 s exceeds the 16 s of training; the bands")
+    for held in (np.full(long.size, 75.0), np.where(long > 1, 75.0, 0.0)):
+        slow = next(one for one in beyond_training(FAST, held, 0.005) if one.kind == "slow")
+        assert f"voltage averages {np.mean(held):.3g} V over 100 s" in slow.text
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0, 2.5, 4.0, 10.0])
+@pytest.mark.parametrize("interval", [1e-3, 0.02])
+@pytest.mark.parametrize("phase", [0.0, np.pi / 2])
+def test_slowness_is_remarked_on_from_a_factor_of_three(
+    factor: float, interval: float, phase: float
+) -> None:
+    time = np.arange(0, 45, interval)
+    remarks = kinds(FAST, 75 * np.sin(4 * np.pi * time / factor + phase), interval)
+    assert (factor > 3) == ("slow" in remarks)
+    assert "duration" not in remarks
+
+
+def test_rest_small_drives_and_long_ones_of_the_same_frequency_are_not_slow() -> None:
+    rested = np.where(TIME < 4, 75 * np.sin(4 * np.pi * TIME), 0.0)
+    small = 5 * np.sin(0.2 * np.pi * TIME)
+    assert [] == [*kinds(FAST, rested, 0.005), *kinds(FAST, small, 0.005)]
+    repeated = np.tile(FAST.only.voltage, 4)
+    assert ["duration"] == kinds(FAST, repeated, 0.005)
+    assert [] == kinds(fitted(repeated, 0.005), FAST.only.voltage, 0.005)
+
+
+def test_a_hold_counts_from_where_it_begins_and_the_slowest_record_counts() -> None:
+    """Predicted is the end of a hold; a fit that saw one as long knows it."""
+    held = np.where(TIME < 1, 75 * np.sin(4 * np.pi * TIME), 75.0)
+    end = slice(TIME.size * 3 // 4, None)
+    assert ["slow"] == [one.kind for one in beyond_training(FAST, held, 0.005, end)]
+    assert [] == beyond_training(fitted(held, 0.005), held, 0.005, end)
+
+
+def test_few_good_drives_are_called_slow_or_long() -> None:
+    """Four of 400; held-out steps that are longer than the others are rightly called so."""
+    alarms = 0
+    for number in range(400):
+        record, generator = good(number), np.random.default_rng(number)
+        quarter = record.samples // 4
+        start = int(generator.integers(0, 3 * quarter))
+        held_out = slice(start, start + quarter)
+        training = (slice(0, start + 1), slice(held_out.stop, record.samples))
+        if sum(float(np.ptp(record.voltage[window])) for window in training) > 0:
+            posterior = fitted(record.voltage, record.interval).altered(training=training)
+            found = beyond_training(posterior, record.voltage, record.interval, held_out)
+            alarms += any(one.kind in ("slow", "duration") for one in found)
+    assert alarms <= 4
+
+
+def test_held_out_part_of_the_same_drive_is_no_extrapolation() -> None:
+    """Noise of half a volt, decaying amplitudes, and every rate from 50 Hz to 2 kHz."""
+    generator = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(300):
+        interval, other = 10 ** generator.uniform(-3.3, -1.7, 2)
+        one = sine(1.0, interval, periods=5.0)
+        two = sine(1.0, other, periods=generator.uniform(1.0, 5.0))
+        two *= np.linspace(1.0, 0.5, two.size)
+        noise = [0.5 * generator.standard_normal(v.size) for v in (one, two)]
+        alarms += len(beyond_training(fitted(one + noise[0], interval), two + noise[1], other))
+    assert alarms == 0
