@@ -6,7 +6,8 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.inference import pointfit
 from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.sampler import first_chain, sample
 
 
 def sampled(problem: Problem, workers: int = 1) -> tuple[Outcome, Chain]:

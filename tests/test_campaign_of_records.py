@@ -20,7 +20,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.sampler import draws
+from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled
 

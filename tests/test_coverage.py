@@ -22,7 +22,7 @@ from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.results.bands import LEVELS, Bands, Kind
-from bwbayes.sampling.sampler import draws
+from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled
 

@@ -16,16 +16,16 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.config.models import models_of
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.jobs.models import compare_models
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import finished
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, read_record
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import Start, predict_record, thinned
-from bwbayes.sampling.sampler import draws
+from bwbayes.sampling.chain import draws
 from tests.measured import keep
 
 ROOT = Path(__file__).resolve().parents[1]

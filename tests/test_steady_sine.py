@@ -18,7 +18,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from bwbayes.model.actuator import Actuator
-from bwbayes.sampling.sampler import draws
+from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled
 

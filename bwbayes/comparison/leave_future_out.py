@@ -22,9 +22,10 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import Bands
 from bwbayes.results.prediction import thinned
+from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import draws, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 
 __all__ = ["BLOCKS", "FUTURE", "Part", "bands_part", "cut", "leave_future_out", "log_ratios"]
 

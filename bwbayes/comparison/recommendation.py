@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison, Difference
@@ -114,7 +114,7 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
             variance += 1 / first.effective + 1 / second.effective
             freedom += blocks - 1
     error = float(np.sqrt(variance))
-    return Difference(total, error, max(SMALL, float(stats.t.ppf(0.975, freedom)) * error))
+    return Difference(total, error, max(SMALL, float(scipy.stats.t.ppf(0.975, freedom)) * error))
 
 
 def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Candidate:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.linalg import block_diag
-from scipy.signal import StateSpace
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.control.sampled import SampledSections, sections_of
@@ -72,7 +72,9 @@ def linear_part(actuator: Actuator, theta: ArrayLike) -> Any:
         a.append(shift)
         b.append(entry)
         c.append(gain * np.eye(1, order))
-    return StateSpace(block_diag(*a), np.vstack(b), np.hstack(c), d, dt=actuator.interval)
+    return scipy.signal.StateSpace(
+        block_diag(*a), np.vstack(b), np.hstack(c), d, dt=actuator.interval
+    )
 
 
 def frequency_response(sections: SampledSections, turns: FloatArray) -> FloatArray:

@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 from numbers import Real
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import sawtooth
+import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError, suggestion
@@ -44,11 +43,11 @@ MOST_SAMPLES = 10**7
 
 SHAPES: Mapping[str, Callable[[FloatArray, int], FloatArray]] = {
     "sine": lambda turns, _: np.sin(2 * np.pi * turns),
-    "triangle": lambda turns, _: sawtooth(2 * np.pi * (turns + 0.25), 0.5),
+    "triangle": lambda turns, _: scipy.signal.sawtooth(2 * np.pi * (turns + 0.25), 0.5),
     "staircase": lambda turns, levels: (
-        np.round(levels * sawtooth(2 * np.pi * (turns + 0.25), 0.5)) / levels
+        np.round(levels * scipy.signal.sawtooth(2 * np.pi * (turns + 0.25), 0.5)) / levels
     ),
-    "raster": lambda turns, _: sawtooth(2 * np.pi * (turns + WRITTEN / 2), WRITTEN),
+    "raster": lambda turns, _: scipy.signal.sawtooth(2 * np.pi * (turns + WRITTEN / 2), WRITTEN),
 }
 
 
@@ -108,7 +107,7 @@ class Reference:
             # Turned about its ends, so that it begins and ends where it did.
             beyond = int(WIDTH * sd) + 1
             turned = np.pad(values, beyond, "reflect", reflect_type="odd")
-            smooth = gaussian_filter1d(turned, sd, truncate=WIDTH)[beyond:-beyond]
+            smooth = scipy.ndimage.gaussian_filter1d(turned, sd, truncate=WIDTH)[beyond:-beyond]
         object.__setattr__(self, "given", values)
         object.__setattr__(self, "displacement", smooth)
 

@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.data.record import Record
@@ -375,7 +375,7 @@ def _ornstein_uhlenbeck(
     decay = math.exp(-interval / PROCESS_TIME)
     shocks = PROCESS_SD * generator.standard_normal(samples)
     shocks[1:] *= math.sqrt(-math.expm1(-2 * interval / PROCESS_TIME))
-    return np.asarray(lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
 
 
 def _quantize(values: FloatArray, step: float, bits: int) -> FloatArray:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.data.record import Record
@@ -141,7 +141,7 @@ def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
         return voltage
     decay = np.exp(-1 / samples)
     shifted = voltage - voltage[0]
-    lagged: FloatArray = voltage[0] + lfilter([1 - decay], [1.0, -decay], shifted)
+    lagged: FloatArray = voltage[0] + scipy.signal.lfilter([1 - decay], [1.0, -decay], shifted)
     return lagged
 
 

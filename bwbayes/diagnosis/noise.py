@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import optimize, stats
+import scipy
 from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
@@ -32,10 +32,12 @@ def tail_nats(white: FloatArray) -> float:
     for degrees in DEGREES:
 
         def cost(log_scale: float, degrees: float = degrees) -> float:
-            return -float(np.sum(stats.t.logpdf(white, degrees, scale=np.exp(log_scale))))
+            return -float(np.sum(scipy.stats.t.logpdf(white, degrees, scale=np.exp(log_scale))))
 
-        densities.append(-optimize.minimize_scalar(cost, bounds=(-5.0, 5.0), method="bounded").fun)
-    normal = float(np.sum(stats.norm.logpdf(white)))
+        densities.append(
+            -scipy.optimize.minimize_scalar(cost, bounds=(-5.0, 5.0), method="bounded").fun
+        )
+    normal = float(np.sum(scipy.stats.norm.logpdf(white)))
     # The scale is paid for as its sd of a half over the root of the readings, of a prior's of one.
     cost_of_scale = 0.5 * np.log(2 * white.size)
     return float(logsumexp(densities) - np.log(DEGREES.size) - cost_of_scale) - normal
@@ -66,7 +68,7 @@ def _grown(white: FloatArray, growth: FloatArray) -> tuple[float, float]:
         logs = level + slope * growth
         return float(np.sum(logs + 0.5 * white**2 * np.exp(-2 * logs)) + 0.5 * slope**2)
 
-    found = optimize.minimize(cost, np.zeros(2), method="BFGS")
+    found = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
     level = np.log(np.sqrt(np.mean(white**2)))
     gained = cost(np.array([level, 0.0])) - float(found.fun)
     return gained - 0.5 * float(np.log(1 + 2 * white.size)), float(found.x[1])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
@@ -99,7 +99,9 @@ def spikes(
     off = _off_median(values, ends)
     allowed = np.zeros_like(values)
     if drive is not None:
-        allowed = 2 * maximum_filter1d(np.abs(_off_median(drive, ends)), 2 * NEIGHBOURS + 1)
+        allowed = 2 * scipy.ndimage.maximum_filter1d(
+            np.abs(_off_median(drive, ends)), 2 * NEIGHBOURS + 1
+        )
     usual = scatter(off[off != 0]) if np.any(off) else 0.0
     limit = max(8 * usual, least) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
@@ -148,7 +150,7 @@ def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
 
 def _off_median(values: FloatArray, ends: bool) -> FloatArray:
     mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
-    off: FloatArray = values - median_filter(values, NEIGHBOURS, mode=mode)
+    off: FloatArray = values - scipy.ndimage.median_filter(values, NEIGHBOURS, mode=mode)
     return off
 
 

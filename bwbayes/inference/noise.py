@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, lognormal
@@ -272,7 +272,9 @@ class DiscrepancyNoise:
         rate = self.interval / time
         shocks = sd * generator.standard_normal(samples)
         shocks[1:] *= np.sqrt(-np.expm1(-2 * rate))
-        discrepancy = np.asarray(lfilter([1.0], [1.0, -np.exp(-rate)], shocks), dtype=np.float64)
+        discrepancy = np.asarray(
+            scipy.signal.lfilter([1.0], [1.0, -np.exp(-rate)], shocks), dtype=np.float64
+        )
         return discrepancy, sensor * generator.standard_normal(samples)
 
     def at(self, interval: float) -> DiscrepancyNoise:
@@ -346,7 +348,9 @@ class _Filter:
             # Innovations over their sd in the long run.
             scale = 1 / np.sqrt(variance)
             before = -scale * self.mean[row][:, np.newaxis]
-            eta, after = lfilter((scale, -scale * phi), (1.0, -a), values, axis=-1, zi=before)
+            eta, after = scipy.signal.lfilter(
+                (scale, -scale * phi), (1.0, -a), values, axis=-1, zi=before
+            )
             # Powers of a below exp(-40) add nothing.
             memory = int(min(readings, 1 - 40 / log_a))
             powers = np.power(a, np.arange(memory + 1))

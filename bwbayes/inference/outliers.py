@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -36,7 +36,7 @@ LIMIT = 6.0
 ROUNDS = 10
 
 # Median of a standard normal's distance from zero.
-MEDIAN = float(norm.ppf(0.75))
+MEDIAN = float(ndtri(0.75))
 
 # If they are a larger part of the readings than this, they are not isolated outliers.
 MOST = 0.05

@@ -136,8 +136,8 @@ class Parameter:
     def mass_between(self) -> tuple[float, float]:
         """The prior's cumulative probability at both ends of the support."""
         assert self.prior is not None
-        low, high = self.support
-        return float(self.prior.frozen.cdf(low)), float(self.prior.frozen.cdf(high))
+        ends = self.prior.form.cdf(np.array(self.support))
+        return float(ends[0]), float(ends[1])
 
 
 class JointPrior:

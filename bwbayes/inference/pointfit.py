@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, optimize, special
+import scipy
+from scipy import linalg, special
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -246,7 +247,7 @@ class _LeastSquares:
                 residuals(values)
             return last[2]
 
-        solution = optimize.least_squares(
+        solution = scipy.optimize.least_squares(
             residuals,
             start[self.physical],
             jac=jacobian,
@@ -286,7 +287,7 @@ def _mode(
         if any(_leads_to(posterior, position, mode) for mode in modes):
             return None
         # Each round measures in the units of the last curvature: finite differences need them.
-        solution = optimize.minimize(
+        solution = scipy.optimize.minimize(
             surface.value,
             surface.inwards(position),
             jac=surface.gradient,

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
+import scipy
 from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
@@ -61,7 +61,7 @@ class Distribution:
             if not np.isfinite(value):
                 raise InputError(f"{self.name}: {key} is {value}; give a finite number")
         with np.errstate(invalid="ignore"):
-            quantiles = np.asarray(self.frozen.ppf([0.1, 0.5, 0.9]))
+            quantiles = self.form.ppf(np.array([0.1, 0.5, 0.9]))
         if not np.isfinite(quantiles).all() or not quantiles[0] < quantiles[2]:
             raise InputError(f"{self}: no proper distribution; check its arguments")
 
@@ -130,20 +130,39 @@ class Distribution:
     @cached_property
     def form(self) -> Form:
         """Distribution functions, in closed form if there is one."""
+        self._require_arguments()
         return closed(self.name, self.arguments) or Frozen(self.frozen)
 
     @cached_property
     def support(self) -> tuple[float, float]:
         """The least and the largest value."""
-        low, high = self.frozen.support()
+        low, high = self.form.ppf(np.array([0.0, 1.0]))
         return float(low), float(high)
 
     @cached_property
     def frozen(self) -> Any:
         """The frozen distribution of scipy."""
         arguments = dict(self.arguments)
+        lower, upper = arguments.get("lower", 0.0), arguments.get("upper", 1.0)
+        match self.name:
+            case "normal":
+                return scipy.stats.norm(arguments["mean"], arguments["sd"])
+            case "lognormal":
+                return scipy.stats.lognorm(arguments["sigma"], scale=arguments["median"])
+            case "uniform":
+                return scipy.stats.uniform(lower, upper - lower)
+            case "halfnormal":
+                # The same as scipy's halfnorm, which loses its precision near zero.
+                return scipy.stats.chi(1, scale=arguments["scale"])
+            case "beta":
+                return scipy.stats.beta(arguments["a"], arguments["b"], lower, upper - lower)
+        return self._by_scipy_name(arguments)
+
+    def _require_arguments(self) -> None:
+        """Refuse arguments that a familiar distribution does not have."""
+        arguments = self.arguments
         if self.name not in FAMILIAR:
-            return self._by_scipy_name(arguments)
+            return
         required, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
         missing = [key for key in required if key not in arguments]
         unknown = [key for key in arguments if key not in (*required, *optional)]
@@ -155,24 +174,17 @@ class Distribution:
             raise InputError(
                 f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
             )
-        match self.name:
-            case "normal":
-                return stats.norm(arguments["mean"], arguments["sd"])
-            case "lognormal":
-                return stats.lognorm(arguments["sigma"], scale=arguments["median"])
-            case "uniform":
-                return stats.uniform(lower, upper - lower)
-            case "halfnormal":
-                # The same as scipy's halfnorm, which loses its precision near zero.
-                return stats.chi(1, scale=arguments["scale"])
-        return stats.beta(arguments["a"], arguments["b"], loc=lower, scale=upper - lower)
 
     def _by_scipy_name(self, arguments: dict[str, float]) -> Any:
-        family = getattr(stats, self.name, None)
-        if not isinstance(family, stats.rv_continuous):
+        family = getattr(scipy.stats, self.name, None)
+        if not isinstance(family, scipy.stats.rv_continuous):
             names = [
                 *FAMILIAR,
-                *(n for n, f in vars(stats).items() if isinstance(f, stats.rv_continuous)),
+                *(
+                    n
+                    for n, f in vars(scipy.stats).items()
+                    if isinstance(f, scipy.stats.rv_continuous)
+                ),
             ]
             near = difflib.get_close_matches(self.name, names, n=1)
             familiar = f"use one of {', '.join(FAMILIAR)}"

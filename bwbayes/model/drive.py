@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 
@@ -131,7 +131,7 @@ def rate(voltage: FloatArray, interval: float) -> FloatArray:
     A measured voltage is noisy, and its change noisier: it is smoothed over a five-hundredth of
     the record.
     """
-    slow = ndimage.uniform_filter1d(voltage, max(1, voltage.size // 500), mode="nearest")
+    slow = scipy.ndimage.uniform_filter1d(voltage, max(1, voltage.size // 500), mode="nearest")
     change: FloatArray = np.gradient(slow, interval) if slow.size > 1 else np.zeros_like(slow)
     return change
 

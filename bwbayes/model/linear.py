@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -102,7 +102,7 @@ class Recursion:
         if drive.shape[1] == 0:
             return drive  # lfilter would leave the state undefined
         for row, values in enumerate(drive):
-            values[:], state[row] = lfilter(
+            values[:], state[row] = scipy.signal.lfilter(
                 self.numerator[row], self.denominator[row], values, zi=state[row]
             )
         return drive

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from bwbayes.arrays import FloatArray
 
@@ -154,6 +154,6 @@ def left_out(likelihoods: NormalLikelihoods, prior: Hyperprior) -> FloatArray:
         sd = np.sqrt(1 / likelihoods.precision[specimen] + posterior.spread**2 + posterior.variance)
         z = (likelihoods.mean[specimen] - posterior.mean) / sd
         # From the nearer tail, which keeps its digits.
-        tails = [np.sum(posterior.probability * stats.norm.cdf(side * z)) for side in (1, -1)]
+        tails = [np.sum(posterior.probability * scipy.stats.norm.cdf(side * z)) for side in (1, -1)]
         p[specimen] = 2 * min(tails)
     return p

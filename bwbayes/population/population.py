@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
@@ -340,7 +340,7 @@ def _around(
     center = weights @ places
     away = places - center
     covariance = (away * weights[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
-    student = stats.multivariate_t(center, covariance, df=DEGREES, seed=generator)
+    student = scipy.stats.multivariate_t(center, covariance, df=DEGREES, seed=generator)
     drawn = student.rvs(DRAWS)
     # The density of τ is that of log τ over τ.
     return drawn[:, 0], np.exp(drawn[:, 1]), student.logpdf(drawn) - drawn[:, 1]

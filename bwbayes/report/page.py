@@ -16,7 +16,6 @@ from itertools import groupby
 from typing import NamedTuple
 from urllib.parse import quote
 
-import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
@@ -120,6 +119,8 @@ def _spans(columns: Sequence[TableColumn]) -> list[tuple[str, int]]:
 
 def csv_link(table: Table) -> str:
     """Return a table as CSV, as a data URI."""
+    import pandas as pd  # noqa: PLC0415  # slow to load
+
     if table.records:
         frame = pd.DataFrame(table.records)
     else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import pandas as pd
 from markupsafe import Markup
 
 from bwbayes.inference.parameters import Parameter
@@ -319,6 +318,8 @@ def _estimate_texts(estimate: Estimate | None) -> tuple[str, str]:
 
 def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return nested numbers as rows, a column for each key of ``numbers``."""
+    import pandas as pd  # noqa: PLC0415  # slow to load
+
     columns = {
         name: pd.json_normalize(dict(nested), sep=" ").iloc[0] for name, nested in numbers.items()
     }

@@ -31,7 +31,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, stats
+import scipy
+from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
@@ -97,7 +98,7 @@ class Agreement:
     @property
     def p_value(self) -> float:
         """Probability of a larger distance if all records are of one actuator."""
-        return float(stats.chi2.sf(self.distance, self.degrees)) if self.degrees else 1.0
+        return float(scipy.stats.chi2.sf(self.distance, self.degrees)) if self.degrees else 1.0
 
     @property
     def disagrees(self) -> bool:
@@ -108,7 +109,10 @@ class Agreement:
     def noisier(self) -> bool:
         """Whether its noise is another one than the records share, beyond chance and by much."""
         squares = self.readings * self.size**2
-        tails = stats.chi2.cdf(squares, self.readings), stats.chi2.sf(squares, self.readings)
+        tails = (
+            scipy.stats.chi2.cdf(squares, self.readings),
+            scipy.stats.chi2.sf(squares, self.readings),
+        )
         return min(tails) < ALARM / 2 and not 1 / NOISIER < self.size < NOISIER
 
 

@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from scipy.special import ndtr
-from scipy.stats import binom, poisson
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
@@ -292,21 +292,24 @@ def ecdf_band(count: int, level: float) -> EcdfBand:
 
 def _pointwise(count: int, points: FloatArray, tail: float) -> tuple[FloatArray, FloatArray]:
     """Return counts (POINTS,) beyond which lies at most half the tail's probability either side."""
-    either = binom.ppf(tail / 2, count, points), binom.isf(tail / 2, count, points)
+    either = (
+        scipy.stats.binom.ppf(tail / 2, count, points),
+        scipy.stats.binom.isf(tail / 2, count, points),
+    )
     return np.asarray(either[0]), np.asarray(either[1])
 
 
 def _stays_inside(count: int, lower: FloatArray, upper: FloatArray) -> float:
     """Probability that the counts of a uniform sample stay between both, at every point."""
     counts = np.arange(count + 1)
-    step = poisson.pmf(counts, count / (POINTS + 1))
+    step = scipy.stats.poisson.pmf(counts, count / (POINTS + 1))
     probability = np.zeros(count + 1)
     probability[0] = 1.0
     for low, high in zip(lower, upper, strict=True):
         probability = np.convolve(probability, step)[: count + 1]
         probability[(counts < low) | (counts > high)] = 0.0
     whole = np.convolve(probability, step)[count]
-    return float(whole / poisson.pmf(count, count))
+    return float(whole / scipy.stats.poisson.pmf(count, count))
 
 
 def _legendre(u: FloatArray) -> FloatArray:
@@ -320,7 +323,7 @@ def _covered(positions: FloatArray) -> dict[int, float]:
 
 
 def _binomial_limits(count: int, level: int) -> tuple[float, float]:
-    low, high = binom.interval(LIMITS, count, level / 100)
+    low, high = scipy.stats.binom.interval(LIMITS, count, level / 100)
     return float(low / count), float(high / count)
 
 

@@ -7,7 +7,8 @@ model describes.
 from __future__ import annotations
 
 import numpy as np
-from scipy import special, stats
+import scipy
+from scipy import special
 
 from bwbayes.arrays import BoolArray
 from bwbayes.data.io.grid import clock
@@ -62,7 +63,9 @@ def coverage(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[
         hits = covered * worth
         # The binomial distribution function, for a number of readings that is not whole, where the
         # noise's sd is any that the fit allows.
-        within = 1 - 2 * stats.norm.sf(stats.norm.isf((1 - nominal) / 2) / standard.scales)
+        within = 1 - 2 * scipy.stats.norm.sf(
+            scipy.stats.norm.isf((1 - nominal) / 2) / standard.scales
+        )
         chance = float(np.mean(special.betainc(worth - hits, hits + 1, 1 - within)))
         found.append((f"the {level}% sensor band covers {percent(covered)} of readings", chance))
     return _least_likely(found)
@@ -79,7 +82,7 @@ def size(standard: Standard) -> list[tuple[str, float]]:
         (standard.varying, standard.for_varying, " about their mean"),
     ):
         square = float(np.mean(z**2))
-        chance = float(stats.f.sf(square, worth, standard.known))
+        chance = float(scipy.stats.f.sf(square, worth, standard.known))
         if square > ODDS:
             ratio = f"{np.sqrt(square):.2g} times as large{about}"
             text = f"the residuals are {ratio} as the sensor band predicts"
@@ -95,7 +98,7 @@ def leaning(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[s
         return []
     # As sure as the size of the noise is.
     errors = abs(mean) * np.sqrt(standard.for_mean)
-    chance = 2 * float(stats.t.sf(errors, standard.known))
+    chance = 2 * float(scipy.stats.t.sf(errors, standard.known))
     residual = float(np.mean((bands.measured - bands.mean)[judged]))
     text = f"the readings lie {residual:+.3g} um off the mean, {errors:.2g} of its standard errors"
     return _least_likely([(text, chance)])
@@ -110,7 +113,7 @@ def _least_likely(found: list[tuple[str, float]]) -> list[tuple[str, float]]:
 def too_wide(standard: Standard) -> list[str]:
     """Say whether the residuals are far smaller than the sensor band says."""
     square = float(np.mean(standard.z**2))
-    chance = stats.f.cdf(square, standard.for_size, standard.known)
+    chance = scipy.stats.f.cdf(square, standard.for_size, standard.known)
     if square >= TOO_WIDE**2 or chance >= ALARM:
         return []
     return [f"the sensor band is {1 / max(np.sqrt(square), 1e-9):.2g} times too wide"]

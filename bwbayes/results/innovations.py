@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
@@ -106,7 +106,7 @@ class Innovations:
     @property
     def kurtosis(self) -> float:
         """Excess kurtosis: 0 of a normal distribution, positive with heavy tails."""
-        return float(stats.kurtosis(self.white))
+        return float(scipy.stats.kurtosis(self.white))
 
     def by(self, what: str) -> tuple[tuple[str, FloatArray], ...]:
         """Return innovations in parts of the drive, by its "rate", "voltage" or "direction"."""
@@ -197,7 +197,7 @@ def _oscillating(lines: Sequence[SpectralLine]) -> Iterator[Finding]:
 
 def _correlated(series: Innovations) -> Iterator[Finding]:
     correlation = series.correlation
-    bound = stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
+    bound = scipy.stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
     lag = int(np.argmax(np.abs(correlation)))
     if abs(correlation[lag]) > max(bound, CORRELATED):
         after = series.time[lag + 1] - series.time[0]
@@ -219,7 +219,7 @@ def _one_sided(series: Innovations, what: str) -> Iterator[Finding]:
     ]
     worst = int(np.argmax(np.abs(means)))
     mean = float(np.mean(groups[worst][1]))
-    if abs(means[worst]) > stats.norm.isf(ALARM / 6) and abs(mean) > ONE_SIDED:
+    if abs(means[worst]) > scipy.stats.norm.isf(ALARM / 6) and abs(mean) > ONE_SIDED:
         subject = "drive" if what == "rate" else "voltage"
         yield Finding(
             "noise model",

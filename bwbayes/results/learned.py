@@ -15,9 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
-import arviz_base
 import numpy as np
-from arviz_stats import psense  # type: ignore[attr-defined]  # not in an __all__
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
@@ -157,6 +155,9 @@ def _sensitivities(
 
     From draws (draws, free), taken as one chain: weights depend on no order.
     """
+    import arviz_base  # noqa: PLC0415  # slow to load
+    from arviz_stats import psense  # type: ignore[attr-defined]  # noqa: PLC0415
+
     tree = arviz_base.from_dict(
         {
             "posterior": {name: draws[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import simpson
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -296,7 +296,7 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
         "remanence_um": _at_zero(voltage, falling) - middle if through_zero else None,
         "coercive_V": (passed[0] - passed[1]) / 2,
-        "area_um_V": np.asarray(simpson(gap, x=voltage, axis=1)),
+        "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),
     }
 
 

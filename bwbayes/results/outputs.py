@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import arviz_base
 import numpy as np
 
 from bwbayes.arrays import FloatArray
@@ -54,6 +53,8 @@ def posterior_tree(
         The training records by name. The variables and times of several have their record's name
         behind their own: ``displacement_loops``.
     """
+    import arviz_base  # noqa: PLC0415  # slow to load
+
     _, ensembles, walkers, _ = result.draws.shape
 
     def chains(values: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import chain, islice
 
 import numpy as np
-from scipy.signal import periodogram
+import scipy
 from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -172,7 +172,7 @@ def _statistics(
     at = neighbours
     total = np.sum(centred**2, axis=1)
     lag = np.sum(centred[:, at] * centred[:, at + 1], axis=1)
-    frequency, power = periodogram(residual, detrend="constant")
+    frequency, power = scipy.signal.periodogram(residual, detrend="constant")
     whole = np.sum(power, axis=1)
     place = frequency / frequency[-1]
     slow, fast = (np.sum(power[:, part], axis=1) for part in (place <= SLOW, place > MIDDLE))

@@ -29,8 +29,10 @@ from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.passages import crossings, passed
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
+from bwbayes.sampling.chain import draws
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import Outcome, draws, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.shown import brief
 
 __all__ = [

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage, signal
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 
@@ -119,7 +119,7 @@ def residual_spectrum(
         power = grid.power(left)
         if level is None:
             size = FINER * NEIGHBORS + 1
-            level = ndimage.median_filter(power, size, mode="reflect") / math.log(2)
+            level = scipy.ndimage.median_filter(power, size, mode="reflect") / math.log(2)
         frequency = _strongest(grid, power / level, found)
         if frequency is None:
             break
@@ -140,7 +140,7 @@ def residual_spectrum(
     lines.sort(key=lambda line: -line.amplitude)
     length = min(max(grid.samples // SEGMENTS, 1), LONGEST)
     centered = grid.filled(residual - np.mean(residual))
-    welch, density = signal.welch(centered, 1 / interval, nperseg=length)
+    welch, density = scipy.signal.welch(centered, 1 / interval, nperseg=length)
     density = np.sqrt(density * grid.samples / rows.size)
     return ResidualSpectrum(welch[1:], density[1:], tuple(lines))
 
@@ -173,12 +173,12 @@ class _TimeGrid:
     @property
     def length(self) -> int:
         """Of a Fourier transform."""
-        return int(fft.next_fast_len(FINER * self.samples, real=True))
+        return int(scipy.fft.next_fast_len(FINER * self.samples, real=True))
 
     @property
     def frequency(self) -> FloatArray:
         """Of a periodogram (frequencies,), Hz."""
-        frequency: FloatArray = fft.rfftfreq(self.length, self.interval)
+        frequency: FloatArray = scipy.fft.rfftfreq(self.length, self.interval)
         return frequency
 
     def top(self, power: FloatArray, at: int) -> float:
@@ -199,7 +199,7 @@ class _TimeGrid:
 
     def power(self, values: FloatArray) -> FloatArray:
         """Return the periodogram of values (readings,)."""
-        power: FloatArray = np.abs(fft.rfft(self.filled(values), self.length)) ** 2
+        power: FloatArray = np.abs(scipy.fft.rfft(self.filled(values), self.length)) ** 2
         return power / self.rows.size
 
 
@@ -243,9 +243,9 @@ class _Drive:
     @classmethod
     def of(cls, grid: _TimeGrid, time: FloatArray, voltage: FloatArray) -> _Drive:
         whole = np.interp(grid.interval * np.arange(grid.samples), time - time[0], voltage)
-        window = signal.windows.hann(grid.samples)
+        window = scipy.signal.windows.hann(grid.samples)
         centered = whole - np.sum(window * whole) / np.sum(window)
-        power = np.abs(fft.rfft(window * centered, grid.length)) ** 2
+        power = np.abs(scipy.fft.rfft(window * centered, grid.length)) ** 2
         return cls(power, grid.top(power, int(np.argmax(power))))
 
 

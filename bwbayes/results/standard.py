@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal, stats
+import scipy
+from scipy.special import ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.results.bands import Bands, Kind
@@ -18,7 +19,7 @@ from bwbayes.results.bands import Bands, Kind
 __all__ = ["Z_90", "Standard", "standardised"]
 
 # Half the width of a 90 % band, in sds.
-Z_90 = float(stats.norm.ppf(0.95))
+Z_90 = float(ndtri(0.95))
 
 # Sds of the noise, as a fit allows them, over which a chance is averaged.
 SCALES = 200
@@ -57,7 +58,7 @@ class Standard:
     def scales(self) -> FloatArray:
         """Factors on the noise's sd, evenly probable, that the fit allows."""
         chance = (np.arange(SCALES) + 0.5) / SCALES
-        factors: FloatArray = np.sqrt(self.known / stats.chi2.ppf(chance, self.known))
+        factors: FloatArray = np.sqrt(self.known / scipy.stats.chi2.ppf(chance, self.known))
         return factors
 
 
@@ -103,7 +104,7 @@ def standardised(bands: Bands, judged: BoolArray, memory: float, unsure: float) 
 def _pairs(judged: BoolArray) -> FloatArray:
     """Count the pairs of judged samples at each lag, (lags,), those in either order."""
     there = judged[slice(*np.flatnonzero(judged)[[0, -1]] + [0, 1])].astype(np.float64)
-    counts = np.rint(signal.correlate(there, there, method="fft")[there.size - 1 :])
+    counts = np.rint(scipy.signal.correlate(there, there, method="fft")[there.size - 1 :])
     counts[1:] *= 2
     result: FloatArray = counts
     return result

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+import scipy
 from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -375,7 +375,7 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
     departure, and a score test of slow ones (drift, a transient), which many readings would hide.
     """
     readings = histories.likelihoods[0].readings.rows
-    p = stats.chi2.sf(squares, readings.size)
+    p = scipy.stats.chi2.sf(squares, readings.size)
     if readings.size > MANY:
         few = slice(None, None, -(-len(theta) // TESTED))
         place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
@@ -384,7 +384,7 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
         (taken,) = tested.each(
             theta[few], lambda likelihood, rows: (likelihood.score(rows, shapes).together,)
         )
-        slow = stats.chi2.sf(taken, SLOW)
+        slow = scipy.stats.chi2.sf(taken, SLOW)
         p = np.minimum(2 * np.minimum(p[few], slow), 1.0)
     return float(np.mean(p))
 

@@ -8,17 +8,31 @@ are blocks of the sampling whose proposal turned out not to cover the posterior.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.sampling.ensemble import Block, EnsembleState
-from bwbayes.sampling.moves import MOVES
+from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.shown import brief
 
-__all__ = ["MOST_DRAWS", "PHASES", "Chain", "Phase", "thinning"]
+__all__ = [
+    "MOST_DRAWS",
+    "MOVES",
+    "PHASES",
+    "RANDOM_STATE_WORDS",
+    "Block",
+    "Chain",
+    "EnsembleState",
+    "Phase",
+    "constrain_steps",
+    "draws",
+    "log_densities",
+    "thinning",
+]
 
 # Draws of all walkers that are judged and reported at most; of more, every second or fourth step
 # is used, and so on. Chains get that long because their steps tell little that is new.
@@ -26,6 +40,43 @@ MOST_DRAWS = 2**19
 
 Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
+
+# Names of the moves, in the order in which a block counts them.
+MOVES = ("differential evolution", "snooker", "mixture", "nearby")
+
+# Mersenne twister: 624 words, position, whether a normal number is kept, and that number.
+RANDOM_STATE_WORDS = 628
+
+
+@dataclass(frozen=True)
+class EnsembleState:
+    """Where an ensemble stands.
+
+    ``coordinates`` (walkers, free), ``log_density`` (walkers,) and ``random_state`` (628,), the
+    words of emcee's generator.
+    """
+
+    __repr__ = brief
+
+    coordinates: FloatArray
+    log_density: FloatArray
+    random_state: NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What an ensemble did.
+
+    ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
+    (walkers,) moves, ``moves`` (kinds, 2) how often each kind of move was proposed to a walker and
+    accepted, and the ``end`` it goes on from.
+    """
+
+    coordinates: FloatArray
+    log_density: FloatArray
+    accepted: IntArray
+    moves: IntArray
+    end: EnsembleState
 
 
 def thinning(draws: int, limit: int = MOST_DRAWS) -> int:
@@ -149,3 +200,23 @@ class Chain:
             parts.append(np.stack([values[first::thin] for values in arrays], axis=1))
             done += len(arrays[0])
         return np.concatenate(parts)
+
+
+def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
+
+    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
+    """
+    thin = thinning(chain.draws(phase))
+    return constrain_steps(posterior, chain.coordinates(phase, thin))
+
+
+def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
+    """Return the log density of :func:`draws`, (steps, ensembles, walkers), nats."""
+    return chain.log_density(phase, thinning(chain.draws(phase)))
+
+
+def constrain_steps(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
+    """Return coordinates (steps, ensembles, walkers, free) in their own units."""
+    flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
+    return flat.reshape(coordinates.shape)

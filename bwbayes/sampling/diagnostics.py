@@ -17,11 +17,10 @@ from __future__ import annotations
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
-from emcee.autocorr import auto_window
-from scipy import fft
+import scipy
 from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
@@ -133,24 +132,26 @@ class Check:
         return reasons
 
 
-class _Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
-    """arviz's statistics, with autocovariances that are averaged over chains at once.
+def _statistics() -> Any:
+    """Return arviz's statistics, slow to load, whose autocovariance is all chains' average."""
+    from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # noqa: PLC0415
 
-    That is all that arviz's effective draws look at. One transform back serves all chains.
-    """
+    class Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
+        def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
+            assert axis in (-1, 1)
+            return _autocovariance(ary)
 
-    def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
-        """Mean autocovariance (1, steps) of chains (chains, steps)."""
-        assert axis in (-1, 1)
-        steps = ary.shape[1]
-        padded = fft.next_fast_len(2 * steps, real=True)
-        spectrum = fft.rfft(ary - np.mean(ary, axis=1, keepdims=True), padded)
-        power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
-        covariance: FloatArray = fft.irfft(power, padded)[:, :steps] / steps
-        return covariance
+    return Averaged()
 
 
-AVERAGED = _Averaged()
+def _autocovariance(chains: FloatArray) -> FloatArray:
+    """Mean autocovariance (1, steps) of chains (chains, steps), by one transform back for all."""
+    steps = chains.shape[1]
+    padded = scipy.fft.next_fast_len(2 * steps, real=True)
+    spectrum = scipy.fft.rfft(chains - np.mean(chains, axis=1, keepdims=True), padded)
+    power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
+    covariance: FloatArray = scipy.fft.irfft(power, padded)[:, :steps] / steps
+    return covariance
 
 
 def _beside_limit(value: float, limit: float, digits: int = 0) -> str:
@@ -168,10 +169,12 @@ def autocorrelation_time(chains: FloatArray) -> float:
     As ``emcee.autocorr.integrated_time`` has it, from the mean of the chains' autocorrelations. It
     is nan where it cannot be told, for instance where nothing moves.
     """
+    from emcee.autocorr import auto_window  # noqa: PLC0415  # slow to load
+
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         away = chains - np.mean(chains, axis=1, keepdims=True)
         away /= np.sqrt(np.sum(away**2, axis=1, keepdims=True))
-        correlation = chains.shape[1] * AVERAGED.autocov(away)[0]
+        correlation = chains.shape[1] * _autocovariance(away)[0]
     time = 2 * np.cumsum(correlation) - 1
     windowed = float(time[auto_window(time, WINDOW)])
     return windowed if windowed > 0 else np.nan
@@ -267,7 +270,7 @@ def pareto_k(log_weights: FloatArray) -> float:
         if log_weights.size and np.ptp(log_weights) < EQUAL:
             return 0.0
     try:
-        shape = float(array_stats.psislw(-np.unique(log_weights))[1])
+        shape = float(_statistics().psislw(-np.unique(log_weights))[1])
     except (ValueError, IndexError):  # nothing
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
@@ -288,7 +291,7 @@ def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     finite = np.isfinite(log_weights).all()
     if not finite or (log_weights.size and np.ptp(log_weights) < EQUAL):
         return np.full(log_weights.size, 1 / log_weights.size), 0.0 if finite else np.inf
-    smoothed, shape = array_stats.psislw(-log_weights)
+    smoothed, shape = _statistics().psislw(-log_weights)
     weights = np.exp(smoothed - np.max(smoothed))
     return weights / np.sum(weights), float(shape) if np.isfinite(shape) else np.inf
 
@@ -317,16 +320,16 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     rank the draws three times more. And of the mean of the draws as they are: those of a heavy
     tail are worth another number.
     """
-    means = np.mean(values, axis=2)
+    statistics, means = _statistics(), np.mean(values, axis=2)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        cap = array_stats.ess(means.T, method="mean") * np.var(values) / np.var(means)
-        bulk = AVERAGED.ess(scores, method="mean")
+        cap = statistics.ess(means.T, method="mean") * np.var(values) / np.var(means)
+        bulk = statistics.ess(scores, method="mean")
         # A comparison would take what is not a number for a draw beyond the tail.
         tails = [
-            AVERAGED.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
+            statistics.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
             for p in TAIL
         ]
-        mean = AVERAGED.ess(as_chains(values), method="mean")
+        mean = statistics.ess(as_chains(values), method="mean")
     # np.minimum keeps a nan of either.
     bulk, tail, mean = np.minimum([bulk, np.min(tails), mean], cap).tolist()
     return bulk, tail, mean
@@ -341,7 +344,7 @@ def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> float:
     superchain = np.repeat(np.arange(ensembles), len(scores) // ensembles)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         rhats = [
-            array_stats.rhat_nested(ranked, superchain_ids=superchain, method="split")
+            _statistics().rhat_nested(ranked, superchain_ids=superchain, method="split")
             for ranked in (scores, folded)
         ]
     return float(np.max(rhats))

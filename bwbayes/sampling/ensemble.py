@@ -9,66 +9,28 @@ workers, or one that was interrupted and goes on, gives the same bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from emcee.moves import Move
 from numpy.typing import NDArray
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.walking import Steps, walk
-from bwbayes.shown import brief
 
 __all__ = [
-    "RANDOM_STATE_WORDS",
-    "Block",
-    "EnsembleState",
     "advance",
     "advance_together",
     "start",
 ]
 
-# Mersenne twister: 624 words, position, whether a normal number is kept, and that number.
-RANDOM_STATE_WORDS = 628
-
 # Starts lie this many posterior sds from an optimum, in a cluster of a fraction of one.
 FAR = 10.0
 TIGHT = 0.2
 TRIALS = 100
-
-
-@dataclass(frozen=True)
-class EnsembleState:
-    """Where an ensemble stands.
-
-    ``coordinates`` (walkers, free), ``log_density`` (walkers,) and ``random_state`` (628,), the
-    words of emcee's generator.
-    """
-
-    __repr__ = brief
-
-    coordinates: FloatArray
-    log_density: FloatArray
-    random_state: NDArray[np.uint32]
-
-
-@dataclass(frozen=True)
-class Block:
-    """What an ensemble did.
-
-    ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
-    (walkers,) moves, ``moves`` (kinds, 2) how often each kind of move was proposed to a walker and
-    accepted, and the ``end`` it goes on from.
-    """
-
-    coordinates: FloatArray
-    log_density: FloatArray
-    accepted: IntArray
-    moves: IntArray
-    end: EnsembleState
 
 
 def start(

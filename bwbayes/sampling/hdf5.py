@@ -15,7 +15,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-__all__ = ["DAMAGE", "FULL", "Image", "either", "put", "reserve"]
+__all__ = ["DAMAGE", "FULL", "Image", "either", "name_finished", "put", "reserve"]
 
 # What reading a damaged file raises.
 DAMAGE = (OSError, LookupError, ValueError, RuntimeError)
@@ -87,3 +87,10 @@ def reserve(file: Any, size: int) -> None:
         # Anything else is a system or a disk that cannot reserve.
         if error.errno in FULL:
             raise
+
+
+def name_finished(temporary: Path, path: Path) -> None:
+    """Give a finished file its name, in one step, after it has reached the disk."""
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    temporary.replace(path)

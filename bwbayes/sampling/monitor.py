@@ -8,13 +8,13 @@ are needed.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import MOST_DRAWS, Chain, thinning
+from bwbayes.sampling.chain import MOST_DRAWS, Chain, constrain_steps, thinning
 from bwbayes.sampling.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
@@ -24,14 +24,21 @@ from bwbayes.sampling.diagnostics import (
     stuck,
     times,
 )
+from bwbayes.shown import brief
 
-__all__ = ["ConvergenceMonitor", "constrain_steps"]
+__all__ = ["ConvergenceMonitor", "Outcome"]
 
 
-def constrain_steps(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
-    """Return coordinates (steps, ensembles, walkers, free) in their own units."""
-    flat, _ = posterior.prior.constrain(coordinates.reshape(-1, coordinates.shape[-1]))
-    return flat.reshape(coordinates.shape)
+@dataclass(frozen=True)
+class Outcome:
+    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
+
+    __repr__ = brief
+
+    converged: bool
+    stop_reason: str
+    check: Check
+    remarks: tuple[str, ...] = ()
 
 
 class ConvergenceMonitor:

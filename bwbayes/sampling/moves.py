@@ -20,16 +20,12 @@ from bwbayes.sampling.nearby import Nearby
 from bwbayes.sampling.proposals import Proposal, StudentMixture
 
 __all__ = [
-    "MOVES",
     "AmongPlaces",
     "SnookerMove",
     "pilot_moves",
     "sampling_moves",
     "spreading_moves",
 ]
-
-# Names of the moves, in the order in which the functions below return them.
-MOVES = ("differential evolution", "snooker", "mixture", "nearby")
 
 Weighted = list[tuple[moves.Move, float]]
 

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from scipy.stats import skew
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
@@ -279,7 +279,7 @@ def _require_spread(draws: FloatArray) -> None:
 
 def _first_cut(draws: FloatArray) -> StudentMixture:
     """Cut draws (count, free) along their most skewed coordinate."""
-    shape = np.asarray(skew(draws, axis=0))
+    shape = np.asarray(scipy.stats.skew(draws, axis=0))
     axis = int(np.argmax(np.abs(shape)))
     # Ranks from the body of the distribution to its longer tail.
     along = draws[:, axis] * (1 if shape[axis] >= 0 else -1)

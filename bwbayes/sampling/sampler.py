@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import Chain, Phase, thinning
+from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning
 from bwbayes.sampling.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
@@ -44,19 +44,15 @@ from bwbayes.sampling.diagnostics import (
     nested_rhat,
     pareto_k,
 )
-from bwbayes.sampling.ensemble import Block, advance_together, start
-from bwbayes.sampling.monitor import ConvergenceMonitor, constrain_steps
-from bwbayes.sampling.moves import MOVES, pilot_moves, sampling_moves, spreading_moves
+from bwbayes.sampling.ensemble import advance_together, start
+from bwbayes.sampling.monitor import ConvergenceMonitor, Outcome
+from bwbayes.sampling.moves import pilot_moves, sampling_moves, spreading_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.shown import brief
 
 __all__ = [
-    "Outcome",
     "Watcher",
-    "draws",
     "first_chain",
-    "log_densities",
     "sample",
 ]
 
@@ -87,18 +83,6 @@ FIRST_PART = 0.5
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
-
-    __repr__ = brief
-
-    converged: bool
-    stop_reason: str
-    check: Check
-    remarks: tuple[str, ...] = ()
 
 
 def first_chain(
@@ -141,20 +125,6 @@ def sample(
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
         _refit_proposal(chain)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
-
-
-def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
-    """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
-
-    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
-    """
-    thin = thinning(chain.draws(phase))
-    return constrain_steps(posterior, chain.coordinates(phase, thin))
-
-
-def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:
-    """Return the log density of :func:`draws`, (steps, ensembles, walkers), nats."""
-    return chain.log_density(phase, thinning(chain.draws(phase)))
 
 
 def _sampled(

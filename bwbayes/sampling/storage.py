@@ -18,7 +18,6 @@ and what was run (config, versions, seed, hash of the data) as the file's attrib
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -33,11 +32,17 @@ from numpy.typing import NDArray
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.chain import (
+    MOVES,
+    PHASES,
+    RANDOM_STATE_WORDS,
+    Block,
+    Chain,
+    EnsembleState,
+    Phase,
+)
 from bwbayes.sampling.curvature import QuadraticMap, rows_of
-from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
-from bwbayes.sampling.hdf5 import DAMAGE, Image, either, put, reserve
-from bwbayes.sampling.moves import MOVES
+from bwbayes.sampling.hdf5 import DAMAGE, Image, either, name_finished, put, reserve
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
 
 __all__ = ["ChainFile"]
@@ -96,7 +101,7 @@ class ChainFile(Chain):
                 file.attrs[name] = value
         with _write_errors(path), opened._delete_on_failure(temporary):
             temporary.write_bytes(layout.getbuffer())
-            _replace(temporary, path)
+            name_finished(temporary, path)
         with opened._delete_on_failure(path):
             opened._file = h5py.File(path, "r+", libver="latest", locking=False)
             opened._file.swmr_mode = True
@@ -171,7 +176,7 @@ class ChainFile(Chain):
         fresh = path.with_suffix(".fresh")
         opened = cls.create(fresh, old, old.point, old.block, old.attributes())
         # The name changes under the open file: it is the same file all along.
-        _replace(fresh, path)
+        name_finished(fresh, path)
         opened.path = path
         return opened
 
@@ -391,10 +396,3 @@ def _write_errors(path: Path) -> Iterator[None]:
             f"{path}: cannot be written ({error.strerror}); no block of the chain is lost: fix "
             "that, then resume the run"
         ) from None
-
-
-def _replace(temporary: Path, path: Path) -> None:
-    """Give a finished file its name, in one step, after it has reached the disk."""
-    with temporary.open("rb") as file:
-        os.fsync(file.fileno())
-    temporary.replace(path)

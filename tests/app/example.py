@@ -20,7 +20,7 @@ from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
 from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.sampler import Outcome
+from bwbayes.sampling.monitor import Outcome
 from tests.declared import declared
 
 

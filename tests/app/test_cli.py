@@ -401,7 +401,8 @@ def test_predict_after_goes_on_from_the_readings(bwbayes: Type, tmp_path: Path) 
         wide[name] = (rows[:, high] - rows[:, low])[behind]
     part = wide["after"] / wide["usual"]
     assert part[0] < 0.9
-    assert part[-1] == pytest.approx(1, abs=0.02)
+    # At one time the quantiles of so many draws are 3 % off; over two periods they are not.
+    assert np.mean(part[-200:]) == pytest.approx(1, abs=0.02)
     assert np.argmin(part) < 0.2 * part.size
 
 

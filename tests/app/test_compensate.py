@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import bwbayes as bw
 from bwbayes.app.commands.compensate import compensate as command
-from bwbayes.app.jobs.at_work import opened
+from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.predicted import FILES, Compensation
 from bwbayes.control.wished import shaped
@@ -36,7 +36,7 @@ def asked_file(folder: Path, values: Any, interval: float = 0.02) -> Path:
 
 def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
-    made = compensate(opened(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
+    made = compensate(converged(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
     files = made.save(tmp_path / "new")
     assert list(FILES) == [path.name for path in files]
     record = bw.read_record(files[0], need_displacement=False)
@@ -59,7 +59,7 @@ def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Pat
 
 @pytest.fixture(scope="module")
 def sine(run: Path) -> Compensation:
-    return compensate(opened(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True)
+    return compensate(converged(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
     path = asked_file(tmp_path, [repr(float(1e3 * value)) for value in values])
-    by_file = compensate(opened(run), path, from_rest=True)
+    by_file = compensate(converged(run), path, from_rest=True)
     fit = bw.open_run(run)
     by_array = fit.compensate(values, from_rest=True)
     np.testing.assert_allclose(by_file.asked, values, rtol=1e-12)
@@ -126,9 +126,9 @@ def test_a_shape_is_that_of_the_command_line(run: Path, tmp_path: Path) -> None:
     assert "triangle" == made.reference.name
     shape = shaped("triangle", 0.02, 30.0, 1.0, periods=2)
     np.testing.assert_array_equal(made.asked, shape.given)
-    again = compensate(opened(run), shape, from_rest=True, limit=5)
+    again = compensate(converged(run), shape, from_rest=True, limit=5)
     assert numbers == again.summary
-    assert numbers == compensate(opened(run), made.reference, from_rest=True, limit=5).summary
+    assert numbers == compensate(converged(run), made.reference, from_rest=True, limit=5).summary
 
 
 @pytest.mark.parametrize(
@@ -190,11 +190,11 @@ def test_references_that_cannot_be_used_are_one_line(
 ) -> None:
     path = asked_file(tmp_path, values)
     with pytest.raises(InputError, match=line) as refused:
-        compensate(opened(run), path, from_rest=True, voltage=VOLTAGE)
+        compensate(converged(run), path, from_rest=True, voltage=VOLTAGE)
     assert "\n" not in str(refused.value)
 
 
 def test_what_is_too_fast_says_where_and_how_fast(run: Path) -> None:
     fast = shaped("sine", 0.02, 40.0, 10.0)
     with pytest.raises(InputError, match=r"V/s, and from .* it is faster than the amplifier's"):
-        compensate(opened(run), fast, from_rest=True, voltage=VOLTAGE, slew=500.0)
+        compensate(converged(run), fast, from_rest=True, voltage=VOLTAGE, slew=500.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
-from bwbayes.app.jobs.at_work import opened
+from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.design import design
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.data import read_record
@@ -72,7 +72,7 @@ def test_the_best_of_a_file_is_written_for_the_generator(
 
 def test_the_preset_keeps_to_the_amplifiers_limits(run: Path) -> None:
     made = design(
-        opened(run),
+        converged(run),
         Path("verification"),
         voltage=(0.0, 150.0),
         current=2e-3,

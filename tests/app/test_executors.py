@@ -30,10 +30,10 @@ from bwbayes.app.running.run import resume
 from bwbayes.app.running.workers import executor, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
-from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.ensemble import advance
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import draws, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.app import small
 from tests.app.test_calibrate import assert_same_end as assert_same_calibration
 from tests.app.test_calibrate import begun as begun_calibration

@@ -12,13 +12,13 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.export import export as command
-from bwbayes.app.jobs.at_work import opened
+from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.export import FILES, export
 from bwbayes.errors import InputError
 
 
 def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
-    made = export(opened(run), tmp_path / "new" / "here")
+    made = export(converged(run), tmp_path / "new" / "here")
     files = [tmp_path / "new" / "here" / name for name in FILES]
     numbers = json.loads(files[0].read_text())
     posterior = json.loads((run / "summary.json").read_text())["parameters"]
@@ -63,11 +63,11 @@ def test_options_that_make_no_sense_are_one_line(
     run: Path, tmp_path: Path, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line):
-        export(opened(run), tmp_path / "out", **options)
+        export(converged(run), tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="choose another folder"):
-        export(opened(run), tmp_path / "file")
+        export(converged(run), tmp_path / "file")
 
 
 def test_the_command_says_what_it_wrote(

@@ -11,9 +11,9 @@ import pytest
 
 from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import dump, load, parse
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running import assembling, cache
-from bwbayes.app.running import run as module
 from bwbayes.app.running.fingerprint import (
     UNSAID,
     fingerprint,
@@ -102,11 +102,11 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     expected = "the chain was begun with other versions: scipy 1.1, now 1.2"
     assert (expected,) == version_remarks(noted, now)
     assert () == version_remarks(noted, {"numpy": "1.0"})
-    assert not any("other versions" in r for r in module.finished(RunFolder(run)).result.remarks)
+    assert not any("other versions" in r for r in finished(RunFolder(run)).result.remarks)
     installed = versions("numpy")
     for room in (assembling, cache):
         monkeypatch.setattr(room, "versions", lambda _: installed | {"numpy": "99"})
-    remarks = module.finished(RunFolder(run)).result.remarks
+    remarks = finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
 

@@ -6,10 +6,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import finished
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import Report

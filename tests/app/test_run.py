@@ -19,6 +19,7 @@ from rich.console import Console
 
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load, parse
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
@@ -29,7 +30,7 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.report.run import run_report
 from bwbayes.report.screen import as_text
 from bwbayes.results.result import summary
-from bwbayes.sampling import sampler
+from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.storage import ChainFile
@@ -167,7 +168,7 @@ def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
 def test_posterior_is_the_chain(run: Path) -> None:
     problem = RunFolder(run).problem()
     chain = ChainFile.read(run / "chain.h5")
-    draws = sampler.draws(problem.posterior, chain)
+    draws = chains.draws(problem.posterior, chain)
     density = chain.log_density("sampling")
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
         posterior = tree["posterior"].to_dataset()
@@ -312,7 +313,7 @@ def test_interrupted_command_says_how_to_go_on(
 def test_posterior_that_presses_against_the_passive_bound_is_remarked_on(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit = module.finished(RunFolder(run))
+    fit = finished(RunFolder(run))
     monkeypatch.setattr(BoucWen, "remarks", lambda _, column, __: [f"pressed {column['d'].ndim}"])
     unconverged = replace(fit.outcome, converged=False)
     assert "pressed 1" in fit.knowing(outcome=unconverged, _loaded=None).result.remarks
@@ -320,7 +321,7 @@ def test_posterior_that_presses_against_the_passive_bound_is_remarked_on(
 
 def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
     problem = RunFolder(run).problem()
-    outcome = module.finished(RunFolder(run)).outcome
+    outcome = finished(RunFolder(run)).outcome
     said = StringIO()
     progress = Progress(Console(file=said, width=40), problem.plan)
     progress.begun = progress.printed = time.monotonic() - 60
@@ -397,12 +398,12 @@ def test_chain_without_draws_predicts_nothing(
 ) -> None:
     made = small.begun(tmp_path / "a")
     with pytest.raises(InputError, match="does not exist"):
-        module.finished(made)
+        finished(made)
     watch_until(monkeypatch, "pilot", 5)
     with pytest.raises(KeyboardInterrupt):
         resume(made, small.quiet(), workers=1)
     with pytest.raises(InputError, match=r"no draws yet; resume with `bwbayes\.resume"):
-        module.finished(made)
+        finished(made)
 
 
 @pytest.mark.usefixtures("_without_pictures")

@@ -20,8 +20,7 @@ from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.ensemble import Block, EnsembleState
+from bwbayes.sampling.chain import Block, Chain, EnsembleState
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 from tests.sampling.hard_chains import BLOCK, HARD, good, moved

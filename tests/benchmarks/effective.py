@@ -30,11 +30,12 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import Chain, Phase
+from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.diagnostics import TAIL, Check, as_chains
-from bwbayes.sampling.ensemble import Block, EnsembleState, advance
+from bwbayes.sampling.ensemble import advance
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.moves import sampling_moves
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, problem
 from tests.benchmarks.likelihood import speed_up
 from tests.benchmarks.tables import Cell, Table

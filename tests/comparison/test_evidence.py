@@ -27,8 +27,9 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
+from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import draws, first_chain, log_densities, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.test_solvable import (
     TRUTH,
     WINDOWS,

@@ -30,7 +30,8 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.prediction import thinned
 from bwbayes.results.standing import Standing
-from bwbayes.sampling.sampler import draws, first_chain, sample
+from bwbayes.sampling.chain import draws
+from bwbayes.sampling.sampler import first_chain, sample
 
 __all__ = [
     "CONFIG",

@@ -33,8 +33,9 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
+from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import draws, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.problems import (
     INTERVAL,
     TRUE_LAG,

@@ -9,10 +9,16 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.chain import (
+    MOVES,
+    PHASES,
+    RANDOM_STATE_WORDS,
+    Block,
+    Chain,
+    EnsembleState,
+    Phase,
+)
 from bwbayes.sampling.curvature import QuadraticMap, pairs
-from bwbayes.sampling.ensemble import RANDOM_STATE_WORDS, Block, EnsembleState
-from bwbayes.sampling.moves import MOVES
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
 from bwbayes.sampling.storage import ChainFile
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from bwbayes.sampling.chain import PHASES, Chain, Phase
 from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.problems import gaussian
 
 PLAN = SamplingPlan(

@@ -18,8 +18,9 @@ import pytest
 
 from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 from tests.forks import FORKS
 from tests.inference.problems import gaussian

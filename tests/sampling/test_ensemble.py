@@ -9,11 +9,8 @@ import pytest
 from emcee.moves import DEMove, MHMove
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.ensemble import (
-    EnsembleState,
-    advance,
-    start,
-)
+from bwbayes.sampling.chain import EnsembleState
+from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentProposal
 from tests.inference.problems import gaussian, target

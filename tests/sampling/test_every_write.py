@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.sampling.chain import PHASES, Phase
-from bwbayes.sampling.ensemble import Block, EnsembleState
+from bwbayes.sampling.chain import PHASES, Block, EnsembleState, Phase
 from bwbayes.sampling.storage import ChainFile
 from tests.forks import FORKS
 from tests.inference.traced import WRITES, stopped_before_every_write

@@ -18,16 +18,11 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
-from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.chain import Chain, draws
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
-from bwbayes.sampling.sampler import (
-    FIRST_CHECK,
-    Outcome,
-    Watcher,
-    draws,
-    sample,
-)
+from bwbayes.sampling.sampler import FIRST_CHECK, Watcher, sample
 from tests.sampling.samplings import (
     LONG,
     PLAN,

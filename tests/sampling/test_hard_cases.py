@@ -26,8 +26,9 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import check
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.problems import TARGETS, gaussian, target
 from tests.sampling.hard_chains import BLOCK, HARD, good, moved
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling import monitor, sampler
-from bwbayes.sampling.chain import thinning
+from bwbayes.sampling import chain as chains
+from bwbayes.sampling import monitor
+from bwbayes.sampling.chain import draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import check
-from bwbayes.sampling.sampler import draws, log_densities
 from tests.sampling.samplings import PLAN, POSTERIOR, run
 
 # Ten parameters, the default's 64 walkers; ensembles that disagree, so that all checks are made.
@@ -25,10 +25,10 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.sampling.ensemble import Block
+from bwbayes.sampling.chain import Block, draws, log_densities
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import draws, first_chain, log_densities, sample
+from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.problems import gaussian
 
 posterior, point = gaussian(10)
@@ -77,7 +77,7 @@ def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.Monke
     """As its steps counted from one are, however often it was thinned on the way; and says so."""
     plan, most = replace(PLAN, ess=200), 800
     monkeypatch.setattr(monitor, "MOST_DRAWS", most)
-    monkeypatch.setattr(sampler, "thinning", lambda count, most=most: thinning(count, most))
+    monkeypatch.setattr(chains, "thinning", lambda count, most=most: thinning(count, most))
     chain, outcome = run(plan)
     assert outcome.check.steps == chain.steps("sampling")
     thin = thinning(chain.draws("sampling"), most)

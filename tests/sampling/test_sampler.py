@@ -16,16 +16,10 @@ from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
-from bwbayes.sampling.chain import Chain
+from bwbayes.sampling.chain import Chain, draws
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import (
-    FIRST_CHECK,
-    MOST_TUNING_BLOCKS,
-    Outcome,
-    draws,
-    first_chain,
-    sample,
-)
+from bwbayes.sampling.sampler import FIRST_CHECK, MOST_TUNING_BLOCKS, first_chain, sample
 from tests.inference.problems import short_posterior, target
 from tests.sampling.samplings import (
     PLAN,

@@ -14,7 +14,8 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.ensemble import EnsembleState, advance, advance_together, start
+from bwbayes.sampling.chain import EnsembleState
+from bwbayes.sampling.ensemble import advance, advance_together, start
 from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import gaussian, short_posterior

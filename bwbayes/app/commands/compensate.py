@@ -77,12 +77,12 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.compensate import compensate as invert
 
     if (shape is None) == (reference is None):
         raise InputError("compensate: give either a shape or --reference")
-    command = invert(opened(folder), shape or reference, **options)
+    command = invert(converged(folder), shape or reference, **options)
     where = out or folder / "compensation" / command.reference.name
     files = command.save(where, overwrite=overwrite)
     return present(command.report(), files, command.standing)

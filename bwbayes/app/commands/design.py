@@ -54,7 +54,7 @@ def design(
 
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
-    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.design import design as rank
     from bwbayes.data import Record, write_record
     from bwbayes.report.saving import refuse_existing, save
@@ -65,7 +65,7 @@ def design(
     out = out or folder / "design"
     names = ("best.csv", "design.html", "design.json")
     refuse_existing([out / name for name in names], overwrite=overwrite)
-    ranking = rank(opened(folder), target, **options)
+    ranking = rank(converged(folder), target, **options)
     files = save(ranking.report(), out, "design")
     best = ranking.signals[ranking.best.name]
     write_record(Record(best, None, ranking.interval, voltage_is="command"), out / "best.csv")

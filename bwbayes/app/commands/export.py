@@ -34,12 +34,12 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 
     Example: bwbayes export results/ring_bender --rate 1000
     """
-    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.export import FILES
     from bwbayes.app.jobs.export import export as write
 
     out = out or folder / "export"
-    model = write(opened(folder), out, **options)
+    model = write(converged(folder), out, **options)
     status = conclude(model.standing)
     if model.without_inverse is not None:
         click.echo(f"bwbayes: no inverse in it: {model.without_inverse}", err=True)

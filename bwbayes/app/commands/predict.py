@@ -69,7 +69,7 @@ def predict(
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
-    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.fit.opening import converged
     from bwbayes.app.running.predictions import predict_after, predict_another, training_record
     from bwbayes.data import Record
     from bwbayes.data.waveforms import signal
@@ -98,7 +98,7 @@ def predict(
     if table in (numbers, picture):
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
     refuse_existing([table, numbers, picture], overwrite=overwrite)
-    fit = opened(folder)
+    fit = converged(folder)
     problem, flat, standing = fit.problem, fit.flat_draws, fit.standing
     of = training_record(problem, training)
     if record is not None:

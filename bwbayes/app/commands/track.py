@@ -63,13 +63,13 @@ def track(
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.jobs.at_work import opened
+    from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.track import track as follow
     from bwbayes.report.saving import refuse_existing, save
 
     out = out or folder / "track"
     files = [out / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
     refuse_existing(files, overwrite=overwrite)
-    tracking = follow(opened(folder), frequencies=frequencies or None, **options)
+    tracking = follow(converged(folder), frequencies=frequencies or None, **options)
     written = save(tracking.report(), out, "track")
     return present(tracking.report(), written, tracking.standing, quiet=quiet)

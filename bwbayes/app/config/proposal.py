@@ -17,7 +17,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.data import Record
@@ -265,7 +265,8 @@ def _difference(record: Record, windows: list[slice]) -> float:
     drive = record.voltage, np.abs(rate(record.voltage, record.interval))
     thinned = slice(None, None, 1 + record.samples // SEEN)
     differences = [
-        stats.ks_2samp(x[thinned][held[thinned]], x[thinned][~held[thinned]])[0] for x in drive
+        scipy.stats.ks_2samp(x[thinned][held[thinned]], x[thinned][~held[thinned]])[0]
+        for x in drive
     ]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
 

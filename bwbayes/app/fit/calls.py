@@ -225,10 +225,10 @@ def open_run(folder: str | Path) -> Fit:
     InputError
         No such run, or it has no draws yet.
     """
-    from bwbayes.app.running import run
+    from bwbayes.app.fit.opening import finished
     from bwbayes.app.running.folder import RunFolder
 
-    return run.finished(RunFolder.open(Path(folder)))
+    return finished(RunFolder.open(Path(folder)))
 
 
 def resume(

@@ -14,11 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from bwbayes.app.fit.plots import Plots
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.at_work import at_work
-from bwbayes.app.jobs.compare import by_name
-from bwbayes.app.jobs.compare import compare as compare_fits
 from bwbayes.app.jobs.compensate import compensate as compensate_fit
 from bwbayes.app.jobs.design import design as design_fit
 from bwbayes.app.jobs.export import export as export_fit
@@ -30,7 +27,6 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another, residuals_along
 from bwbayes.app.running.workers import executor
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.compared import Comparison
 from bwbayes.data import Record, read_record
 from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
@@ -44,12 +40,16 @@ from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
-from bwbayes.sampling.sampler import Outcome, draws, log_densities, sample
+from bwbayes.sampling.chain import draws, log_densities
+from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.shown import head
 
 if TYPE_CHECKING:
     import xarray
+
+    from bwbayes.app.fit.plots import Plots
+    from bwbayes.comparison.compared import Comparison
 
 __all__ = ["Fit"]
 
@@ -98,6 +98,8 @@ class Fit:
         """How the sampling ended, or stands."""
         if self._loaded is not None:
             return self._loaded.outcome
+        from bwbayes.sampling.sampler import sample  # noqa: PLC0415  # emcee is slow to load
+
         plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
         with executor(1) as pool:
             return sample(self.problem.posterior, plan, self.chain, pool)
@@ -237,6 +239,8 @@ class Fit:
     @property
     def plot(self) -> Plots:
         """The figures: ``fit.plot.loop()``, ``bands()``, ``corner()``, ``trace()`` and more."""
+        from bwbayes.app.fit.plots import Plots  # noqa: PLC0415  # matplotlib is slow to load
+
         return Plots(self.problem, self.result, self._converged)
 
     def predict(
@@ -307,8 +311,10 @@ class Fit:
 
         Options and errors are as in :func:`bwbayes.compare`, which fits models, too.
         """
-        fits = by_name((fit.name, fit) for fit in (self, *others))
-        return compare_fits(fits, future=future, workers=workers, executor=executor)
+        from bwbayes.app.jobs import compare  # noqa: PLC0415  # which samples
+
+        fits = compare.by_name((fit.name, fit) for fit in (self, *others))
+        return compare.compare(fits, future=future, workers=workers, executor=executor)
 
     def resume(
         self,

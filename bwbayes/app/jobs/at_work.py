@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
-from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate
 
 import numpy as np
 
 from bwbayes.app.fit.surroundings import warn
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.operator import Span
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["at_work", "command_limits", "limits_of", "opened"]
+__all__ = ["at_work", "command_limits", "limits_of"]
 
 
 def at_work[**P, R](job: Callable[Concatenate[Fit, P], R]) -> Callable[Concatenate[Fit, P], R]:
@@ -38,24 +36,6 @@ def at_work[**P, R](job: Callable[Concatenate[Fit, P], R]) -> Callable[Concatena
         return product
 
     return method
-
-
-def opened(path: Path) -> Fit:
-    """Return the fit in a folder, if it is finished and has converged.
-
-    Raises
-    ------
-    NotConvergedError
-        The sampling has not converged.
-    InputError
-        No such run, or it is not finished.
-    """
-    from bwbayes.app.running.run import finished  # noqa: PLC0415  # fits can do what jobs do
-
-    folder = RunFolder.open(path)
-    fit = finished(folder)
-    fit.require_converged()
-    return fit.knowing(standing=folder.standing())
 
 
 def limits_of(problem: Problem, limits: tuple[float, float] | None) -> Span:

@@ -26,7 +26,7 @@ from bwbayes.comparison.recommendation import recommend
 from bwbayes.errors import InputError
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.results.scores import score
-from bwbayes.sampling.sampler import draws, log_densities
+from bwbayes.sampling.chain import draws, log_densities
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit

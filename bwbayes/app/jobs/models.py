@@ -19,13 +19,14 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, ModelConfig, dump
 from bwbayes.app.config.models import slug
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.jobs.compare import candidate, comparison_of, description, require_same
 from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.problem.records import training_records
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import begin, draw, finished, resume
+from bwbayes.app.running.run import begin, draw, resume
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.comparison.candidates import Candidate

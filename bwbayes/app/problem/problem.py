@@ -12,6 +12,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -87,8 +88,8 @@ class Validation:
 class Problem:
     """All that a run needs, and the config that says the same in explicit numbers.
 
-    ``records`` are those that are fitted, by name; ``findings`` what is wrong with each;
-    ``defaults`` what the default priors of these records would be, by the parameters' name.
+    ``records`` are those that are fitted, by name; ``defaults`` what the default priors of these
+    records would be, by the parameters' name.
     """
 
     __repr__ = brief
@@ -98,9 +99,37 @@ class Problem:
     posterior: Posterior
     plan: SamplingPlan
     validations: Mapping[str, Validation]
-    remarks: tuple[str, ...] = ()
     defaults: Mapping[str, Distribution] = field(default_factory=dict)
-    findings: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict)
+
+    @cached_property
+    def findings(self) -> dict[str, tuple[Finding, ...]]:
+        """What is wrong with each record that is fitted."""
+        return {
+            name: tuple(
+                finding
+                for finding in findings_of(record, [*chain(*self.windows(name).values())])
+                if len(self.records) == 1 or finding.kind not in MADE_UP_FOR
+            )
+            for name, record in self.records.items()
+        }
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know of the records, one line each."""
+        sources = self.config.records
+        remarks = [text for source in sources.values() for text in source.remarks or ()]
+        remarks += [
+            f"{name}: {finding}" for name, all_ in self.findings.items() for finding in all_
+        ]
+        remarks += [text for name, other in self.others.items() for text in unlike(name, other)]
+        remarks += [
+            (f"{name}: " if len(self.records) > 1 else "") + _set_aside(source.outliers, record)
+            for (name, source), record in zip(sources.items(), self.records.values(), strict=True)
+            if source.outliers is not None
+        ]
+        for name in self.validations:
+            remarks += [f"{name}: {finding.note}" for finding in self.extrapolations(name)]
+        return tuple(remarks)
 
     @property
     def record(self) -> Record:
@@ -211,19 +240,6 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     warned = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     noted = [text for source in config.records.values() for text in source.remarks or ()]
     warned = list(dict.fromkeys([*noted, *warned]))
-    findings = {
-        name: tuple(
-            finding
-            for finding in findings_of(
-                record, [*windows[name].training, *chain(*windows[name].held_out.values())]
-            )
-            if len(fitted) == 1 or finding.kind not in MADE_UP_FOR
-        )
-        for name, record in fitted.items()
-    }
-    remarks = [*warned]
-    remarks += [f"{name}: {finding}" for name, issues in findings.items() for finding in issues]
-    remarks += [text for name, other in others.items() for text in unlike(config, name, other)]
     aside = {name: source.outliers for name, source in config.records.items()}
     unjudged = [name for name, times in aside.items() if times is None]
     if config.model.outliers and unjudged:
@@ -243,11 +259,6 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             aside[name] = complete[name].time[spoilt[name]].tolist()
             fitted[name] = complete[name].without(spoilt[name])
     posterior, defaults = _posterior(config, fitted, windows)
-    remarks += [
-        (f"{name}: " if len(fitted) > 1 else "") + _set_aside(times, fitted[name])
-        for name, times in aside.items()
-        if times is not None
-    ]
     validations = {}
     for name, v in config.validation.items():
         of = v.of or next(iter(windows))
@@ -258,19 +269,14 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             validations[name] = Validation(windows[of].held_out[name], of=of)
     simulated = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth = simulated | config.truth
-    problem = Problem(
+    return Problem(
         _explicit(config, posterior, truth, aside, warned),
         fitted,
         posterior,
         _plan(config, posterior),
         validations,
-        tuple(remarks),
         defaults,
-        findings,
     )
-    for name in validations:
-        remarks += [f"{name}: {finding.note}" for finding in problem.extrapolations(name)]
-    return replace(problem, remarks=tuple(remarks))
 
 
 def _posterior(

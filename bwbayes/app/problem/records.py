@@ -284,10 +284,8 @@ def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]
     )
 
 
-def unlike(config: Config, name: str, record: Record) -> Iterator[str]:
-    """Yield what is wrong with the record of a file that is predicted."""
-    if config.validation[name].file is None:
-        return
+def unlike(name: str, record: Record) -> Iterator[str]:
+    """Yield what is wrong with a record that is predicted."""
     for finding in inspect(record):
         if finding.kind == "switch-on transient":
             fix = f"lead_in_from = {record.clock(finding.stop)} under [validation.{name}]"

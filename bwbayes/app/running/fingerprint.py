@@ -17,11 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 from bwbayes.app.config.config import Config
+from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 
-__all__ = ["fingerprint", "require_same", "version_remarks", "versions"]
+__all__ = ["fingerprint", "require_its_own", "require_same", "version_remarks", "versions"]
 
 PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
 
@@ -138,3 +139,10 @@ def _shown(value: object) -> str:
         arguments = ", ".join(f"{k} {v}" for k, v in value.items() if k != "distribution")
         return f"{value['distribution']} ({arguments})" if "distribution" in value else arguments
     return "not set" if value is None else str(value)
+
+
+def require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
+    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
+    if noted.get("data_sha256") != problem.sha256:
+        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
+    require_same(noted.get("posterior"), problem.config, path)

@@ -21,10 +21,11 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.drawing import Beside, beside
-from bwbayes.app.running.fingerprint import fingerprint, require_same, versions
+from bwbayes.app.running.fingerprint import fingerprint, require_its_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.workers import executor, one_thread
@@ -37,10 +38,11 @@ from bwbayes.report.page import render
 from bwbayes.report.saving import draw_pictures
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.sampler import Outcome, first_chain, sample
+from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["begin", "draw", "finished", "redraw", "resume", "start", "write_files"]
+__all__ = ["begin", "draw", "redraw", "resume", "start", "write_files"]
 
 
 def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
@@ -177,29 +179,13 @@ def redraw(folder: RunFolder) -> Fit:
     return fit
 
 
-def finished(folder: RunFolder) -> Fit:
-    """Return the fit that a run's folder holds, as far as its chain goes.
-
-    Raises
-    ------
-    InputError
-        The chain is missing, damaged or still in its pilot.
-    """
-    problem = folder.problem()
-    chain = ChainFile.read(folder.chain)
-    _require_its_own(folder.chain, problem, chain.attributes())
-    if chain.blocks("sampling") == 0:
-        raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
-    return Fit(problem, chain, folder, folder.numbers().get("wall_s", 0.0))
-
-
 def _chain(
     folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
 ) -> ChainFile:
     """Open the run's chain where it stands, or start it with a point fit."""
     posterior, config = problem.posterior, problem.config
     if folder.chain.exists():
-        chain = ChainFile.resume(folder.chain, partial(_require_its_own, folder.chain, problem))
+        chain = ChainFile.resume(folder.chain, partial(require_its_own, folder.chain, problem))
         first_engine, now = chain.attributes()["engine"], posterior.engine
         if first_engine != now:
             if requested is None:
@@ -224,13 +210,6 @@ def _chain(
     }
     first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
     return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
-
-
-def _require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
-    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
-    if noted.get("data_sha256") != problem.sha256:
-        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
-    require_same(noted.get("posterior"), problem.config, path)
 
 
 def _effort(problem: Problem, chain: ChainFile, outcome: Outcome) -> str:

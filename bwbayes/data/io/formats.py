@@ -25,7 +25,6 @@ from bwbayes.data.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.data.io.memory import array_source
 from bwbayes.data.io.series import Source
 from bwbayes.data.io.table import FileTable, table_of
-from bwbayes.data.io.text import read_text, write_text
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, InputWarning
 
@@ -153,6 +152,8 @@ def read_source(path: Path) -> Source:
             raise InputError(f"{path}: a workbook or an archive; export it as CSV")
         if path.suffix.lower() in _BINARY:
             raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+        from bwbayes.data.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+
         return read_text(path)
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
@@ -181,6 +182,8 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
     elif suffix not in _TEXT:
         _write_whole(path, lambda draft: write_hdf5(record, draft))
     else:
+        from bwbayes.data.io.text import write_text  # noqa: PLC0415  # pandas is slow to load
+
         truth_path = _truth_path(path)
         truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
         _write_whole(path, lambda draft: write_text(record, draft))

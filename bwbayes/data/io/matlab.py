@@ -21,8 +21,7 @@ from typing import Any, Literal
 
 import h5py
 import numpy as np
-import scipy.io
-from scipy.io.matlab import MatReadWarning, matfile_version
+import scipy
 
 from bwbayes.data.io.hdf5 import read_hdf5, record_arrays
 from bwbayes.data.io.series import MAXIMUM_SAMPLES, Series, Source, vectors
@@ -82,12 +81,12 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
 
 
 def _read_5(path: Path) -> Source:
-    if matfile_version(path, appendmat=False)[0] != 1:
+    if scipy.io.matlab.matfile_version(path, appendmat=False)[0] != 1:
         raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
     _check_elements(path.read_bytes())
     with warnings.catch_warnings():
         # SciPy warns of a variable that it cannot read or that comes twice; here that is an error.
-        warnings.simplefilter("error", MatReadWarning)
+        warnings.simplefilter("error", scipy.io.matlab.MatReadWarning)
         variables = scipy.io.whosmat(path, appendmat=False)
 
         def load(name: str) -> Any:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -245,4 +245,8 @@ class One:
         bracket = center + s * min(reach, abs(edge - center))
         if s * off(bracket) < 0:
             return bracket
-        return float(brentq(off, center, bracket, xtol=1e-15 * max(abs(bracket), 1.0), rtol=1e-14))
+        return float(
+            scipy.optimize.brentq(
+                off, center, bracket, xtol=1e-15 * max(abs(bracket), 1.0), rtol=1e-14
+            )
+        )

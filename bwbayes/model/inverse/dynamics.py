@@ -19,8 +19,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.linear import Recursion
@@ -50,18 +50,18 @@ def undone(
     if numerator[0] == 0.0 and numerator.size > 1:
         # What the drive before the first sample, or at rest that of the first one, has settled.
         forced[: 2 if state is None else 1] = 0.0
-        later: FloatArray = lfilter(denominator, numerator[1:], forced)[1:]
+        later: FloatArray = scipy.signal.lfilter(denominator, numerator[1:], forced)[1:]
         last = later[-1:] if later.size else np.zeros(1)
         return np.concatenate([later, last])
     if numerator.size == denominator.size == 1:
         return np.asarray(forced / numerator[0])
     # Then no zero lies outside of the unit circle; to look for them takes as long as the filter.
     if np.abs(numerator[1:]).sum() < numerator[0]:
-        return np.asarray(lfilter(denominator, numerator, forced))
+        return np.asarray(scipy.signal.lfilter(denominator, numerator, forced))
     zeros = np.roots(numerator)
     outside = zeros[np.abs(zeros) > 1]
     if not outside.size:
-        return np.asarray(lfilter(denominator, numerator, forced))
+        return np.asarray(scipy.signal.lfilter(denominator, numerator, forced))
     drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, forced)
     if state is None:
         drive[0] = 0.0
@@ -72,12 +72,14 @@ def _looking_ahead(
     first: float, zeros: NDArray[Any], denominator: FloatArray, forced: FloatArray
 ) -> FloatArray:
     """Undo zeros inside of the unit circle forwards, and those outside of it backwards."""
-    drive = lfilter(denominator, [first], forced).astype(np.complex128)
+    drive = scipy.signal.lfilter(denominator, [first], forced).astype(np.complex128)
     for zero in zeros[np.abs(zeros) <= 1]:
-        drive = lfilter([1.0], [1.0, -zero], drive)
+        drive = scipy.signal.lfilter([1.0], [1.0, -zero], drive)
     for zero in zeros[np.abs(zeros) > 1]:
         # w[t-1] = (w[t] - v[t]) / zero, from a drive that does not change after the end.
         end = drive[-1] / (1 - zero)
-        before, _ = lfilter([-1 / zero], [1.0, -1 / zero], drive[:0:-1], zi=[end / zero])
+        before, _ = scipy.signal.lfilter(
+            [-1 / zero], [1.0, -1 / zero], drive[:0:-1], zi=[end / zero]
+        )
         drive = np.concatenate([before[::-1], [end]])
     return np.asarray(drive.real.copy())

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binom
 
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures.style import COLOURS, axis_label, hide_unused, share_legend
@@ -36,7 +36,7 @@ def draw_histograms(calibration: Calibration) -> Figure:
     """
     labels = _labels(calibration)
     count = calibration.positions.shape[0]
-    low, high = binom.interval(LIMITS, count, 1 / RANK_BINS)
+    low, high = scipy.stats.binom.interval(LIMITS, count, 1 / RANK_BINS)
     figure, panels = _grid(labels, "rank among the draws (%)", "replicates\n(expected: 1)")
     for panel, column in zip(panels, calibration.positions.T, strict=True):
         heights, edges = np.histogram(column, RANK_BINS, range=(0, 1))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
-from scipy.stats import rankdata
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.report.figures.style import (
@@ -198,7 +198,7 @@ def _rank_heights(draws: FloatArray) -> FloatArray:
 
     ``draws`` is (steps, ensembles, walkers); what is not a number has no rank.
     """
-    ranks = (rankdata(draws) - 0.5).reshape(draws.shape) / draws.size
+    ranks = (scipy.stats.rankdata(draws) - 0.5).reshape(draws.shape) / draws.size
     edges = np.linspace(0, 1, RANK_BINS + 1)
     counts = [np.histogram(ranks[:, e], edges)[0] for e in range(draws.shape[1])]
     heights: FloatArray = np.asarray(counts) * (RANK_BINS * draws.shape[1] / draws.size)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
 
 from bwbayes.report.figures.style import COLOURS, MEAN_COLOUR, MEASURED_COLOUR
 from bwbayes.results.innovations import Innovations
@@ -30,7 +30,7 @@ def draw_innovations(innovations: Innovations) -> Figure:
 
 def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
     correlation = innovations.correlation
-    bound = stats.norm.isf(0.025) / np.sqrt(innovations.white.size)
+    bound = scipy.stats.norm.isf(0.025) / np.sqrt(innovations.white.size)
     lags = np.arange(1, correlation.size + 1)
     panel.axhspan(-bound, bound, color="#dddddd", lw=0, label="95 % of independent ones")
     panel.vlines(lags, 0, correlation, color=COLOURS[0], lw=2)
@@ -44,13 +44,14 @@ def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
 def _draw_quantiles(panel: Axes, innovations: Innovations) -> None:
     ordered = np.sort(innovations.white)
     size = ordered.size
-    expected = stats.norm.ppf((np.arange(size) + 0.5) / size)
+    expected = scipy.stats.norm.ppf((np.arange(size) + 0.5) / size)
     inner = np.arange(EXTREMES, size - EXTREMES, max(1, size // DOTS))
     ends = np.r_[: min(EXTREMES, size), max(size - EXTREMES, 0) : size]
     at = np.unique(np.concatenate([ends, inner])).astype(np.int64)
     # Where each of so many independent ones lies, pointwise, from the beta distribution.
     low, high = (
-        stats.norm.ppf(stats.beta.ppf(level, at + 1, size - at)) for level in (0.025, 0.975)
+        scipy.stats.norm.ppf(scipy.stats.beta.ppf(level, at + 1, size - at))
+        for level in (0.025, 0.975)
     )
     panel.fill_between(expected[at], low, high, color="#dddddd", lw=0, label="95 % of normal ones")
     panel.plot(expected[at], expected[at], color=MEAN_COLOUR, lw=1)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.signal import periodogram
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
@@ -123,7 +123,9 @@ def _draw_loop(record: Record) -> Figure:
 
 def _draw_drive(record: Record) -> Figure:
     """Draw the spectrum of the voltage, above its mean, from one period a record on."""
-    frequency, power = periodogram(record.voltage, 1 / record.interval, "hann", scaling="spectrum")
+    frequency, power = scipy.signal.periodogram(
+        record.voltage, 1 / record.interval, "hann", scaling="spectrum"
+    )
     amplitude = np.sqrt(2 * power[1:])
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     panel = figure.subplots()
