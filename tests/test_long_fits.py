@@ -64,17 +64,3 @@ def test_whole_fit_of_million_samples_takes_two_gibibytes() -> None:
     whole = fitted(MILLION, dynamics="lag", ess=400)
     keep("long fit", {"gib": whole.peak / GIB})
     assert whole.peak <= 2 * GIB
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
-def test_peak_of_whole_fit_grows_by_less_than_two_gibibytes_a_million_samples() -> None:
-    """The same with few parameters and draws: the peak's line through two lengths, drawn on."""
-    fixed = {"alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0, "lag": 0.002}
-    fixed |= {"offset": 0.0, "discrepancy_time": 0.5}
-    parameters = {name: {"fixed": value} for name, value in fixed.items()}
-    short, long = (
-        fitted(samples, dynamics="lag", ess=100, parameters=parameters)
-        for samples in (10_000, 30_000)
-    )
-    each = (long.peak - short.peak) / (long.samples - short.samples)
-    assert long.peak + each * (MILLION - long.samples) <= 2 * GIB

@@ -197,6 +197,26 @@ def test_killed_at_every_stage_it_resumes_to_the_same_bits(run: Path, tmp_path: 
     small.assert_same_end(run, folder)
 
 
+IN_A_CALLBACK = """
+import ctypes, os, signal, time
+from bwbayes.app.commands import cli
+
+def wait(*_, **__):
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    time.sleep({seconds})
+
+cli.cli.main = wait
+cli.main()
+"""
+
+
+def test_a_request_that_falls_into_a_callback_is_not_lost() -> None:
+    """What C calls cannot raise, such as what loads a compiled function."""
+    code = IN_A_CALLBACK.format(seconds=PATIENCE)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (130, "bwbayes: interrupted\n") == (done.returncode, done.stderr)
+
+
 @pytest.mark.parametrize(
     ("asked", "everyone", "moment"),
     [

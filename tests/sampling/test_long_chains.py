@@ -12,7 +12,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling import chain as chains
-from bwbayes.sampling import monitor
+from bwbayes.sampling import monitor, sampler
 from bwbayes.sampling.chain import draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import check
 from tests.sampling.samplings import PLAN, POSTERIOR, run
@@ -77,7 +77,8 @@ def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.Monke
     """As its steps counted from one are, however often it was thinned on the way; and says so."""
     plan, most = replace(PLAN, ess=200), 800
     monkeypatch.setattr(monitor, "MOST_DRAWS", most)
-    monkeypatch.setattr(chains, "thinning", lambda count, most=most: thinning(count, most))
+    for module in (chains, sampler):
+        monkeypatch.setattr(module, "thinning", lambda count, most=most: thinning(count, most))
     chain, outcome = run(plan)
     assert outcome.check.steps == chain.steps("sampling")
     thin = thinning(chain.draws("sampling"), most)

@@ -8,8 +8,10 @@ Commands that build on a run end with the status of that run.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import threading
 import warnings
 from concurrent.futures import BrokenExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -73,6 +75,15 @@ def _terminate(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+    """Ask to stop once more where the first request fell into a callback, which cannot raise."""
+    if ignored.exc_type is KeyboardInterrupt:
+        # Later: raised in here it would be lost too.
+        threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
+    else:
+        sys.__unraisablehook__(ignored)
+
+
 def _one_line(message: Warning | str, *_: object, **__: object) -> str:
     return f"bwbayes: {as_typed(str(message))}\n"
 
@@ -81,6 +92,7 @@ def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, _terminate)
+    sys.unraisablehook = _interrupt_again
     warnings.formatwarning = _one_line
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
