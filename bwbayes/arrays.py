@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["ArrayLike", "BoolArray", "FloatArray", "IntArray"]
+__all__ = ["ArrayLike", "BoolArray", "FloatArray", "Floating", "IntArray"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Floating = NDArray[np.floating]  # of either precision
 IntArray = NDArray[np.int64]

@@ -4,6 +4,9 @@ Given a draw a reading is normal, with the draw's simulation as its mean. Standa
 that are kept along the record turn means and sds into values of the mixture, and the bands are
 quantiles of these: as smooth along the record as the simulations are. The scores are stratified,
 and a few draws get many of them each, so that hardly any chance is left in a quantile.
+
+All but the scores works in the precision of its arguments: a single one, of means less what they
+have in common, takes half the time.
 """
 
 from __future__ import annotations
@@ -11,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import logsumexp, ndtri
+from scipy.special import ndtri
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, Floating
 
 __all__ = ["VALUES", "crps", "log_density", "quantile", "ranked_values", "stratified_scores"]
 
@@ -36,7 +39,7 @@ def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     return scores
 
 
-def ranked_values(means: FloatArray, sds: FloatArray, scores: FloatArray) -> FloatArray:
+def ranked_values(means: Floating, sds: Floating, scores: Floating) -> Floating:
     """Return values of the mixture in ascending order, (samples, values), um.
 
     Parameters
@@ -56,7 +59,7 @@ def ranked_values(means: FloatArray, sds: FloatArray, scores: FloatArray) -> Flo
     return values
 
 
-def quantile(ranked: FloatArray, probability: float) -> FloatArray:
+def quantile(ranked: Floating, probability: float) -> Floating:
     """Return a quantile (samples,), um, of values ranked along the last axis.
 
     The i-th of N values is the quantile of (i + 1/2) / N, with straight lines in between.
@@ -64,11 +67,11 @@ def quantile(ranked: FloatArray, probability: float) -> FloatArray:
     count = ranked.shape[1]
     place = min(max(probability * count - 0.5, 0.0), count - 1.0)
     below, above = ranked[:, math.floor(place)], ranked[:, math.ceil(place)]
-    line: FloatArray = below + (place % 1) * (above - below)
+    line: Floating = below + (place % 1) * (above - below)
     return line
 
 
-def crps(ranked: FloatArray, values: FloatArray) -> FloatArray:
+def crps(ranked: Floating, values: Floating) -> Floating:
     """Return the continuous ranked probability score of values y (samples,), um.
 
     E|X - y| - E|X - X'| / 2 over the N ranked x: (2/N) Σ (x_i - y) (1{y < x_i} - (i + 1/2) / N).
@@ -80,16 +83,19 @@ def crps(ranked: FloatArray, values: FloatArray) -> FloatArray:
     """
     away = ranked - values[:, np.newaxis]
     count = ranked.shape[1]
-    score: FloatArray = 2 * np.mean(away * ((away > 0) - (np.arange(count) + 0.5) / count), axis=1)
+    below = (np.arange(count, dtype=ranked.dtype) + 0.5) / count
+    score: Floating = 2 * np.mean(away * ((away > 0) - below), axis=1)
     return score
 
 
-def log_density(z: FloatArray, sds: FloatArray) -> FloatArray:
+def log_density(z: Floating, sds: Floating) -> Floating:
     """Return the log density (samples,), nats, per um: log (1/S) Σ φ(z) / sd over the S draws.
 
     ``z`` (draws, samples) is (value - mean) / sd, and ``sds``, all above zero, as in
     :func:`ranked_values`. nan where a value is missing.
     """
-    total: FloatArray = logsumexp(-0.5 * z**2 - np.log(sds), axis=0)
-    total -= np.log(len(z) * np.sqrt(2 * np.pi))
-    return total
+    each = -0.5 * z**2 - np.log(sds)
+    largest = np.max(each, axis=0)
+    mean = np.mean(np.exp(each - largest), axis=0)
+    density: Floating = largest + np.log(mean) - 0.5 * math.log(2 * math.pi)
+    return density

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.data.record import Record, Window
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
@@ -207,7 +207,7 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(mixed.start.model))
-    pending: deque[tuple[int, Future[dict[str, FloatArray]]]] = deque()
+    pending: deque[tuple[int, Future[dict[str, Floating]]]] = deque()
 
     def put() -> None:
         first, part = pending.popleft()
@@ -258,24 +258,29 @@ def _simulated(
 
 def _summarised(
     mixed: _Draws, record: Record, first: int, simulated: FloatArray
-) -> dict[str, FloatArray]:
+) -> dict[str, Floating]:
     """Mean, band edges, and the judgement of the readings, each (samples,)."""
     samples = simulated.shape[1]
     expected, carried = simulated, mixed.start.carried
     if carried is not None:
         expected = simulated + carried.means(first, samples)
-    summarised = {"mean": np.mean(expected, axis=0)}
+    mean = np.mean(expected, axis=0)
+    summarised: dict[str, Floating] = {"mean": mean}
+    # About their mean, so that a single precision is one of the band's width.
+    scores = mixed.scores.astype(np.float32)
+    away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
     for kind in KINDS:
-        means, sds = expected if kind != "parameter" else simulated, mixed.sds(kind, first, samples)
-        ranked = mixture.ranked_values(means, sds, mixed.scores)
+        means = apart if kind == "parameter" else away
+        sds = mixed.sds(kind, first, samples).astype(np.float32)
+        ranked = mixture.ranked_values(means, sds, scores)
         for level in LEVELS:
             tail = (100 - level) / 200
-            summarised[f"{kind} {level} lower"] = mixture.quantile(ranked, tail)
-            summarised[f"{kind} {level} upper"] = mixture.quantile(ranked, 1 - tail)
+            summarised[f"{kind} {level} lower"] = mean + mixture.quantile(ranked, tail)
+            summarised[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
         if kind == "sensor" and record.displacement is not None:
-            reading = record.displacement[first : first + samples]
+            reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
             z = (reading - means) / sds
-            summarised["pit"] = np.mean(ndtr(z), axis=0)
+            summarised["pit"] = np.mean(ndtr(z), axis=0, dtype=np.float64)
             summarised["crps"] = mixture.crps(ranked, reading)
             summarised["log_score"] = mixture.log_density(z, sds)
     return summarised

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp, ndtr
 from scipy.stats import norm
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, Floating
 from bwbayes.results.mixture import (
     VALUES,
     crps,
@@ -61,12 +61,12 @@ KINDS = [
 ]
 
 
-def values(kind: str) -> FloatArray:
+def values(kind: str) -> Floating:
     means, sds = draws(kind)
     return ranked_values(means, sds, stratified_scores(len(means), random()))
 
 
-def worst_error(means: FloatArray, sds: FloatArray, ranked: FloatArray) -> float:
+def worst_error(means: FloatArray, sds: FloatArray, ranked: Floating) -> float:
     """Error of the quantiles' probabilities in sds of independent values, the largest.
 
     Where a part of the draws has no sd the distribution has steps: both sides count.
