@@ -223,6 +223,10 @@ FIGURES: dict[str, Callable[[], list[float]]] = {
     "-m slow tests/control/test_command_hold.py": compensation("compensation by a DAC"),
     "-m slow tests/test_campaign_study.py -k covers": specimens,
     "-m slow tests/population": populations,
+    "-m slow tests/inference/test_untried.py": lambda: [
+        *(100 * STUDIES["untried"]["coverage"][n] for n in ("sine", "staircase", "hold", "hour")),
+        STUDIES["untried"]["wider"],
+    ],
     "-m slow tests/test_long_fits.py": lambda: [STUDIES["long fit"]["gib"]],
 }
 
