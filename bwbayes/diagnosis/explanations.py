@@ -53,14 +53,21 @@ TIED = float(np.log(20))
 SHIFTED = 3.0
 
 
-def explain(scene: Scene, *, thorough: bool) -> tuple[Explanation, ...]:
+def explain(
+    scene: Scene, watch: Callable[[float], None] = lambda _: None, *, thorough: bool
+) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
     Unless ``thorough``, only the first of them, and all if any of these is worth anything.
+    ``watch`` is called with the share that is done.
     """
-    explanations = [explanation for kind in ADDITIONS for explanation in kind(scene)]
-    if thorough or any(explanation.nats > 0 for explanation in explanations):
-        explanations += [explanation for kind in CHANGES for explanation in kind(scene)]
+    explanations: list[Explanation] = []
+    kinds = ADDITIONS + CHANGES
+    for number, kind in enumerate(kinds):
+        if number == len(ADDITIONS) and not thorough and all(e.nats <= 0 for e in explanations):
+            break
+        explanations += kind(scene)
+        watch((number + 1) / len(kinds))
     return tuple(sorted(explanations, key=lambda explanation: -explanation.nats))
 
 

@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.results.start`.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -78,6 +78,7 @@ def predict_windows(
     record: Record,
     windows: Mapping[str, slice | Sequence[slice]],
     generator: np.random.Generator,
+    watch: Callable[[int], None] = lambda _: None,
 ) -> list[Bands]:
     """Predict windows of the training record: one simulation, one offset.
 
@@ -93,13 +94,15 @@ def predict_windows(
         Slices of its samples, by name: one, or several, which make one set of bands.
     generator
         Draws the state of the dynamics at the record's start, where that is unknown.
+    watch
+        Is called with a number of samples whenever so many more are done.
     """
     theta = posterior.prior.theta(draws)
     mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(part.start, part.stop) for parts in several.values() for part in parts]
     first = min(start for start, _ in edges)
-    whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)))
+    whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)), watch)
     bands = []
     for name, parts in several.items():
         training = any(
@@ -161,6 +164,7 @@ def predict_record(
     generator: np.random.Generator,
     name: str = "prediction",
     window: Window | None = None,
+    watch: Callable[[int], None] = lambda _: None,
 ) -> Bands:
     """Predict another record, or a planned voltage without a measurement.
 
@@ -179,6 +183,8 @@ def predict_record(
     window
         Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
         its first sample in any case.
+    watch
+        Is called with a number of samples whenever so many more are done.
 
     Raises
     ------
@@ -190,7 +196,7 @@ def predict_record(
     begun = started(posterior, theta, record, start, generator)
     if part.stop <= begun.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, _draws(posterior, theta, begun), record, part)
+    bands = _bands(name, _draws(posterior, theta, begun), record, part, watch)
     scored_from = max(begun.judged_from - part.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=begun.lead_in, separate=True)
 
@@ -202,7 +208,13 @@ def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
     return _Draws(start, *sds, scores)
 
 
-def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
+def _bands(
+    name: str,
+    mixed: _Draws,
+    record: Record,
+    window: slice,
+    watch: Callable[[int], None] = lambda _: None,
+) -> Bands:
     """Walk through a record and summarise the mixture over a window."""
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
@@ -213,6 +225,7 @@ def _bands(name: str, mixed: _Draws, record: Record, window: slice) -> Bands:
         first, part = pending.popleft()
         for key, values in part.result().items():
             joined[key][first : first + values.size] = values
+        watch(values.size)
 
     with ThreadPoolExecutor(THREADS) as executor:
         for first, simulated in _simulated(mixed.start, record.voltage, window):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.running.progress import Progress
+from bwbayes import open_run
+from bwbayes.app.running.predictions import predictions
+from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.plan import SamplingPlan
 
@@ -88,3 +91,30 @@ def test_a_run_that_goes_on_has_an_eta_after_its_first_block(watched: Watched) -
     watched.block(10.0, ensembles=1)
     # A quarter of a block of 50 steps in 2.5 s, and 600 steps less that to go.
     assert round(2.5 / 12.5 * (600 - 12.5)) == pytest.approx(watched.eta, abs=1)
+
+
+def test_each_step_after_the_sampling_counts_down_by_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    console = Console(record=True, width=200, file=StringIO())
+    with StepProgress(console) as progress:
+        for step, share in (("predictions", 0.25), ("predictions", 1.0), ("explanations", 0.0)):
+            now[0] += 30
+            progress(step, share)
+        now[0] += 60
+        progress("explanations", 0.5)
+    assert [
+        "predictions 25%   ETA 1:30",
+        "predictions 100%   ETA 0:00",
+        "explanations 0%   ETA unknown",
+        "explanations 50%   ETA 1:30",
+    ] == console.export_text().splitlines()
+
+
+def test_predictions_say_how_far_they_are(run: Path) -> None:
+    fit, shares = open_run(run), [0.0]
+    predictions(fit.problem, fit.flat_draws, shares.append)
+    assert sorted(shares) == shares
+    assert shares[-1] == pytest.approx(1.0)

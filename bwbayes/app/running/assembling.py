@@ -5,7 +5,9 @@ What is worked out is kept with the run (:mod:`bwbayes.app.running.cache`), and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,11 +55,16 @@ WORKED_OUT = (
 
 
 def assemble(
-    problem: Problem, chain: ChainFile, outcome: Outcome, artist: Beside | None = None
+    problem: Problem,
+    chain: ChainFile,
+    outcome: Outcome,
+    artist: Beside | None = None,
+    watch: Callable[[str, float], None] = lambda *_: None,
 ) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions.
 
-    ``artist`` is given each part of it as soon as there is something to draw.
+    ``artist`` is given each part of it as soon as there is something to draw; ``watch`` is called
+    with the name of a step and the share of it that is done.
     """
     posterior = problem.posterior
     result = _drawn(problem, chain, outcome)
@@ -80,7 +87,7 @@ def assemble(
         return result
     chosen = thinned(flat, generator(problem.config.seed, "draws"))
     steps = measure_steps(posterior, chosen, stepped(problem))
-    bands = predictions(problem, flat)
+    bands = predictions(problem, flat, partial(watch, "predictions"))
     if artist is not None:
         artist.draw(replace(result, bands=bands, steps=steps))
     best = flat[int(np.argmax(result.log_density))]
@@ -101,7 +108,13 @@ def assemble(
     places = posterior.prior.unconstrain(best[np.newaxis])
     places = np.concatenate([places, chain.point.optima])
     explanations = {
-        name: explained(problem, name, places, thorough=failed or bool(odd[name]))
+        name: explained(
+            problem,
+            name,
+            places,
+            partial(watch, f"explanations of {name}" if several else "explanations"),
+            thorough=failed or bool(odd[name]),
+        )
         for name in problem.records
     }
     verdicts = judged(problem, bands, background, explanations)

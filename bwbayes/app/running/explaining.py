@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.arrays import FloatArray
@@ -16,7 +16,12 @@ SHOWN = 5
 
 
 def explained(
-    problem: Problem, name: str, places: FloatArray, *, thorough: bool
+    problem: Problem,
+    name: str,
+    places: FloatArray,
+    watch: Callable[[float], None] = lambda _: None,
+    *,
+    thorough: bool,
 ) -> tuple[Explanation, ...]:
     """Explain a training record's readings better than its fit does, the best explanation first.
 
@@ -28,6 +33,8 @@ def explained(
         The record's name.
     places
         The posterior's modes (modes, free), coordinates.
+    watch
+        Is called with the share that is done.
     thorough
         Something is known to be wrong.
     """
@@ -41,7 +48,7 @@ def explained(
         # Of several records no other model is built: it would be one of all of them.
         problem.reconfigured if len(problem.records) == 1 else None,
     )
-    return explain(scene, thorough=thorough)
+    return explain(scene, watch, thorough=thorough)
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:

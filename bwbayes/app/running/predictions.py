@@ -8,7 +8,7 @@ on the data alone: the same record under another name gets the same bands.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -261,18 +261,36 @@ def training_record(problem: Problem, name: str | None) -> str:
     return name or next(iter(problem.records))
 
 
-def predictions(problem: Problem, flat: FloatArray, *, training: bool = True) -> tuple[Bands, ...]:
-    """Predict everything held out, and the ``training`` windows of all records, from flat draws."""
+def predictions(
+    problem: Problem,
+    flat: FloatArray,
+    watch: Callable[[float], None] = lambda _: None,
+    *,
+    training: bool = True,
+) -> tuple[Bands, ...]:
+    """Predict everything held out, and the ``training`` windows of all records, from flat draws.
+
+    ``watch`` is called with the share that is done.
+    """
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
+    records = [*problem.records.values(), *problem.others.values()]
+    total = sum(record.samples for record in records)
+    done = 0
+
+    def more(samples: int) -> None:
+        nonlocal done
+        done += samples
+        watch(min(done / total, 1.0))
+
     for name, alone, own_draws in posterior.each(chosen):
         windows = problem.windows(name) if training else problem.held_out(name)
         if windows:
             record = problem.records[name]
             # By content: the same record under another name gets the same bands.
             source = generator(seed, f"predict {record.sha256}")
-            bands += predict_windows(alone, own_draws, record, windows, source)
+            bands += predict_windows(alone, own_draws, record, windows, source, more)
     for name, other in problem.validations.items():
         if other.record is not None:
             source = generator(seed, f"predict {other.record.sha256}")
@@ -280,7 +298,7 @@ def predictions(problem: Problem, flat: FloatArray, *, training: bool = True) ->
             alone, own_draws = _reaching(problem, chosen, other.of, other.record, beyond)
             bands.append(
                 predict_record(
-                    alone, own_draws, other.record, other.start, source, name, other.judged
+                    alone, own_draws, other.record, other.start, source, name, other.judged, more
                 )
             )
     return tuple(bands)

@@ -19,7 +19,7 @@ from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
 
-__all__ = ["CountProgress", "Progress"]
+__all__ = ["CountProgress", "Progress", "StepProgress"]
 
 # Seconds between lines where there is no terminal.
 PAUSE = 10.0
@@ -50,6 +50,23 @@ class _Line:
         elif printed and now - self.printed >= PAUSE:
             self.printed = now
             self.console.print(line, highlight=False, soft_wrap=True)
+
+
+class StepProgress(_Line):
+    """Watches steps, one after the other, of which the share that is done is known."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
+        self.step, self.latest = "", self.begun
+
+    def __call__(self, step: str, share: float) -> None:
+        """Take note of how much of a step is done, from 0 to 1."""
+        if step != self.step:
+            self.step, self.begun = step, self.latest
+        self.latest = time.monotonic()
+        elapsed = self.latest - self.begun
+        remaining = _minutes(elapsed * (1 - share) / share) if share else "unknown"
+        self.show(f"{step} {share:.0%}   ETA {remaining}")
 
 
 class CountProgress(_Line):

@@ -27,7 +27,7 @@ from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.drawing import Beside, beside
 from bwbayes.app.running.fingerprint import fingerprint, require_its_own, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.progress import Progress
+from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
@@ -151,7 +151,8 @@ def resume(
             outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
         console.print(_effort(problem, chain, outcome), highlight=False)
         console.print("computing predictions ...", highlight=False)
-        result = assemble(problem, chain, outcome, artist)
+        with StepProgress(console) as watch:
+            result = assemble(problem, chain, outcome, artist, watch)
         fit = Fit(problem, chain, folder, time.monotonic() - start_time).knowing(
             outcome=outcome, result=result, standing=result.standing
         )
