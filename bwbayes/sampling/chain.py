@@ -102,8 +102,8 @@ class Chain:
     set_aside
         Blocks at the beginning of the sampling that do not count, because their proposal turned
         out not to cover the posterior.
-    second, refitted
-        The proposal that was fitted to the first of these, if any, and how many they were.
+    refit, refitted
+        The proposal that was last fitted to blocks of the sampling, and to how many.
     """
 
     __repr__ = brief
@@ -112,27 +112,27 @@ class Chain:
         self.starts = tuple(starts)
         self.proposals: dict[Phase, StudentMixture | None] = dict.fromkeys(PHASES)
         self.set_aside = self.refitted = 0
-        self.second: StudentMixture | None = None
+        self.refit: StudentMixture | None = None
         self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
 
     def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
         """Fix the proposal of a phase, before its first block."""
         self.proposals[phase] = proposal
 
-    def fall_back(self, blocks: int, second: StudentMixture | None = None) -> None:
+    def fall_back(self, blocks: int, refit: StudentMixture | None = None) -> None:
         """Set the first blocks of the sampling aside: they count no longer.
 
-        It goes on with a second proposal, or without any.
+        It goes on with a proposal that was fitted to them, or without any.
         """
-        if second is not None:
-            self.second, self.refitted = second, blocks
+        if refit is not None:
+            self.refit, self.refitted = refit, blocks
         self.set_aside = blocks
 
     def proposal_in_use(self, phase: Phase) -> StudentMixture | None:
         """Return the proposal that a phase goes on with."""
         if phase != "sampling" or not self.set_aside:
             return self.proposals[phase]
-        return self.second if self.set_aside == self.refitted else None
+        return self.refit if self.set_aside == self.refitted else None
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
         """Add the next block of every ensemble."""

@@ -14,10 +14,10 @@ and the next one waits until then, and until the chain is long against its autoc
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
 from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
-the sampling starts again from where the ensembles are with a second proposal, which is fitted to
-them, for they have been where the first hardly goes. If that one does not cover its draws either,
-these are set aside too, and differential evolution goes on alone, which needs about ten times the
-steps. So all draws that count come from one kernel, fixed before the first of them.
+the sampling starts again from where the ensembles are with another proposal, which is fitted to all
+that was set aside, for that has been where the first hardly goes. After half of the budget
+differential evolution goes on alone, which needs about ten times the steps. So all draws that count
+come from one kernel, fixed before the first of them.
 
 All decisions are functions of the chain alone, and are taken again from its beginning when a run
 that was interrupted goes on: it comes to the same end.
@@ -38,7 +38,6 @@ from bwbayes.inference.pointfit import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning
 from bwbayes.sampling.diagnostics import (
-    LARGEST_PARETO_K,
     LENGTH,
     Check,
     nested_rhat,
@@ -69,8 +68,11 @@ MOST_TUNING_BLOCKS = 16
 TAKEN = 0.5
 HARDLY_TAKEN = 0.25
 
+# The part of the budget in which a proposal that does not cover its draws is followed by another.
+REFITTING = 0.5
+
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
-# least if it is not draws that are missing.
+# least if it is not draws that are missing. A proposal is fitted again to so many more at least.
 FIRST_CHECK = 3
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
@@ -122,8 +124,12 @@ def sample(
         _extend(posterior, plan, chain, "pilot", executor, watcher)
     if not chain.history("sampling"):
         _tune(posterior, plan, chain, executor, watcher)
+    elif chain.refitted and chain.refit is None:
+        chain.refit = _refit(chain, chain.refitted)  # that of a file
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        _refit_proposal(chain)
+        made = len(chain.history("sampling"))
+        early = made * plan.block <= REFITTING * plan.most_steps
+        chain.fall_back(made, _refit(chain, made) if early else None)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
@@ -158,7 +164,11 @@ def _sampled(
         if blocks == budget:
             why = "; ".join(missing) or "only the last check passed"
             return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
-        if not now.covered and at_end:
+        if (
+            not now.covered
+            and at_end
+            and chain.set_aside + blocks >= LEAST_STRETCH * chain.refitted
+        ):
             return None
         first = not now.shortcomings(plan.ess, FIRST_PART)
         passed = (passed or blocks) if first else 0
@@ -183,42 +193,32 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
-def _refit_proposal(chain: Chain) -> None:
-    """Set what the sampling has made aside; the first time, go on with a fit to that."""
-    thin = thinning(chain.draws("sampling"))
-    second = None if chain.set_aside else _fitted(chain, "sampling", slice(None), thin)
-    chain.fall_back(len(chain.history("sampling")), second)
+def _refit(chain: Chain, blocks: int) -> StudentMixture | None:
+    """Fit a proposal to the first blocks of the sampling, whether they count or not."""
+    made = Chain(chain.starts)
+    for block in chain.history("sampling")[:blocks]:
+        made.append("sampling", block)
+    return _fitted(made, "sampling", slice(None), thinning(made.draws("sampling")))
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
     """Say what a user should know of the moves."""
     alone = "differential evolution and snooker moves alone made the draws that count"
-    first, refitted = chain.proposals["sampling"], chain.refitted
+    first = chain.proposals["sampling"]
     if first is None:
         return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
     if not chain.set_aside:
         return ()
     aside = chain.history("sampling")[: chain.set_aside]
-    poor = _describe_poor_coverage(first, aside[: refitted or None])
-    story = f"the proposal {poor}: they are set aside, and "
-    if not refitted:
-        return (f"{story}{alone}",)
-    if chain.second is None or chain.set_aside == refitted:
-        return (f"{story}a second one, fitted to them, made draws that count",)
-    again = _describe_poor_coverage(chain.second, aside[refitted:])
-    return (f"{story}so are those of a second one, fitted to them, which {again}: {alone}",)
-
-
-def _describe_poor_coverage(proposal: StudentMixture, aside: Sequence[Sequence[Block]]) -> str:
-    """Say how badly a proposal covers the blocks that were set aside."""
     flat = [block for blocks in aside for block in blocks]
     coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in flat])
     density = np.concatenate([b.log_density.ravel() for b in flat])
-    shape = pareto_k(density - proposal.log_density(coordinates))
+    shape = pareto_k(density - first.log_density(coordinates))
     steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
+    followed = "one that was fitted to them made the draws that count"
     return (
-        f"did not cover its first {steps} steps (Pareto k {shape:.2f} is not below "
-        f"{LARGEST_PARETO_K})"
+        f"the proposal did not cover the first {steps} steps (Pareto k {shape:.2f}): they are set "
+        f"aside, and {followed if chain.refitted == chain.set_aside else alone}",
     )
 
 

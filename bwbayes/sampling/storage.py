@@ -7,11 +7,12 @@ that was cut or changed on the disk the blocks before the damage are read. Going
 first copies what counts into a fresh one. This module alone knows the layout:
 
     /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
-    /proposal/PHASE, /proposal/second    weights, centres, factors of the proposals; bend
+    /proposal/PHASE                      weights, centres, factors of the proposals; bend
     /point                               the point fit
     /committed                           blocks of each phase; proposals of each phase (0 or 1);
                                          blocks of the sampling that were set aside, and those
-                                         that the second proposal was fitted to
+                                         that the proposal in use was fitted to, which is
+                                         fitted again when the sampling goes on
 
 and what was run (config, versions, seed, hash of the data) as the file's attributes.
 """
@@ -49,7 +50,7 @@ __all__ = ["ChainFile"]
 
 FORMAT = 2
 
-# Where /committed says how many blocks were set aside, and for a second proposal.
+# Where /committed says how many blocks were set aside, and how many a proposal was fitted to.
 SET_ASIDE = 2 * len(PHASES)
 REFITTED = SET_ASIDE + 1
 
@@ -109,9 +110,8 @@ class ChainFile(Chain):
                 opened.freeze(phase, chain.proposals[phase])
                 for blocks in chain.history(phase):
                     opened.append(phase, blocks)
-            if chain.set_aside and chain.second is not None:
-                opened.fall_back(chain.refitted, chain.second)
-            if chain.set_aside != opened.set_aside:
+            opened.refitted, opened.refit = chain.refitted, chain.refit
+            if chain.set_aside:
                 opened.fall_back(chain.set_aside)
         return opened
 
@@ -215,13 +215,10 @@ class ChainFile(Chain):
             self._commit(len(PHASES) + PHASES.index(phase), 1)
         super().freeze(phase, proposal)
 
-    def fall_back(self, blocks: int, second: StudentMixture | None = None) -> None:
+    def fall_back(self, blocks: int, refit: StudentMixture | None = None) -> None:
         """Set the first blocks of the sampling aside, in the file too."""
-        if second is not None:
-            self._write("second", second)
-            self._commit(REFITTED, blocks)
-        self._commit(SET_ASIDE, blocks)
-        super().fall_back(blocks, second)
+        super().fall_back(blocks, refit)
+        self._commit(slice(SET_ASIDE, REFITTED + 1), [self.set_aside, self.refitted])
 
     def close(self) -> None:
         """Close the file."""
@@ -259,7 +256,7 @@ class ChainFile(Chain):
             path.unlink(missing_ok=True)
             raise
 
-    def _commit(self, column: int, count: int) -> None:
+    def _commit(self, column: int | slice, count: int | list[int]) -> None:
         """Let ``count`` count, once everything before has reached the file."""
         self._file.flush()
         self._file["committed"][:, column] = count
@@ -274,10 +271,8 @@ class ChainFile(Chain):
                 with h5py.File(image, "r") as file:
                     loaded = cls._read_header(path, file)
                     committed = either(file["committed"])
-                    # Files of versions that fitted no second one say nothing of it.
+                    # Files of versions that fitted none say nothing of it.
                     set_aside, refitted = [*committed[SET_ASIDE:].tolist(), 0][:2]
-                    if refitted:
-                        loaded.second = _proposal(file["proposal/second"])
                     for column, phase in enumerate(PHASES):
                         if committed[len(PHASES) + column]:
                             loaded.proposals[phase] = _proposal(file[f"proposal/{phase}"])
@@ -287,9 +282,9 @@ class ChainFile(Chain):
                 damage = " ".join(str(error.args[-1] if error.args else error).split())
         if loaded is not None:
             n_blocks = len(loaded.history("sampling"))
-            loaded.refitted = refitted if refitted <= n_blocks else 0
-            # Blocks are lost from the end: then the second proposal's, or all, count again.
-            loaded.set_aside = set_aside if set_aside <= n_blocks else loaded.refitted
+            # Blocks are lost from the end: then all that are left count again.
+            if set_aside <= n_blocks:
+                loaded.set_aside, loaded.refitted = set_aside, refitted
         return loaded, damage
 
     @classmethod
@@ -325,7 +320,7 @@ def _create_all(file: Any, point: PointFit, starts: Sequence[EnsembleState], blo
     layout: dict[str, Any] = {f"point/{name}": getattr(point, name) for name in _POINT}
     for name in ("coordinates", "log_density", "random_state"):
         layout[f"start/{name}"] = np.stack([getattr(s, name) for s in starts])
-    for name in (*PHASES, "second"):
+    for name in PHASES:
         layout[f"proposal/{name}/weights"] = np.zeros(COMPONENTS)
         layout[f"proposal/{name}/centres"] = np.zeros((COMPONENTS, free))
         layout[f"proposal/{name}/factors"] = np.zeros((COMPONENTS, free, free))

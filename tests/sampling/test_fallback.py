@@ -1,6 +1,6 @@
-"""A proposal that does not cover its draws is given up, and a second one is fitted to these.
+"""A proposal that does not cover its draws is given up, and another one is fitted to these.
 
-If that does not cover its draws either, differential evolution goes on alone.
+After half of the budget differential evolution goes on alone.
 
 The planted proposal is a normal distribution of a third of the posterior's width, whose weights
 have a tail of shape 0.91: far above the limit of 0.7, that of a fitted one far below.
@@ -82,12 +82,14 @@ def fallen_back() -> tuple[Chain, Outcome]:
     return planted(plant_every)
 
 
-def test_two_proposals_that_do_not_cover_their_draws_are_given_up(
+def test_proposals_that_do_not_cover_their_draws_are_given_up(
     fallen_back: tuple[Chain, Outcome],
 ) -> None:
-    """At the first checks; what they drew does not count, and what counts they did not draw."""
+    """In half of the budget; what they drew does not count, and what counts they did not."""
     chain, outcome = fallen_back
-    assert (FIRST_CHECK, 2 * FIRST_CHECK) == (chain.refitted, chain.set_aside)
+    half = LONG.most_steps / 2 / LONG.block
+    assert 0 < chain.refitted <= half < chain.set_aside
+    assert chain.set_aside < 1.5 * half
     assert chain.proposals["sampling"] is not None
     assert chain.proposal_in_use("sampling") is None
     assert {"differential evolution", "snooker"} == set(chain.moves("sampling"))
@@ -98,11 +100,11 @@ def test_two_proposals_that_do_not_cover_their_draws_are_given_up(
 
 
 def test_proposals_that_were_given_up_are_told_of(fallen_back: tuple[Chain, Outcome]) -> None:
-    (remark,) = fallen_back[1].remarks
-    steps = FIRST_CHECK * PLAN.block
-    shapes = re.findall(rf"did not cover its first {steps} steps \(Pareto k (0\.\d\d) ", remark)
-    assert 2 == len(shapes)
-    assert min(map(float, shapes)) > 0.7
+    chain, outcome = fallen_back
+    (remark,) = outcome.remarks
+    steps = chain.set_aside * PLAN.block
+    (shape,) = re.findall(rf"did not cover the first {steps} steps \(Pareto k (0\.\d\d)\)", remark)
+    assert float(shape) > 0.7
     assert remark.startswith("the proposal ")
     assert "differential evolution and snooker moves alone" in remark
     assert fallen_back[1].check.pareto_k is None
@@ -141,6 +143,7 @@ def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
         sample(POSTERIOR, LONG, chain, PluggedExecutor(PLAN.ensembles * (before + blocks)))
     so_far = blocks // FIRST_CHECK * FIRST_CHECK
     assert min(so_far, expected.set_aside) == chain.set_aside
+    chain.refit = None  # a file does not keep it
     with ThreadPoolExecutor(1) as executor:
         again = sample(POSTERIOR, LONG, chain, executor)
     assert expected.set_aside == chain.set_aside

@@ -50,28 +50,29 @@ def test_attributes_say_what_was_run_and_survive_going_on(whole: Path, tmp_path:
     assert ChainFile.read(copy).attributes() == ATTRIBUTES
 
 
-def test_a_second_proposal_is_kept_in_use_and_after_it(tmp_path: Path) -> None:
-    """Through a file that goes on; without the last blocks it is in use again."""
+def test_how_many_blocks_a_proposal_was_fitted_to_is_kept(tmp_path: Path) -> None:
+    """Through a file that goes on; without the last blocks all count again."""
     path = tmp_path / "chain.h5"
-    second = proposal("tuning")
     with new(path) as chain:
         chain.freeze("sampling", proposal("sampling"))
         chain.append("sampling", blocks("sampling", 0))
-        chain.fall_back(1, second)
-    with ChainFile.resume(path) as chain:
-        assert_same_proposal(second, chain.proposal_in_use("sampling"))
-        chain.append("sampling", blocks("sampling", 1))
-        chain.fall_back(2)
-    with ChainFile.resume(path) as chain:
-        assert (1, 2) == (chain.refitted, chain.set_aside)
-        assert chain.proposal_in_use("sampling") is None
-        assert_same_proposal(second, chain.second)
+        chain.fall_back(1, proposal("tuning"))
+        assert_same_proposal(proposal("tuning"), chain.proposal_in_use("sampling"))
+    for made in (1, 2):
+        with ChainFile.resume(path) as chain:
+            assert (made, made) == (chain.refitted, chain.set_aside)
+            chain.append("sampling", blocks("sampling", made))
+            chain.fall_back(made + 1, proposal("tuning") if made == 1 else None)
+    read = ChainFile.read(path)
+    assert (2, 3) == (read.refitted, read.set_aside)
+    assert read.proposal_in_use("sampling") is None
     with h5py.File(path, "r+") as file:
-        file["committed"][:, PHASES.index("sampling")] = 1
-    assert_same_proposal(second, ChainFile.read(path).proposal_in_use("sampling"))
+        file["committed"][:, PHASES.index("sampling")] = 2
+    read = ChainFile.read(path)
+    assert (0, 0) == (read.refitted, read.set_aside)
 
 
-def test_a_file_that_knows_no_second_proposal_is_read(tmp_path: Path) -> None:
+def test_a_file_that_knows_of_no_other_proposal_is_read(tmp_path: Path) -> None:
     path = tmp_path / "chain.h5"
     with new(path) as chain:
         chain.freeze("sampling", proposal("sampling"))
@@ -79,7 +80,7 @@ def test_a_file_that_knows_no_second_proposal_is_read(tmp_path: Path) -> None:
         chain.fall_back(1)
     with h5py.File(path, "r+") as file:
         shorter = file["committed"][:, :REFITTED]
-        del file["committed"], file["proposal/second"]
+        del file["committed"]
         file.create_dataset("committed", data=shorter, chunks=(1, REFITTED), fletcher32=True)
     read = ChainFile.read(path)
     assert (1, 0) == (read.set_aside, read.refitted)
