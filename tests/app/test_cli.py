@@ -84,17 +84,6 @@ def assert_one_line(said: Said, *parts: str) -> None:
 # Help and usage
 
 
-@pytest.mark.parametrize("command", ["compensate", "design", "export", "track"])
-def test_the_amplifier_is_told_in_the_same_words_everywhere(command: str) -> None:
-    """Its voltages, fastest change, current and capacitance; --rate is samples a second alone."""
-    options = {o.opts[0]: o for o in cli.cli.commands[command].params if o.opts[0][0] == "-"}
-    assert (2, "LOW HIGH") == (options["--voltage"].nargs, options["--voltage"].metavar)
-    amplifier = {"--slew", "--current", "--capacitance"} & set(options)
-    assert amplifier in (set(), {"--slew", "--current", "--capacitance"})
-    assert (command in ("export", "track")) == ("--rate" in options)
-    assert not {"--voltages", "--limits"} & set(options)
-
-
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
 def test_help_names_every_command(bwbayes: Type, arguments: tuple[str, ...]) -> None:
     said = bwbayes(*arguments)
@@ -295,14 +284,6 @@ def test_simulate_writes_record_and_truth(bwbayes: Type, tmp_path: Path, suffix:
     assert result.displacement is not None
     assert np.std(result.displacement - result.truth) < 1  # the sensor's noise
     assert 0.3575 == json.loads((tmp_path / "a.truth.json").read_text())["alpha"]
-
-
-def test_simulated_record_depends_on_its_seed(bwbayes: Type, tmp_path: Path) -> None:
-    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
-        said = bwbayes("simulate", f"{name}.csv", "--rate", "50", "--seed", seed)
-        assert 0 == said.status
-    first, again, other = (read_record(tmp_path / f"{name}.csv") for name in "abc")
-    assert first.sha256 == again.sha256 != other.sha256
 
 
 def columns(path: Path) -> tuple[list[str], np.ndarray]:

@@ -16,7 +16,7 @@ from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
-from bwbayes.app.running import predictions, run
+from bwbayes.app.running import run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.report.words import digits
@@ -327,28 +327,6 @@ def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
     assert bands.scores is None
     assert bands.holds is None
     assert np.isnan(bands.residuals).all()
-
-
-def test_a_hold_longer_than_the_record_has_a_wider_band_and_no_other_plan_has(
-    opened: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = opened.problem.record
-    ramp = np.linspace(0, np.max(made.voltage), 20)
-    hold = np.concatenate([ramp, np.full(10 * made.samples, ramp[-1])])
-    bands = {}
-    for name, voltage in (("hold", hold), ("same", made.voltage)):
-        plan = replace(made, voltage=voltage, displacement=None, truth=None)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            bands[name] = opened.predict(plan, from_rest=True)
-            with monkeypatch.context() as patch:
-                patch.setattr(predictions, "with_creep", lambda *given: given[:2])
-                bands[f"{name}, still"] = opened.predict(plan, from_rest=True)
-    width = {
-        n: one.upper["displacement", 95] - one.lower["displacement", 95] for n, one in bands.items()
-    }
-    assert width["hold"][-1] > 1.02 * width["hold, still"][-1]
-    np.testing.assert_array_equal(width["same"], width["same, still"])
 
 
 def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:

@@ -34,7 +34,6 @@ COMMANDS = {
 }
 IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
     "compensate": lambda fit, _: fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
-    "track": lambda fit, _: fit.track(frequencies=(2.0,), draws=5),
     "design": lambda fit, _: fit.design("d"),
     "export": lambda fit, folder: fit.export(folder),
 }

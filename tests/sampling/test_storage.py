@@ -11,19 +11,16 @@ from typing import Any
 
 import h5py
 import numpy as np
-import pytest
 
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.storage import REFITTED, ChainFile
 from tests.forks import FORKS
 from tests.sampling.chains import (
     ATTRIBUTES,
-    ENSEMBLES,
     PLAN,
     arrays,
     assert_same,
     blocks,
-    committed,
     finish,
     new,
     proposal,
@@ -146,20 +143,3 @@ def written(path: Path, last_moment: int | None = None) -> int | None:
     process.start()
     process.join()
     return process.exitcode
-
-
-# Some fall into the start, most into a block, its count, or the copy with which a run goes on.
-@pytest.mark.parametrize("first", [0, 3, 20, 44, 48, 53, 60, 71, 120])
-def test_killed_anywhere_it_goes_on_to_the_same_bits(
-    first: int, tmp_path: Path, expected: dict[str, Any]
-) -> None:
-    """Killed twice, the second time when it has gone on: copying, or in a later block."""
-    path = tmp_path / "chain.h5"
-    assert written(path, first) == -signal.SIGKILL
-    before = len(ChainFile.read(path).ends) if path.exists() else 0
-    assert before in (0, ENSEMBLES)
-    counts = committed(path)
-    assert written(path, 5 + first // 2) == -signal.SIGKILL
-    assert all(now >= then for now, then in zip(committed(path), counts, strict=True))
-    assert written(path) == 0
-    assert_same(expected, arrays(ChainFile.read(path)))
