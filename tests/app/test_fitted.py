@@ -21,7 +21,6 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.report.words import digits
 from bwbayes.results.outputs import write_bands
-from bwbayes.results.result import summary
 from tests.app import small
 
 
@@ -123,16 +122,6 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
 
 
 # What it shows
-
-
-def test_the_loops_are_those_of_the_summary(fit: Fit) -> None:
-    loops = fit.loops
-    assert loops is not None
-    told: Any = summary(fit.result)["loops"]
-    opening = loops.major.estimates["opening_um"]
-    assert opening is not None
-    assert opening.lower < opening.mean < opening.upper
-    assert opening.mean == pytest.approx(told["major"]["opening_um"]["mean"])
 
 
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
@@ -327,12 +316,6 @@ def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
     assert bands.scores is None
     assert bands.holds is None
     assert np.isnan(bands.residuals).all()
-
-
-def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        opened.predict(folder / "records/sine.h5", from_rest=True)
 
 
 # Keys

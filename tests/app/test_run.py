@@ -133,18 +133,6 @@ def test_coverage_of_the_displacement_needs_a_truth(copy: RunFolder) -> None:
     assert answer["held-out"]["coverage"]["displacement"] is not None
 
 
-def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
-    tree = xarray.open_datatree(run / "posterior.nc", engine="h5netcdf")
-    assert {"posterior", "sample_stats", "observed_data", "constant_data"} <= set(tree.children)
-    posterior = tree["posterior"].to_dataset()
-    assert set(FREE) == set(posterior.data_vars)
-    assert ("chain", "draw") == posterior["alpha"].dims
-    assert 4 * 18 == posterior.sizes["chain"]
-    assert [0, 1, 2, 3] == sorted(set(posterior["ensemble"].values))
-    assert list(range(18)) == sorted(set(posterior["walker"].values))
-    assert "um/V" == posterior["alpha"].attrs["units"]
-
-
 def test_posterior_is_the_chain(run: Path) -> None:
     problem = RunFolder(run).problem()
     chain = ChainFile.read(run / "chain.h5")

@@ -16,8 +16,6 @@ from bwbayes.inference.outliers import outliers, surprise
 from bwbayes.inference.posterior import Posterior
 from tests.inference.problems import INTERVAL, short_posterior
 
-FIXED = {"initial": 0.0}
-
 
 def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
     displacement = posterior.only.displacement.copy()

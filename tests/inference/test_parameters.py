@@ -175,15 +175,6 @@ def test_a_posterior_that_presses_against_the_passive_bound_says_so(ratio: float
     assert passive_remark(cut_prior(gamma=0.01), draws) is None
 
 
-def test_a_quarter_of_the_draws_near_the_bound_is_no_remark() -> None:
-    prior = cut_prior(exponent=1.0)
-    draws = np.tile([0.7, 0.36, 0.027, 0.0, 0.5], (1000, 1))
-    draws[:250, 3] = 0.027
-    assert passive_remark(prior, draws) is None
-    draws[:260, 3] = 0.027
-    assert passive_remark(prior, draws) is not None
-
-
 def test_far_coordinates_have_no_density() -> None:
     prior = PRIORS["default"]
     z = np.zeros((4, prior.dimensions))
@@ -291,30 +282,6 @@ def test_priors_that_meet_a_constraint_nowhere_are_refused(fixed: dict[str, floa
     prior = joint_prior(HYSTERESIS, RANGES, fixed)
     with pytest.raises(InputError, match=r"^priors: hardly any draw"):
         prior.draw(np.random.default_rng(8), 10_000)
-
-
-@pytest.mark.parametrize(
-    "prior",
-    [
-        Distribution("t", {"df": 3.0, "loc": 0.0, "scale": 5.0}),
-        Distribution("gumbel_r", {"scale": 5.0}),
-        Distribution("cauchy", {}),
-        Distribution("exponnorm", {"K": 1.5}),
-        Distribution("triang", {"c": 0.3, "loc": -5.0, "scale": 10.0}),
-        Distribution("skewnorm", {"a": 2.0}),
-    ],
-    ids=str,
-)
-def test_any_distribution_of_scipy_is_a_prior_for_the_offset(prior: Distribution) -> None:
-    posterior = short_posterior("white", samples=100, priors={"offset": prior})
-    draws = posterior.prior.draw(np.random.default_rng(12), 50)
-    assert np.isfinite(posterior.log_density(posterior.prior.unconstrain(draws))).all()
-    column = list(posterior.names).index("offset")
-    expected = prior.frozen.logpdf(draws[:, column])
-    moved = draws.copy()
-    moved[:, column] = prior.frozen.median()
-    got = posterior.prior.log_density(draws) - posterior.prior.log_density(moved)
-    np.testing.assert_allclose(expected - prior.frozen.logpdf(prior.frozen.median()), got)
 
 
 def test_the_default_prior_covers_the_ring_bender() -> None:

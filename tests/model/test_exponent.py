@@ -17,7 +17,6 @@ ALPHA = 0.36
 # (beta, gamma) in units of alpha: ordinary, equal, opposite, gamma > beta, nearly opposite, only
 # gamma.
 SHAPES = ((1.0, 0.6), (1.0, 1.0), (1.0, -1.0), (0.7, 0.9), (1.0, -0.9), (0.0, 1.0))
-STARTS = (0.0, 0.3, -0.3, -0.8)
 FAR_STARTS = (1.3, -3.0, 40.0, -40.0)
 TRAVEL = np.array([0.0, 1e-3, 0.1, 0.4, 1.0, 1.9, 3.0, 5.0, 9.0, 30.0])
 

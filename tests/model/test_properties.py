@@ -13,7 +13,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.boucwen import ceiling, hysteresis
 from tests.model.references import Model
 
-TABLE_1 = Model(0.3575, 0.0272, 0.0172)
 NODES, WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(12))
 
 few = settings(deadline=None, max_examples=60)

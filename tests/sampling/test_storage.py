@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-import os
-import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.storage import REFITTED, ChainFile
-from tests.forks import FORKS
 from tests.sampling.chains import (
     ATTRIBUTES,
     PLAN,
@@ -101,45 +95,3 @@ def test_blocks_that_were_set_aside_stay_so_and_are_kept(tmp_path: Path) -> None
     assert (2, 3, 5) == (read.set_aside, read.blocks("sampling"), len(read.history("sampling")))
     assert read.proposals["sampling"] is not None
     assert read.proposal_in_use("sampling") is None
-
-
-# Killing
-
-
-def mortal(method: Callable[..., Any], moment: Callable[[], None]) -> Callable[..., Any]:
-    """Make a method one of whose two ends may be its process's last moment."""
-
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        moment()
-        result = method(*args, **kwargs)
-        moment()
-        return result
-
-    return wrapped
-
-
-def write(path: Path, last_moment: int | None = None) -> None:
-    """Finish the chain, or die before or after one of the calls that change its file."""
-    moments = itertools.count()
-
-    def moment() -> None:
-        if next(moments) == last_moment:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    for owner, name in (
-        (h5py.Dataset, "__setitem__"),
-        (h5py.Dataset, "resize"),
-        (h5py.File, "flush"),
-        (h5py.File, "close"),
-        (Path, "replace"),
-    ):
-        setattr(owner, name, mortal(getattr(owner, name), moment))
-    with ChainFile.resume(path) if path.exists() else new(path) as chain:
-        finish(chain)
-
-
-def written(path: Path, last_moment: int | None = None) -> int | None:
-    process = FORKS.Process(target=write, args=(path, last_moment))
-    process.start()
-    process.join()
-    return process.exitcode
