@@ -70,11 +70,6 @@ def fit(record: Record, keys: dict[str, Any]) -> Fit:
         return bw.fit(replace(made, origin=record.origin, truth=record.truth), **keys)
 
 
-@pytest.fixture
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "draw_pictures", lambda _: {})
-
-
 def stopped(folder: Path, steps: int = 25) -> Fit:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
