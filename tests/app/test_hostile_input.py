@@ -39,7 +39,7 @@ from tests.app.mutations import KINDS, Case, case
 from tests.measured import keep
 
 SEED = 1
-FEW, ALL, FITTED = 300, 10_000, 6
+FEW, ALL, FITTED = 600, 10_000, 6
 SECONDS = 10  # of processor time, for a case that takes some hundredths
 LONGEST_LINE = 700
 
@@ -175,7 +175,7 @@ def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
 
 
 @pytest.mark.usefixtures("quick_fit")
-def test_300_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+def test_600_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
     for kind, counts in spoilt(range(FEW), place).items():
         assert counts[0] > 0, f"{kind}: nothing was used"
         assert counts[2] > 0, f"{kind}: nothing was refused"
