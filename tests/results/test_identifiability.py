@@ -1,8 +1,7 @@
 """One constant amplitude does not identify the model, decaying amplitudes do, and the user hears.
 
 At the test stand's 1000 Hz, with the damping free. What is left depends on the record and the mode
-alone, so most tests put the mode at the truth; those that take the point fit's do so at 250 Hz, and
-at 1000 Hz among the slow tests.
+alone, so the mode is put at the truth.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The chain file is whole at every moment: killed, read while written, or damaged on the disk."""
+"""The chain file keeps what was written, what was set aside, and what was said of the run."""
 
 from __future__ import annotations
 
