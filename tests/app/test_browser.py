@@ -216,53 +216,6 @@ def test_intervals_are_seen_on_a_telephone(chromium: Any, pages: dict[str, Path]
         assert "95% interval" in title
 
 
-def test_last_column_of_a_campaign_can_be_reached(chromium: Any, pages: dict[str, Path]) -> None:
-    """Of more parameters than a screen has room for."""
-    with Opened(chromium, pages["campaign"]) as opened:
-        page = opened.page
-        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
-        region = page.locator(".scroll:has(#records)")
-        assert region.evaluate("e => e.scrollWidth > e.clientWidth")
-        region.evaluate("e => { e.scrollLeft = 1e5; }")
-        last = page.locator("#records tr:nth-child(2) td").last.bounding_box()
-        room = region.bounding_box()
-        assert last["x"] + last["width"] <= room["x"] + room["width"] + 1
-
-
-def test_three_scores_are_seen_and_the_others_are_folded(
-    chromium: Any, pages: dict[str, Path]
-) -> None:
-    with Opened(chromium, pages["run"]) as opened:
-        page = opened.page
-        seen = [title.inner_text() for title in page.locator("#validation thead th").all()]
-        assert {"NRMSE", "Max error", "Coverage of the 50, 90, 95% sensor bands"} <= {*seen}
-        assert page.locator("#validation").is_visible()
-        assert not page.locator("#scores").is_visible()
-        page.locator("summary", has_text="Other scores").click()
-        assert page.locator("#scores").is_visible()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_verdicts_have_the_colors_of_their_banners(
-    chromium: Any, pages: dict[str, Path], scheme: str
-) -> None:
-    """Passed on green, inconclusive on amber, all else on red, in every row of a campaign."""
-    color = "e => getComputedStyle(e).backgroundColor"
-    with Opened(chromium, pages["campaign"], color_scheme=scheme) as opened:
-        page = opened.page
-        rows = page.locator("#records tbody tr")
-        seen = rows.locator(".mark").evaluate_all(f"a => a.map({color})")
-        drawn = dict(zip(STATUSES, seen, strict=True))
-        page.set_content(
-            page.content().split("<main>")[0]
-            + "".join(f'<p class="status {kind}">x</p>' for kind in ("bad", "note", "good"))
-        )
-        bad, note, good = page.locator(".status").evaluate_all(f"a => a.map({color})")
-    assert 3 == len({bad, note, good})
-    expected = dict.fromkeys(STATUSES, bad)
-    assert expected | {"validation inconclusive": note, "passed": good} == drawn
-
-
 def test_loops_stand_side_by_side(chromium: Any, pages: dict[str, Path]) -> None:
     """On a screen; on a telephone one below the other."""
     for width, beside in ((1400, True), (400, False)):

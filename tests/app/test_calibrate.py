@@ -118,18 +118,6 @@ def line_ends(whole: Path) -> list[int]:
     return [result.end() for result in re.finditer(b"\n", content)]
 
 
-def test_command_leaves_everything_and_says_how_it_went(tmp_path: Path, whole: Path) -> None:
-    """The installed command with two workers ends in the same bytes as one worker in a process."""
-    (tmp_path / "small.toml").write_text(TEXT)
-    done = said("small.toml", "--replicates", "3", "--workers", "2", where=tmp_path)
-    assert 0 == done.returncode, done.stderr
-    said_of_it = ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not")
-    for text in (*said_of_it, "so few replicates may well miss"):
-        assert text in done.stdout
-    assert "judging" in done.stderr
-    assert_same_end(whole, tmp_path / "results/small-calibration")
-
-
 def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     result = json.loads((whole / "calibration.json").read_text())
     assert (True, False, 3, [], 12) == tuple(
@@ -174,22 +162,6 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
         assert text in page
 
 
-def test_interrupted_it_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path) -> None:
-    """Whole lines are kept, and half a line is made again."""
-    folder = cut(whole, tmp_path / "a", line_ends(whole)[1] + 70)
-    resume(folder, small.quiet(), workers=1)
-    assert_same_end(whole, folder.path)
-
-
-def test_replicates_that_are_there_are_not_made_again(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
-    monkeypatch.setattr(module, "_make", None)
-    resume(folder, small.quiet())
-    assert_same_end(whole, folder.path)
-
-
 def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
     folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's":3', b's":2'))
@@ -202,6 +174,7 @@ def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
 
 
 def test_request_to_stop_is_answered_with_how_to_go_on(whole: Path, tmp_path: Path) -> None:
+    """With two workers it then ends in the same bytes: half a line is made again."""
     (tmp_path / "small.toml").write_text(TEXT)
     command = small.command(
         "calibrate", "small.toml", "--replicates", "3", "--out", "a", "--quiet", "--workers", "1"
@@ -220,8 +193,14 @@ def test_request_to_stop_is_answered_with_how_to_go_on(whole: Path, tmp_path: Pa
     assert (130, "") == (process.returncode, out)
     assert "interrupted; resume with `bwbayes calibrate --resume a`\n" == err
     assert not (tmp_path / "a/calibration.json").exists()
-    done = said("--resume", "a", "--quiet", "--workers", "1", where=tmp_path)
-    assert (0, "", "") == (done.returncode, done.stdout, done.stderr)
+    with lines.open("ab") as file:
+        file.write(b'{"number": 2, "ra')  # cut off
+    done = said("--resume", "a", "--workers", "2", where=tmp_path)
+    assert 0 == done.returncode, done.stderr
+    said_of_it = ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not")
+    for text in (*said_of_it, "so few replicates may well miss"):
+        assert text in done.stdout
+    assert "judging" in done.stderr
     assert_same_end(whole, tmp_path / "a")
 
 
@@ -333,14 +312,6 @@ def assert_refused(
         resume(folder, small.quiet())
 
 
-@pytest.mark.parametrize("damage", [b"", b'{"replic'])
-def test_folder_without_a_number_of_replicates_is_refused(tmp_path: Path, damage: bytes) -> None:
-    folder = begun(tmp_path / "a")
-    folder.replicates.write_bytes(damage)
-    with pytest.raises(InputError, match="does not say how many"):
-        resume(folder, small.quiet())
-
-
 def test_replicates_of_another_config_are_refused(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[1])
     text = folder.config.read_text(encoding="utf-8")
@@ -348,15 +319,6 @@ def test_replicates_of_another_config_are_refused(whole: Path, tmp_path: Path) -
     folder.config.write_text(text.replace("mean = 0.7", "mean = 0.8"), encoding="utf-8")
     with pytest.raises(InputError, match="another config or record"):
         resume(folder, small.quiet())
-
-
-def test_lines_may_come_in_any_order(whole: Path, tmp_path: Path) -> None:
-    folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
-    first, zero, one, two = folder.replicates.read_bytes().splitlines(keepends=True)
-    folder.replicates.write_bytes(first + two + zero)
-    resume(folder, small.quiet(), workers=1)
-    assert_same_end(whole, folder.path)
-    assert one == folder.replicates.read_bytes().splitlines(keepends=True)[-1]
 
 
 def test_nothing_of_an_earlier_end_stays_when_it_goes_on(

@@ -84,17 +84,6 @@ def assert_one_line(said: Said, *parts: str) -> None:
 # Help and usage
 
 
-@pytest.mark.parametrize("command", ["compensate", "design", "export", "track"])
-def test_the_amplifier_is_told_in_the_same_words_everywhere(command: str) -> None:
-    """Its voltages, fastest change, current and capacitance; --rate is samples a second alone."""
-    options = {o.opts[0]: o for o in cli.cli.commands[command].params if o.opts[0][0] == "-"}
-    assert (2, "LOW HIGH") == (options["--voltage"].nargs, options["--voltage"].metavar)
-    amplifier = {"--slew", "--current", "--capacitance"} & set(options)
-    assert amplifier in (set(), {"--slew", "--current", "--capacitance"})
-    assert (command in ("export", "track")) == ("--rate" in options)
-    assert not {"--voltages", "--limits"} & set(options)
-
-
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
 def test_help_names_every_command(bwbayes: Type, arguments: tuple[str, ...]) -> None:
     said = bwbayes(*arguments)
@@ -153,7 +142,7 @@ def test_wrong_command_line_is_one_line(
     assert [] == list(tmp_path.iterdir())
 
 
-# Bad input
+# Bad input: of each kind one; tests/data and test_config.py have them all
 
 ROWS = [f"{i / 100},{5 * (i % 7)},{2 * (i % 7)}" for i in range(60)]
 HEADER = "time_s,voltage_V,displacement_um"
@@ -168,29 +157,9 @@ def lines(*rows: str) -> bytes:
     ("content", "place", "problem"),
     [
         (lines(HEADER, *ROWS[:5], "0.05,abc,1", *ROWS[6:]), "7: voltage_V: ", "abc"),
-        (
-            lines(HEADER, *ROWS[:5], "0.05,nan,1", *ROWS[6:]),
-            "7: voltage_V: ",
-            "no number (empty or nan)",
-        ),
-        (lines(HEADER, *ROWS[:5], "0.05,1,inf", *ROWS[6:]), "7: displacement_um: ", "inf"),
-        (lines(HEADER, *ROWS[:5], "0.05,1e999,1", *ROWS[6:]), "7: voltage_V: ", "inf"),
-        (lines(HEADER, *ROWS[:5], "0.05,,1", *ROWS[6:]), "7: voltage_V: ", "empty"),
-        (lines(HEADER, *ROWS[:5], "0.05,1", *ROWS[6:]), "7: ", "field"),
-        (lines(HEADER, *ROWS[:5], "0.05,1,1,1", *ROWS[6:]), "7: ", "field"),
         (lines(HEADER, *ROWS[:20], *ROWS[25:]), "22: time_s: ", "0.06"),
-        (lines(HEADER, *ROWS[:20], ROWS[19], *ROWS[20:]), "22: time_s: ", "repeat"),
-        (lines(HEADER, *ROWS[:20], ROWS[5], *ROWS[21:]), "22: time_s: ", "back"),
-        (lines(*ROWS), " ", "which column is the time"),
         (lines("t,u,y", *ROWS), "1: ", "which unit has 't' (time), which 'u' (voltage), which 'y'"),
-        (lines(HEADER), "", "no "),
         (b"", "", "empty"),
-        (lines(HEADER, *ROWS) + b"0.6", "62: ", "field"),
-        (lines(HEADER, *ROWS[:5], "0.05,1\0,1", *ROWS[6:]), "7: ", "is not a number"),
-        (b"\xff\xfe\0\1", "", "no columns of numbers"),
-        (lines(HEADER, *(f"{i / 100},5,{i % 7}" for i in range(60))), "", "constant"),
-        (lines(HEADER, *(f"{i / 100},{i % 7},5" for i in range(60))), "", "constant"),
-        (lines("time_s,voltage_V", *(row.rsplit(",", 1)[0] for row in ROWS)), "", "displacement"),
     ],
 )
 def test_malformed_record_is_one_line_and_leaves_nothing(
@@ -208,20 +177,12 @@ def test_malformed_record_is_one_line_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("", "record: is missing"),
         ("[record", "invalid TOML"),
-        ("seed = 1\nseed = 2\n", "invalid TOML"),
         ('[record]\nfil = "record.csv"', "record.fil: unknown key; did you mean file?"),
-        (RECORD + "[sampling]\ness = nan", "sampling.ess: "),
         (RECORD + "[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
-        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window.0: "),
-        (RECORD + "[validation.'a/b']\nwindow = [0.1, 0.2]", "validation.a/b"),
         (RECORD + "[validation.a]\nwindow = [0.1, 0.2]", "overlaps"),
-        (RECORD + "[parameters.alfa]\nfixed = 1.0", "did you mean alpha?"),
-        (RECORD + "[model]\ndynamics = 'second-order'", "parameters.mass: has no default prior"),
         ('[record]\nfile = "none.csv"', "none.csv: does not exist"),
         ('[record]\nfile = "."', "is a directory"),
-        ('[record]\nsignal = "foo"', "signal: no 'foo'"),
     ],
 )
 def test_malformed_config_is_one_line_and_leaves_nothing(
@@ -295,14 +256,6 @@ def test_simulate_writes_record_and_truth(bwbayes: Type, tmp_path: Path, suffix:
     assert result.displacement is not None
     assert np.std(result.displacement - result.truth) < 1  # the sensor's noise
     assert 0.3575 == json.loads((tmp_path / "a.truth.json").read_text())["alpha"]
-
-
-def test_simulated_record_depends_on_its_seed(bwbayes: Type, tmp_path: Path) -> None:
-    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
-        said = bwbayes("simulate", f"{name}.csv", "--rate", "50", "--seed", seed)
-        assert 0 == said.status
-    first, again, other = (read_record(tmp_path / f"{name}.csv") for name in "abc")
-    assert first.sha256 == again.sha256 != other.sha256
 
 
 def columns(path: Path) -> tuple[list[str], np.ndarray]:

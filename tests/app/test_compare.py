@@ -160,19 +160,6 @@ def test_fits_are_compared_at_the_top(fits: tuple[Fit, Fit], tmp_path: Path) -> 
     assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
 
 
-def test_models_are_usual_ones_unless_they_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-
-    def noted(*given: Any, **_: Any) -> Any:
-        asked.append(given[2])
-        raise InputError("that is enough")
-
-    monkeypatch.setattr("bwbayes.app.jobs.models.compare_models", noted)
-    with pytest.raises(InputError, match="that is enough"):
-        bw.compare(measured(), **KEYS)
-    assert len(asked[0]) == 7
-
-
 def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
     record = measured()
     for given, options, line in (

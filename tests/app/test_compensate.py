@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
-import itertools
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import bwbayes as bw
 from bwbayes.app.commands.compensate import compensate as command
@@ -21,7 +17,6 @@ from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.predicted import FILES, Compensation
 from bwbayes.control.wished import shaped
 from bwbayes.errors import InputError
-from bwbayes.report.report import Picture
 
 VOLTAGE = (-100.0, 100.0)
 
@@ -60,37 +55,6 @@ def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Pat
 @pytest.fixture(scope="module")
 def sine(run: Path) -> Compensation:
     return compensate(converged(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True)
-
-
-@pytest.mark.parametrize(
-    ("least", "times"),
-    [(0.0, 1.0), (0.0428, 1.0), (5.83, 1.05), (0.0428, 8.0), (5.83, 99.0), (5.83, 1e6)],
-)
-def test_ticks_of_the_errors_histogram_are_few_and_do_not_overlap(
-    sine: Compensation, least: float, times: float
-) -> None:
-    """However small the errors are, and however much smaller than without compensation."""
-    made = replace(
-        sine,
-        compensated=replace(sine.compensated, rms=np.full(9, least)),
-        linear=replace(sine.linear, rms=np.full(9, least * times)),
-    )
-    (figure,) = (
-        block.draw()
-        for block in made.report().all_blocks()
-        if getattr(block, "name", "") == "error" and isinstance(block, Picture) and block.draw
-    )
-    figure.draw_without_rendering()
-    panel = figure.axes[1]
-    low, high = panel.get_xlim()
-    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    labels = [
-        label.get_window_extent(renderer)
-        for place, label in zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
-        if low <= place <= high and label.get_text()
-    ]
-    assert 2 <= len(labels) <= 5
-    assert not any(one.overlaps(two) for one, two in itertools.combinations(labels, 2))
 
 
 @pytest.mark.filterwarnings("ignore:between samples")
@@ -161,18 +125,6 @@ def test_what_is_no_reference_is_one_line(
     with pytest.raises(InputError, match=re.escape(line)) as refused:
         fit.compensate(reference, **options)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("name", ["compensate", "export", "track", "design"])
-def test_a_method_has_the_arguments_of_what_it_calls(name: str, run: Path) -> None:
-    """In its signature, described, and in the error of one that is unknown."""
-    method = getattr(bw.Fit, name)
-    text = inspect.getdoc(method)
-    assert text is not None
-    for argument in inspect.signature(method).parameters:
-        assert argument == "fit" or re.search(rf"^(?:\w+, )*{argument}(?:, \w+)*$", text, re.M)
-    with pytest.raises(InputError, match=f"^{name}: workes is unknown; "):
-        method(bw.open_run(run), workes=1)
 
 
 @pytest.mark.parametrize(

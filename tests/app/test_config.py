@@ -252,12 +252,6 @@ def test_unknown_key_of_any_length_is_one_short_line() -> None:
     assert len(text) < 700
 
 
-@settings(deadline=None)
-@given(st.text(max_size=40))
-def test_any_text_is_a_config_or_one_line(text: str) -> None:
-    refused("[model]\n" + text)
-
-
 @pytest.mark.parametrize("bom", [b"", b"\xef\xbb\xbf"])
 def test_file_may_start_with_a_byte_order_mark(tmp_path: Path, bom: bytes) -> None:
     path = tmp_path / "my.toml"

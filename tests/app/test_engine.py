@@ -52,14 +52,3 @@ def test_asked_for_another_engine_goes_on_and_is_said(run: Path, copy: RunFolder
     assert result.outcome.converged
     assert "resuming with the numpy engine a chain begun with numba" in said.getvalue()
     assert "numpy" == load(copy.config).sampling.engine
-
-
-@pytest.mark.slow
-def test_engines_agree_on_the_posterior(run: Path, tmp_path: Path) -> None:
-    """Within five Monte Carlo errors of the difference: a false alarm in 10^5 runs."""
-    made = small.begun(tmp_path / "small", ("block = 25", 'block = 25\nengine = "numpy"'))
-    resume(made, small.quiet(), workers=1)
-    one, two = (small.numbers(path)["parameters"] for path in (run, made.path))
-    for name in one:
-        error = (one[name]["mcse_mean"] ** 2 + two[name]["mcse_mean"] ** 2) ** 0.5
-        assert abs(one[name]["mean"] - two[name]["mean"]) < 5 * error

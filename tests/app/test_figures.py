@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -17,19 +15,15 @@ import pytest
 from bokeh.models import ColumnDataSource
 from hypothesis import given, settings
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
-from matplotlib.patches import StepPatch
-from PIL import Image
 
 from bwbayes.inference.parameters import Parameter
 from bwbayes.report.figures import interactive, picture_of, save_pictures
-from bwbayes.report.figures.chain import _rank_heights, draw_corner, draw_trace
-from bwbayes.report.figures.coverage import draw_coverage
-from bwbayes.report.figures.loop import along, draw_loop
+from bwbayes.report.figures.chain import _rank_heights, draw_trace
+from bwbayes.report.figures.loop import draw_loop
 from bwbayes.report.figures.series import _around_largest_error, draw_bands
-from bwbayes.report.figures.style import MEAN_COLOUR, STYLE, envelope, zigzag
+from bwbayes.report.figures.style import MEAN_COLOUR, envelope, zigzag
 from tests.app import example
 
 
@@ -124,19 +118,6 @@ def test_one_parameter_and_bands_at_rest_without_a_measurement_can_be_drawn() ->
     assert low < 0.8 < high
 
 
-def test_legend_names_the_bands_widest_first_and_the_lead_in(
-    figures: Mapping[str, Figure],
-) -> None:
-    labels = figures["bands_held-out"].axes[4].get_legend_handles_labels()[1]
-    kinds = ["95 % sensor reading", "95 % displacement", "95 % parameters alone"]
-    assert kinds == [label for label in labels if label.startswith("95 %")]
-    assert "lead-in, not judged" in labels
-    assert (
-        "lead-in, not judged"
-        not in figures["bands_training"].axes[4].get_legend_handles_labels()[1]
-    )
-
-
 def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
     """The sensor band takes at least a tenth of the zoomed displacement."""
     bands = example.bands(samples=50_000, lead_in=300)
@@ -150,15 +131,6 @@ def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
     assert 10 * width > np.ptp(bands.mean[shown])
 
 
-def test_loop_keeps_a_fast_signals_samples_few_of_a_slow_ones_and_both_ends() -> None:
-    time = np.arange(20_000) / 1000
-    fast, slow = (along(*[np.sin(2 * np.pi * hertz * time)] * 2) for hertz in (97.3, 0.05))
-    assert 19_900 < fast.size
-    assert 600 < slow.size < 1_200
-    for indices in (fast, slow):
-        assert (0, 19_999) == (indices[0], indices[-1])
-
-
 def test_saved_files_are_the_returned_pictures(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "figures"
     drawings = {"trace": lambda: Figure((1, 1)), "bands_a/b": lambda: Figure((2, 1))}
@@ -168,23 +140,6 @@ def test_saved_files_are_the_returned_pictures(tmp_path: Path) -> None:
     for name, file in (("trace", "trace.png"), ("bands_a/b", "bands_a%2Fb.png")):
         assert pictures[name] == (folder / file).read_bytes()
         assert b"\x89PNG\r\n" == pictures[name][:6]
-
-
-@pytest.mark.parametrize("wider", [1.0, 30.0])
-def test_frame_of_the_tip_lies_within_the_loop(wider: float) -> None:
-    """However wide the bands are."""
-    bands = example.bands()
-    middle = {key: (bands.lower[key] + bands.upper[key]) / 2 for key in bands.lower}
-    bands = dataclasses.replace(
-        bands,
-        lower={key: middle[key] + wider * (bands.lower[key] - middle[key]) for key in middle},
-        upper={key: middle[key] + wider * (bands.upper[key] - middle[key]) for key in middle},
-    )
-    figure = draw_loop([bands])
-    figure.draw_without_rendering()
-    whole, tip = visible(figure)
-    assert np.ptp(tip.get_ylim()) <= 0.55 * np.ptp(whole.get_ylim())
-    assert np.ptp(tip.get_xlim()) <= 0.55 * np.ptp(whole.get_xlim())
 
 
 def test_coverage_is_drawn_in_percent_with_its_error(figures: Mapping[str, Figure]) -> None:
@@ -231,28 +186,6 @@ def test_file_time_stands_beside_the_time_axis() -> None:
     )
 
 
-def test_pit_leaves_out_the_lead_in() -> None:
-    bands = example.bands(lead_in=300)
-    assert bands.pit is not None
-    bands.pit[:300] = 0.5
-    bands.pit[300:] = 0.01
-    drawn = draw_coverage([bands], {bands.name: example.scores()}).axes[1].patches[0]
-    assert isinstance(drawn, StepPatch)
-    assert [20.0] + [0.0] * 19 == pytest.approx(list(drawn.get_data()[0]))
-
-
-def test_corner_marks_the_known_truth_alone(figures: Mapping[str, Figure]) -> None:
-    panels = {places(panel): panel for panel in figures["corner"].axes}
-
-    def upright(panel: Axes) -> list[float]:
-        lines = [np.asarray(line.get_xdata()) for line in panel.lines]
-        return [float(x[0]) for x in lines if x.size == 2 and x[0] == x[1]]
-
-    assert [0.7] == upright(panels[0, 0])
-    assert [] == upright(panels[1, 1])
-    assert [2e-3] == upright(panels[3, 2])
-
-
 def test_ranks_of_independent_draws_keep_inside_the_grey_band() -> None:
     """Ninety-five percent of them, whatever the distribution."""
     ensembles, bins = 4, 20
@@ -262,14 +195,6 @@ def test_ranks_of_independent_draws_keep_inside_the_grey_band() -> None:
     reach = 1.96 * np.sqrt((bins - 1) * (ensembles - 1) / draws[0].size)
     assert 0.95 == pytest.approx(np.mean(np.abs(heights - 1) < reach), abs=0.01)
     np.testing.assert_allclose(np.ones(bins), heights[0].mean(axis=0))
-
-
-def test_ranks_show_an_ensemble_that_stays_apart() -> None:
-    draws = example.draws()[..., 0]
-    draws[:, 2] += 1.0
-    heights = _rank_heights(draws)
-    assert pytest.approx(4.0) == heights[2, -1]
-    assert 0 == heights[2, 0]
 
 
 @settings(deadline=None)
@@ -289,28 +214,6 @@ def test_thinned_series_keep_their_extremes(values: list[float], most: int) -> N
     thin_time, thin = zigzag(time, y, most)
     assert thin_time.size == thin.size <= max(2 * most, 1)
     assert (y.min(), y.max()) == (thin.min(), thin.max())
-
-
-def test_tick_labels_of_the_corner_picture_do_not_collide() -> None:
-    """Along the bottom row and the left column, whose panels touch each other."""
-    figure = draw_corner(example.run())
-    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    panels = {places(panel): panel for panel in figure.axes}
-    free = 4
-    lowest, first = (
-        [panels[at] for at in panels if free - 1 == at[0]],
-        [panels[at] for at in panels if 0 == at[1]],
-    )
-    for axes, along_x in ((lowest, True), (first, False)):
-        labels = [
-            label.get_window_extent(renderer)
-            for panel in axes
-            for label in (panel.get_xticklabels() if along_x else panel.get_yticklabels())
-            if label.get_text() and label.get_visible()
-        ]
-        assert len(labels) >= free - 1
-        for one, two in itertools.combinations(labels, 2):
-            assert not one.overlaps(two)
 
 
 def test_plots_keep_the_extremes_and_few_samples() -> None:
@@ -337,21 +240,3 @@ def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None
     assert ["bands_</script><b>", "loop"] == list(plots)
     assert not any("<" in text for text in plots.values())
     assert {} == interactive.draw(example.run(converged=False))
-
-
-def test_pictures_have_few_colours_and_look_the_same() -> None:
-    """Half the size, all but one pixel in a thousand within 12 of 255, and white is white."""
-    figure = draw_loop(example.run().bands)
-    small = picture_of(lambda: figure)
-    figure.set_layout_engine("none")  # it stays where it is
-    canvas = FigureCanvasAgg(figure)
-    plain = BytesIO()
-    with mpl.rc_context(STYLE):
-        canvas.print_png(plain)  # type: ignore[no-untyped-call]
-    drawn, shown = (
-        np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
-        for png in (plain.getvalue(), small)
-    )
-    assert 2 * len(small) < len(plain.getvalue())
-    assert 0.999 < np.mean(np.abs(drawn - shown).max(axis=-1) <= 12)
-    assert [255] * 3 == list(shown[0, 0])

@@ -16,12 +16,11 @@ from bwbayes.app.commands.predict import predict
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
-from bwbayes.app.running import predictions, run
+from bwbayes.app.running import run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, read_record
 from bwbayes.report.words import digits
 from bwbayes.results.outputs import write_bands
-from bwbayes.results.result import summary
 from tests.app import small
 
 
@@ -71,11 +70,6 @@ def fit(record: Record, keys: dict[str, Any]) -> Fit:
         return bw.fit(replace(made, origin=record.origin, truth=record.truth), **keys)
 
 
-@pytest.fixture
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "draw_pictures", lambda _: {})
-
-
 def stopped(folder: Path, steps: int = 25) -> Fit:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
@@ -123,16 +117,6 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
 
 
 # What it shows
-
-
-def test_the_loops_are_those_of_the_summary(fit: Fit) -> None:
-    loops = fit.loops
-    assert loops is not None
-    told: Any = summary(fit.result)["loops"]
-    opening = loops.major.estimates["opening_um"]
-    assert opening is not None
-    assert opening.lower < opening.mean < opening.upper
-    assert opening.mean == pytest.approx(told["major"]["opening_um"]["mean"])
 
 
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
@@ -327,34 +311,6 @@ def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
     assert bands.scores is None
     assert bands.holds is None
     assert np.isnan(bands.residuals).all()
-
-
-def test_a_hold_longer_than_the_record_has_a_wider_band_and_no_other_plan_has(
-    opened: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = opened.problem.record
-    ramp = np.linspace(0, np.max(made.voltage), 20)
-    hold = np.concatenate([ramp, np.full(10 * made.samples, ramp[-1])])
-    bands = {}
-    for name, voltage in (("hold", hold), ("same", made.voltage)):
-        plan = replace(made, voltage=voltage, displacement=None, truth=None)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            bands[name] = opened.predict(plan, from_rest=True)
-            with monkeypatch.context() as patch:
-                patch.setattr(predictions, "with_creep", lambda *given: given[:2])
-                bands[f"{name}, still"] = opened.predict(plan, from_rest=True)
-    width = {
-        n: one.upper["displacement", 95] - one.lower["displacement", 95] for n, one in bands.items()
-    }
-    assert width["hold"][-1] > 1.02 * width["hold, still"][-1]
-    np.testing.assert_array_equal(width["same"], width["same, still"])
-
-
-def test_bands_that_hold_are_silent(folder: Path, opened: Fit) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        opened.predict(folder / "records/sine.h5", from_rest=True)
 
 
 # Keys

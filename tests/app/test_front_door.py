@@ -31,8 +31,6 @@ UNITS = {
 }
 SEPARATORS = [",", ";", "\t", "|", " ", ", ", "  "]
 
-Drive = Any
-
 
 def drive(kind: str, periods: float, time: FloatArray) -> FloatArray:
     """Return a voltage over the times 0 to 1 of a record, V."""
@@ -161,15 +159,6 @@ def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: f
     for values in (voltage, rates):
         assert stats.ks_2samp(values[held], values[~held]).statistic < 0.2
         assert np.ptp(values[held]) > 0.7 * np.ptp(values)
-
-
-def test_the_tail_of_a_decaying_sine_is_not_all_that_is_held_out(tmp_path: Path) -> None:
-    voltage = drive("decaying", 16.0, np.arange(8000) / 8000)
-    path = written(tmp_path / "a.csv", voltage, play(voltage, np.random.default_rng(0)))
-    held = held_out(resolved(path))
-    assert np.abs(voltage[held]).max() > 0.7 * np.abs(voltage).max()
-    windows = np.flatnonzero(np.diff(held.astype(int)) == 1).size
-    assert 2 <= windows <= 5
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ import pytest
 from bwbayes.app.commands.cli import main
 from bwbayes.app.running import run as run_module
 from bwbayes.errors import InputError
-from bwbayes.sampling import hdf5, storage
 from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
@@ -42,10 +40,10 @@ RUNS = max(KILLS // 10, 1)
 Moment = Callable[[Path], bool]
 
 
-def follow(where: Path, arguments: list[str], last_write: int, last_step: str) -> None:
+def follow(where: Path, arguments: list[str], last_step: str) -> None:
     """Do what the command line would, in a session of its own.
 
-    Or die: inside a write of numbers, of so many, or where a step of the run would begin.
+    Or die where a step of the run would begin.
     """
     os.setsid()
     os.chdir(where)
@@ -56,7 +54,6 @@ def follow(where: Path, arguments: list[str], last_write: int, last_step: str) -
             os.dup2(file.fileno(), number)
     patched = pytest.MonkeyPatch()
     patched.setattr(run_module, "draw_pictures", lambda _: {})
-    patched.setattr(storage, "put", mortal(hdf5.put, last_write))
     if last_step:
         patched.setattr(run_module, last_step, die)
     sys.argv = ["bwbayes", *arguments]
@@ -67,31 +64,10 @@ def die(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def mortal(put: Callable[..., None], last: int) -> Callable[..., None]:
-    """Make the last of so many writes of numbers the end of its process, half done."""
-    left = last
-
-    def wrapped(dataset: Any, first: int, values: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left:
-            put(dataset, first, values)
-            return
-        dataset.resize(first + len(values), axis=0)
-        half = max(len(values) // 2, 1)
-        dataset[first : first + half] = values[:half]
-        dataset.file.flush()
-        die()
-
-    return wrapped
-
-
 @contextmanager
-def started(
-    where: Path, *arguments: str, last_write: int = 0, last_step: str = ""
-) -> Iterator[ForkServerProcess]:
+def started(where: Path, *arguments: str, last_step: str = "") -> Iterator[ForkServerProcess]:
     """Start a command as the first process of a session of its own."""
-    process = FORKS.Process(target=follow, args=(where, list(arguments), last_write, last_step))
+    process = FORKS.Process(target=follow, args=(where, list(arguments), last_step))
     process.start()
     assert process.pid is not None
     try:
@@ -265,24 +241,6 @@ def test_second_command_for_the_same_folder_is_refused(tmp_path: Path) -> None:
         assert process.is_alive()
 
 
-# Cut, changed, and full
-
-
-def test_damaged_chain_is_told_in_one_line_and_goes_on_to_the_same_bits(
-    run: Path, tmp_path: Path
-) -> None:
-    for kept in (0.9, 0.5):
-        shutil.copytree(run, tmp_path / "a", dirs_exist_ok=True)
-        content = (run / "chain.h5").read_bytes()
-        (tmp_path / "a/chain.h5").write_bytes(content[: int(kept * len(content))])
-        (tmp_path / "a/summary.json").unlink()
-        status, out, err = finished(tmp_path, "resume", "a", "--quiet", "--workers", "1")
-        assert (0, "") == (status, out)
-        assert 1 == err.count("\n")
-        assert err.startswith("bwbayes: a/chain.h5: damaged (its end is missing); the ")
-        small.assert_same_end(run, tmp_path / "a")
-
-
 # Slow
 
 
@@ -315,21 +273,6 @@ def test_kills_at_random_end_in_the_same_bits(run: Path, tmp_path: Path) -> None
         small.assert_same_end(run, tmp_path / "a")
     keep("kills", {"kills": kills, "runs": RUNS})
     assert KILLS == kills
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("last_write", [1, 7, 36, 60, 84])
-def test_killed_inside_a_write_it_ends_in_the_same_bits(
-    run: Path, tmp_path: Path, last_write: int
-) -> None:
-    """Half of the numbers are in the file, and their count is not."""
-    (tmp_path / "small.toml").write_text(small.TEXT)
-    command = (*go_on(tmp_path), "--workers", "1")
-    with started(tmp_path, *command, last_write=last_write) as process:
-        process.join(PATIENCE)
-        assert -signal.SIGKILL == process.exitcode
-    assert (0, "", "") == finished(tmp_path, *go_on(tmp_path))
-    small.assert_same_end(run, tmp_path / "a")
 
 
 def go_on(where: Path) -> tuple[str, ...]:

@@ -49,18 +49,6 @@ def test_table_is_the_summarys(measured: Loops) -> None:
     assert kept["major"]["opening_um"] is None
 
 
-def test_loops_are_drawn_after_the_measured_one(measured: Loops) -> None:
-    figures = example.figures(with_loops(measured))
-    assert ["loop", "loops"] == list(figures)[:2]
-    whole, less = figures["loops"].axes
-    assert ["major loop", "_nolegend_", "minor loop", "_nolegend_", "initial curve"] == [
-        line.get_label() for line in whole.lines
-    ]
-    falling, rising = (np.asarray(less.lines[i].get_ydata()) for i in (1, 0))
-    ends = [float(falling[0]), float(rising[-1])]
-    assert [0.0, 0.0] == pytest.approx(ends, abs=1e-9)
-
-
 def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
     run = with_loops(measured, converged=False)
     assert summary(run)["loops"] is None
@@ -94,24 +82,6 @@ def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:
                 mean = float(cells[0].split(" ± ")[0])
                 assert one["mean"] == pytest.approx(mean, abs=0.0503 * one["sd"])
     assert kept["one"]["creep_percent"] is None
-
-
-def test_steps_are_drawn_with_their_creep(steps: dict[str, StepResponse]) -> None:
-    figures = example.figures(dataclasses.replace(example.run(), steps=steps))
-    rise, creep = figures["steps"].axes
-    assert ["one, 50 V", "two, 50 V"] == [line.get_label() for line in rise.lines]
-    assert ["two, 50 V"] == [line.get_label() for line in creep.lines]
-    assert ("log", "log") == (rise.get_xscale(), creep.get_xscale())
-    alone = example.figures(dataclasses.replace(example.run(), steps={"one": steps["one"]}))
-    assert 1 == len(alone["steps"].axes)
-
-
-def test_a_step_is_not_drawn_as_a_loop(steps: dict[str, StepResponse]) -> None:
-    run = dataclasses.replace(example.run(), steps={"held-out": steps["one"]})
-    figures = example.figures(run)
-    assert ["training"] == [panel.get_title() for panel in figures["loop"].axes[:1]]
-    assert 2 == len(figures["loop"].axes)
-    assert "bands_held-out" in figures
 
 
 def test_without_convergence_no_step_is_shown(steps: dict[str, StepResponse]) -> None:

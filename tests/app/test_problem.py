@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config.config import SignalConfig, dump, parse
-from bwbayes.app.problem.problem import Problem, generator, resolve, sampled_waveform
+from bwbayes.app.config.config import dump, parse
+from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
@@ -77,26 +77,6 @@ def test_each_purpose_and_each_seed_has_a_random_stream_of_its_own() -> None:
     streams = [generator(seed, purpose) for seed in (0, 1, 256) for purpose in purposes]
     assert len(streams) == len({stream.integers(2**62) for stream in streams})
     assert generator(1, "fit").integers(2**62) == generator(1, "fit").integers(2**62)
-
-
-def test_default_priors_depend_on_ranges_and_times_of_the_drive_alone(tmp_path: Path) -> None:
-    result = []
-    for number, samples in ((1, 400), (2, 900)):
-        write_record(record(samples, seed=number), tmp_path / "record.csv")
-        result.append(of(RECORD, tmp_path).parameters)
-    assert result[0] == result[1]
-    write_record(record(interval=0.02), tmp_path / "record.csv")
-    assert result[0] != of(RECORD, tmp_path).parameters
-
-
-def test_free_exponent_has_its_own_unit_and_wider_scales_of_beta(folder: Path) -> None:
-    free = "[parameters.exponent]\nprior = { distribution = 'uniform', lower = 1.0, upper = 4.0 }"
-    known = by_name(of(RECORD, folder))
-    freed = by_name(of(RECORD + free, folder))
-    for name in ("beta", "gamma"):
-        assert (known[name].unit, freed[name].unit) == ("1/V", "um^(1-n)/V")
-    sigma = [one["beta"].prior.arguments["sigma"] for one in (known, freed) if one["beta"].prior]
-    assert sigma[1] > 1.1 * sigma[0]
 
 
 def test_fixed_gamma_takes_nothing_from_beta(folder: Path) -> None:
@@ -347,12 +327,6 @@ def test_outliers_are_set_aside_once_and_said(folder: Path) -> None:
     assert (
         problem.posterior.only.readings.rows.tolist() == again.posterior.only.readings.rows.tolist()
     )
-
-
-def test_steps_are_drawn_up_from_levels_and_their_dwell() -> None:
-    required = SignalConfig(shape="steps", levels=[0.0, 50.0, -20.0], dwell=2.0, duration=7.0)
-    _, voltage = sampled_waveform(required).sample(10.0)
-    np.testing.assert_array_equal(np.repeat([0.0, 50.0, -20.0], [20, 20, 30]), voltage)
 
 
 def test_voltage_beyond_what_is_fitted_or_the_stands_range_is_remarked_on(folder: Path) -> None:

@@ -16,7 +16,7 @@ from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, read_record
+from bwbayes.data import Record
 from bwbayes.data.io.columns import Naming
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Decay, Sine, Waveform
@@ -68,42 +68,6 @@ def proposed(path: Path, **units: str) -> ConfigProposal:
 
 
 # What is recognised
-
-
-@pytest.mark.parametrize(
-    ("header", "factors", "units"),
-    [
-        (OWN, (1.0, 1.0, 1.0), {}),
-        ("time_ms,voltage_mV,displacement_nm", (1e3, 1e3, 1e3), {}),
-        (FOREIGN, (1e3, 1e3, 1e3), {"displacement": "nm"}),
-        ("t / s,command [V],x (mm)", (1.0, 1.0, 1e-3), {}),
-        ("Time,Volt,Position", (1.0, 1.0, 1.0), {"time": "s", "voltage": "V"}),
-        ("displacement_um,voltage_V,time_s", (1.0, 1.0, 1.0), {}),
-        ("time_s,voltage_V,displcement_um", (1.0, 1.0, 1.0), {}),
-        ("time,voltage,displacement", (1.0, 1e-3, 1.0), {"voltage": "kV", "time": "s"}),
-    ],
-)
-def test_columns_and_units_are_recognised(
-    write: Write,
-    record: Record,
-    header: str,
-    factors: tuple[float, float, float],
-    units: dict[str, str],
-) -> None:
-    if header.startswith(("Time", "time,")):
-        units = units | {"displacement": "um"}
-    order = [2, 1, 0] if header.startswith("disp") else [0, 1, 2]
-    path = write(header, factors)
-    if order[0]:
-        rows = [line.split(",")[::-1] for line in path.read_text().splitlines()[1:]]
-        path.write_text("\n".join([header, *(",".join(row) for row in rows)]) + "\n")
-    made = proposed(path, **units)
-    source = made.config.records["record"]
-    read = read_record(path, columns=source.columns, units=source.units)
-    assert read.interval == pytest.approx(record.interval, rel=1e-6)
-    np.testing.assert_allclose(read.voltage, record.voltage, atol=1e-5)
-    assert read.displacement is not None
-    np.testing.assert_allclose(read.displacement, record.displacement, atol=1e-5)  # type: ignore[arg-type]
 
 
 def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:

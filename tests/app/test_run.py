@@ -20,21 +20,17 @@ from rich.console import Console
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.fit.opening import finished
-from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.data import read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.report.run import run_report
-from bwbayes.report.screen import as_text
-from bwbayes.results.result import summary
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.storage import ChainFile
-from tests.app import example, small
+from tests.app import small
 
 FREE = ("d", "alpha", "beta", "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
 LEVELS = {"50", "90", "95"}
@@ -100,22 +96,6 @@ def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> No
     assert sampling["pareto_k"] < 0.7
 
 
-def test_acceptance_of_each_phase_is_in_the_facts(run: Path) -> None:
-    page = (run / "report.html").read_text()
-    each = r"differential evolution \d+%, snooker \d+%, mixture \d+%"
-    # A tuning that goes on has nearby steps too.
-    assert re.search(f"pilot: {each}; tuning: {each}(, nearby \\d+%)?; sampling: {each}", page)
-
-
-def test_screen_tells_the_acceptance_of_each_move_and_pareto_k() -> None:
-    run = example.run()
-    said = as_text(run_report(run, summary(run)), width=200)
-    expected = (
-        "sampling: 120 steps, accepted: differential evolution 12%, mixture 32%; Pareto k 0.31"
-    )
-    assert expected in said
-
-
 def test_summary_has_every_free_parameter(run: Path) -> None:
     answer = json.loads((run / "summary.json").read_text())["parameters"]
     assert set(FREE) == set(answer)
@@ -151,18 +131,6 @@ def test_coverage_of_the_displacement_needs_a_truth(copy: RunFolder) -> None:
     assert answer["sine"]["coverage"]["displacement"] is None
     assert set(answer["sine"]["coverage"]["sensor"]) == LEVELS
     assert answer["held-out"]["coverage"]["displacement"] is not None
-
-
-def test_posterior_opens_with_its_groups_and_coordinates(run: Path) -> None:
-    tree = xarray.open_datatree(run / "posterior.nc", engine="h5netcdf")
-    assert {"posterior", "sample_stats", "observed_data", "constant_data"} <= set(tree.children)
-    posterior = tree["posterior"].to_dataset()
-    assert set(FREE) == set(posterior.data_vars)
-    assert ("chain", "draw") == posterior["alpha"].dims
-    assert 4 * 18 == posterior.sizes["chain"]
-    assert [0, 1, 2, 3] == sorted(set(posterior["ensemble"].values))
-    assert list(range(18)) == sorted(set(posterior["walker"].values))
-    assert "um/V" == posterior["alpha"].attrs["units"]
 
 
 def test_posterior_is_the_chain(run: Path) -> None:
@@ -220,20 +188,6 @@ def test_bands_have_every_window_and_kind(run: Path) -> None:
     assert all(np.isfinite(float(v)) for row in answer for n, v in row.items() if n != "set")
 
 
-def test_report_needs_nothing_but_itself(run: Path) -> None:
-    """The script of the plots names pages that it does not load; test_browser.py sees to that."""
-    page = (run / "report.html").read_text(encoding="utf-8")
-    page = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
-    assert "url(http" not in page
-    assert "@import" not in page
-
-
-def test_resolved_config_runs_by_itself(run: Path) -> None:
-    problem = RunFolder(run).problem()
-    assert problem.config == load(run / "config.toml")
-
-
 def test_chain_says_what_was_run(run: Path) -> None:
     attributes = ChainFile.read(run / "chain.h5").attributes()
     assert load(run / "config.toml") == parse(str(attributes["config"]), "")
@@ -244,39 +198,6 @@ def test_chain_says_what_was_run(run: Path) -> None:
 
 
 # The same bits, in however many pieces
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_two_workers_give_the_same_bits_as_one(run: Path, tmp_path: Path) -> None:
-    made = small.begun(tmp_path / "small")
-    resume(made, small.quiet(), workers=2)
-    small.assert_same_end(run, made.path)
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_interrupted_run_goes_on_to_the_same_bits(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Interrupted in its pilot, its tuning, twice in its sampling, and while it writes files."""
-    made = small.begun(tmp_path / "small")
-    for phase, blocks in (("pilot", 1), ("tuning", 1), ("sampling", 1), ("sampling", 2)):
-        watch_until(monkeypatch, phase, 4 * blocks + 1)  # in the middle of a block
-        with pytest.raises(KeyboardInterrupt):
-            resume(made, small.quiet(), workers=1)
-        assert not made.summary.exists()
-    monkeypatch.undo()
-    with monkeypatch.context() as patched:
-        patched.setattr(module, "write_bands", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            resume(made, small.quiet(), workers=1)
-    assert not made.summary.exists()
-    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
-    resume(made, small.quiet(), workers=1)
-    small.assert_same_end(run, made.path)
-
-
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def watch_until(monkeypatch: pytest.MonkeyPatch, last: str, count: int) -> None:
@@ -367,11 +288,6 @@ def test_chain_of_another_record_is_refused(copy: RunFolder) -> None:
     assert len(before) == len(copy.chain.read_bytes())
 
 
-def test_running_run_has_one_writer(copy: RunFolder) -> None:
-    with copy.locked(), pytest.raises(InputError, match="another process is writing this run"):
-        resume(copy, small.quiet(), workers=1)
-
-
 # Drawing again
 
 
@@ -404,27 +320,6 @@ def test_chain_without_draws_predicts_nothing(
         resume(made, small.quiet(), workers=1)
     with pytest.raises(InputError, match=r"no draws yet; resume with `bwbayes\.resume"):
         finished(made)
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_fit_that_misses_its_own_readings_does_not_hold(
-    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert () == redraw(copy).standing.lines
-    copy.result.unlink()  # or it would be read
-    said = ["NRMSE 9% on the training readings"]
-    monkeypatch.setattr("bwbayes.results.verdict.missed", lambda *_: said)
-    again = redraw(copy)
-    assert again.standing.holds is False
-    verdict = again.verdicts["training"]
-    assert "on the training readings" in verdict.reasons[0]
-    row = small.numbers(copy.path)["validation"]["training"]
-    assert row["holds"] is False
-    assert list(verdict.reasons) == row["reasons"]
-    assert row["fix"]
-    page = (copy.path / "report.html").read_text(encoding="utf-8")
-    assert 0 < page.index("VALIDATION FAILED") < page.index("Parameters")
-    assert 3 == finish(copy.path, 1, quiet=True)
 
 
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:

@@ -120,13 +120,6 @@ def test_exactly_the_spikes_are_set_aside(seed: int) -> None:
     assert "" == off(of_the_family(seed, 400))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_no_good_reading_is_set_aside_beside_small_spikes(seed: int) -> None:
-    """Of five to ten sds of the noise; whether they count is luck."""
-    spoiled = of_the_family(100 + seed, 400, least=5.0, largest=10 * NOISE)
-    assert set(set_aside(resolved(spoiled.record, "outliers = true"))) <= set(spoiled.rows.tolist())
-
-
 @pytest.mark.slow
 def test_exactly_the_spikes_are_set_aside_in_200_records() -> None:
     """Of up to 20,000 readings; one in a hundred may be off."""

@@ -34,7 +34,6 @@ COMMANDS = {
 }
 IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
     "compensate": lambda fit, _: fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
-    "track": lambda fit, _: fit.track(frequencies=(2.0,), draws=5),
     "design": lambda fit, _: fit.design("d"),
     "export": lambda fit, folder: fit.export(folder),
 }
@@ -67,7 +66,9 @@ def judged(run: Path, tmp_path: Path, holds: bool | None) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "track")) for n in COMMANDS]
+)
 def test_each_command_says_it_first_and_ends_with_its_status(
     name: str, judged: Path, holds: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,16 +14,13 @@ from bwbayes.app.commands import cli
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
 from bwbayes.app.running import run as module
-from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import Block, Chain, EnsembleState
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
-from tests.sampling.hard_chains import BLOCK, HARD, good, moved
 
 
 @pytest.fixture(scope="module")
@@ -111,76 +108,8 @@ def test_larger_budget_converges_to_what_it_would_have_been(
 # Hard cases
 
 
-def run_with(run: Path, path: Path, draws: FloatArray) -> RunFolder:
-    """Return a run's folder whose chain holds these draws, and whose budget they use up.
-
-    ``draws`` (steps, ensembles, walkers, free) are in sds of the point fit's approximation.
-    """
-    steps = ("block = 25", f"block = {BLOCK}\nsteps = {len(draws)}")
-    folder = small.begun(path, steps)
-    old = ChainFile.read(run / "chain.h5")
-    axes = np.linalg.cholesky(old.point.covariance)
-    coordinates = old.point.mode + draws @ axes.T
-    accepted = moved(draws)
-    walkers = draws.shape[2]
-    chain = Chain([widened(state, walkers) for state in old.starts])
-    for number, counts in enumerate([accepted[0], *accepted]):
-        first = max(number - 1, 0) * BLOCK
-        made = coordinates[first : first + BLOCK]
-        blocks = []
-        for e, state in enumerate(chain.starts):
-            density = np.full(made.shape[:1] + made.shape[2:3], -1.0)
-            end = EnsembleState(made[-1, e], density[-1], state.random_state)
-            blocks.append(Block(made[:, e], density, counts[e], np.zeros((3, 2), int), end))
-        chain.append("sampling" if number else "tuning", blocks)
-    noted = old.attributes() | {"posterior": fingerprint(load(folder.config))}
-    ChainFile.create(folder.chain, chain, old.point, BLOCK, noted).close()
-    return folder
-
-
-def widened(state: EnsembleState, walkers: int) -> EnsembleState:
-    """Return a state with so many walkers."""
-    coordinates = np.resize(state.coordinates, (walkers, state.coordinates.shape[1]))
-    return EnsembleState(coordinates, np.resize(state.log_density, walkers), state.random_state)
-
-
-@pytest.mark.parametrize("name", ["stuck ensemble", "heavy autocorrelation"])
-def test_hard_case_ends_with_status_4_and_without_parameters(
-    run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of each kind one, from the folder on; tests/sampling/test_hard_cases.py has them all."""
-    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
-    folder = run_with(run, tmp_path / "a", HARD[name](np.random.default_rng(1), 8))
-    assert 4 == finish(folder.path, 1, quiet=True, ess=1)
-    seen = small.numbers(folder.path)
-    assert (False, None, None) == (seen["converged"], seen["parameters"], seen["validation"])
-    assert not (folder.path / "bands.csv").exists()
-
-
-def test_twin_good_draws_end_with_status_0_and_parameters(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
-    folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8))
-    # The draws are not this record's, so that its bands may be off.
-    assert finish(folder.path, 1, quiet=True, ess=1) != 4
-    assert small.numbers(folder.path)["converged"]
-    assert small.numbers(folder.path)["parameters"]
-
-
 def not_a_number(_: Posterior, theta: FloatArray) -> FloatArray:
     return np.full(len(theta), np.nan)
-
-
-def test_likelihood_that_turns_into_nan_ends_with_status_4(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From the tuning on, when all ensembles agree already."""
-    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
-    folder = run_with(run, tmp_path / "a", good(np.random.default_rng(1), 8)[:BLOCK])
-    monkeypatch.setattr(Posterior, "log_likelihood", not_a_number)
-    assert 4 == finish(folder.path, 1, quiet=True, ess=1, steps=4 * BLOCK)
-    assert small.numbers(folder.path)["parameters"] is None
 
 
 def test_likelihood_that_is_nan_everywhere_is_said(

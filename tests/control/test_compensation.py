@@ -157,15 +157,6 @@ def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: 
     assert of_expected < expected.linear.smoothed.expected
 
 
-def test_the_mean_command_brings_the_mean_model_to_the_reference(asked: Reference) -> None:
-    of = problem()
-    flat = about(of, 0.0, 3, np.random.default_rng(1))
-    command = compensated(of, asked, flat)
-    np.testing.assert_allclose(command.compensated.bands.mean, command.smoothed, atol=1e-6)
-    assert command.compensated.smoothed.expected < 1e-6
-    assert command.difference < 1e-6
-
-
 def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> None:
     """Both are given: what the smoothing moves is an error too, unless it is said not to be."""
     of, source = problem(), np.random.default_rng(3)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import StateSpace, cont2discrete, dlsim, tf2ss
+from scipy.signal import StateSpace, dlsim
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.discrete import frequency_response, linear_part
@@ -100,33 +100,6 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     moved = simulated(system, drives - drives[0])[:, 0]
     expected = actuator.displacement(theta, voltage, from_rest=True)[0]
     np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize(("hold", "method"), [("first", "foh"), ("zero", "zoh")])
-@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
-def test_the_linear_part_is_scipys_own_discretisation(
-    dynamics: str, hold: Hold, method: Any
-) -> None:
-    """Compared by the response to an impulse; a lag's poles are slow enough for matrix exps."""
-    actuator = Actuator(dynamics, hold, 1e-3)
-    theta = cases.theta(actuator)
-    changes = {"mass": 1.0, "damping": 100.0}
-    for name, value in changes.items():
-        if name in actuator.parameters:
-            theta[0, actuator.parameters.index(name)] = value
-    column = actuator.columns(theta)
-    if dynamics == "lag":
-        continuous = [1.0], [column["lag"][0], 1.0]
-    else:
-        k = column["stiffness"][0]
-        continuous = [1.0], [column["mass"][0] / k, column["damping"][0] / k, 1.0]
-    system: Any = tf2ss(*continuous)
-    discrete = cont2discrete(system, 1e-3, method)
-    impulse = np.zeros(200)
-    impulse[3] = 1.0
-    expected = simulated(discrete, impulse)
-    got = simulated(linear_part(actuator, theta[0]), impulse)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
 
 
 @every_actuator

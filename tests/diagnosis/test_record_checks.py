@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from ast import literal_eval
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from bwbayes.data import Record, read_record
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.frozen import clipped
 from bwbayes.diagnosis.record_checks import inspect
-from bwbayes.diagnosis.series_patterns import decay, spikes, trend, turning_points
+from bwbayes.diagnosis.series_patterns import spikes
 from tests.data.spoilt import SPOILT, good, looping
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
@@ -183,21 +182,6 @@ def test_a_finding_is_one_line() -> None:
             assert one.start < one.stop
 
 
-def test_a_million_samples_take_seconds() -> None:
-    generator = np.random.default_rng(1)
-    time_s = np.arange(10**6) * 1e-4
-    voltage = 100 * np.sin(2 * np.pi * time_s) * np.exp(-time_s / 50)
-    displacement = 0.5 * voltage + 0.1 * generator.standard_normal(10**6)
-    begun = time.process_time()
-    assert () == inspect(Record(voltage, displacement, 1e-4))
-    assert time.process_time() - begun < 10
-
-
-def test_turning_points_leave_out_small_turns() -> None:
-    values = np.array([0.0, 1.0, 3.0, 2.9, 4.0, 1.0, 1.2, -2.0, 5.0, 5.0])
-    assert [0, 4, 7, 9] == turning_points(values, 0.5).tolist()
-
-
 def test_spikes_are_neither_edges_nor_turns() -> None:
     noise = 0.01 * np.random.default_rng(1).standard_normal(400)
     triangle = np.abs(np.arange(400) % 80 - 40) / 10
@@ -220,10 +204,3 @@ def test_every_spike_counts_once_and_its_neighbours_do_not(seed: int, pairs: boo
     planted = np.sort(np.concatenate([planted, planted + 1])) if pairs else planted
     values[planted] += 25.0 * generator.choice([-1, 1])
     assert planted.tolist() == spikes(values, 0.6 * voltage, 1.2).tolist()
-
-
-def test_a_decay_and_a_trend_are_measured() -> None:
-    at: FloatArray = np.linspace(0.0, 1.999, 2000)
-    size, constant = decay(at, 3 - 5 * np.exp(-at / 0.1), 1.0)
-    assert (size, constant) == pytest.approx((-5, 0.1), rel=0.05)
-    assert trend(at, 7 - 2 * at) == pytest.approx(-2 * at[-1])

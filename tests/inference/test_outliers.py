@@ -6,8 +6,6 @@ among all readings here has a probability below 1e-5. A spike of 20 um is some f
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import linalg
@@ -18,25 +16,11 @@ from bwbayes.inference.outliers import outliers, surprise
 from bwbayes.inference.posterior import Posterior
 from tests.inference.problems import INTERVAL, short_posterior
 
-FIXED = {"initial": 0.0}
-
 
 def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
     displacement = posterior.only.displacement.copy()
     displacement[rows] += size * (-1.0) ** np.arange(len(rows))
     return posterior.altered(displacement=displacement)
-
-
-@pytest.mark.parametrize("noise", ["discrepancy", "white"])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_spikes_are_found_and_nothing_else(noise: str, seed: int) -> None:
-    posterior = short_posterior("white" if noise == "white" else "discrepancy", 800, seed=seed)
-    posterior = replace(posterior, engine="numba")
-    rows = np.sort(np.random.default_rng(seed).choice(800, 10, replace=False))
-    generator = np.random.default_rng(3)
-    spiky = spoilt(posterior, rows.tolist())
-    assert rows.tolist() == outliers(spiky.without, generator)["record"].tolist()
-    assert [] == outliers(posterior.without, generator)["record"].tolist()
 
 
 def test_a_reading_is_set_aside_from_six_sds_on() -> None:
@@ -103,16 +87,3 @@ def test_a_record_full_of_outliers_is_refused() -> None:
     noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)
     with pytest.raises(InputError, match="too many for isolated outliers"):
         outliers(noisy.without, np.random.default_rng(8))
-
-
-def test_good_readings_among_many_spikes_are_not_set_aside() -> None:
-    """Four records of 800 with 30 spikes: all of these, and none of the others.
-
-    While the spikes are in the fit a good reading is suspected once in some thousands; the last fit
-    clears it.
-    """
-    for seed in range(4):
-        posterior = replace(short_posterior(samples=800, seed=seed), engine="numba")
-        rows = np.sort(np.random.default_rng(seed).choice(800, 30, replace=False))
-        spiky = spoilt(posterior, rows.tolist(), 5.0)
-        assert rows.tolist() == outliers(spiky.without, np.random.default_rng(3))["record"].tolist()

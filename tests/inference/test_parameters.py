@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -165,17 +164,6 @@ def test_gamma_beyond_beta_is_outside_unless_the_model_need_not_be_passive() -> 
     assert np.mean(free.draw(np.random.default_rng(13), 2000)[:, 3] > 0.02) > 0.1
 
 
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
-def test_every_draw_of_a_prior_that_need_not_be_passive_has_a_likelihood(engine: Any) -> None:
-    for fixed in ({}, {"initial": 8.0, "exponent": 1.0}, {"exponent": 1.0}):
-        usual = short_posterior(samples=60, fixed=fixed, priors=WIDE)
-        posterior = replace(usual, prior=active(usual.prior), engine=engine)
-        draws = posterior.prior.draw(np.random.default_rng(14), 2000)
-        theta = posterior.prior.theta(draws)
-        assert np.mean(theta[:, 3] > theta[:, 2]) > 0.2
-        assert np.isfinite(posterior.log_density(posterior.prior.unconstrain(draws))).all()
-
-
 @pytest.mark.parametrize("ratio", [0.9, 0.99, 1.0])
 def test_a_posterior_that_presses_against_the_passive_bound_says_so(ratio: float) -> None:
     prior = cut_prior(exponent=1.0)
@@ -185,15 +173,6 @@ def test_a_posterior_that_presses_against_the_passive_bound_says_so(ratio: float
     assert remark is None or "[model] passive = false" in remark
     assert passive_remark(active(prior), draws) is None
     assert passive_remark(cut_prior(gamma=0.01), draws) is None
-
-
-def test_a_quarter_of_the_draws_near_the_bound_is_no_remark() -> None:
-    prior = cut_prior(exponent=1.0)
-    draws = np.tile([0.7, 0.36, 0.027, 0.0, 0.5], (1000, 1))
-    draws[:250, 3] = 0.027
-    assert passive_remark(prior, draws) is None
-    draws[:260, 3] = 0.027
-    assert passive_remark(prior, draws) is not None
 
 
 def test_far_coordinates_have_no_density() -> None:
@@ -303,48 +282,6 @@ def test_priors_that_meet_a_constraint_nowhere_are_refused(fixed: dict[str, floa
     prior = joint_prior(HYSTERESIS, RANGES, fixed)
     with pytest.raises(InputError, match=r"^priors: hardly any draw"):
         prior.draw(np.random.default_rng(8), 10_000)
-
-
-def test_every_one_of_many_draws_has_a_finite_density() -> None:
-    prior = PRIORS["default"]
-    draws = prior.draw(np.random.default_rng(10), 100_000)
-    assert np.isfinite(prior.log_density(draws)).all()
-    z = prior.unconstrain(draws)
-    free, log_prior = prior.constrain(z)
-    assert np.isfinite(log_prior).all()
-    np.testing.assert_allclose(draws, free, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("dynamics", ["lag", "second-order"])
-def test_every_one_of_many_draws_has_a_finite_likelihood(dynamics: Any) -> None:
-    fixed = {"mass": 0.00134, "stiffness": 4.1e5} if dynamics == "second-order" else {}
-    posterior = short_posterior(samples=60, dynamics=dynamics, fixed=fixed)
-    draws = posterior.prior.draw(np.random.default_rng(11), 10_000)
-    assert np.isfinite(posterior.log_density(posterior.prior.unconstrain(draws))).all()
-
-
-@pytest.mark.parametrize(
-    "prior",
-    [
-        Distribution("t", {"df": 3.0, "loc": 0.0, "scale": 5.0}),
-        Distribution("gumbel_r", {"scale": 5.0}),
-        Distribution("cauchy", {}),
-        Distribution("exponnorm", {"K": 1.5}),
-        Distribution("triang", {"c": 0.3, "loc": -5.0, "scale": 10.0}),
-        Distribution("skewnorm", {"a": 2.0}),
-    ],
-    ids=str,
-)
-def test_any_distribution_of_scipy_is_a_prior_for_the_offset(prior: Distribution) -> None:
-    posterior = short_posterior("white", samples=100, priors={"offset": prior})
-    draws = posterior.prior.draw(np.random.default_rng(12), 50)
-    assert np.isfinite(posterior.log_density(posterior.prior.unconstrain(draws))).all()
-    column = list(posterior.names).index("offset")
-    expected = prior.frozen.logpdf(draws[:, column])
-    moved = draws.copy()
-    moved[:, column] = prior.frozen.median()
-    got = posterior.prior.log_density(draws) - posterior.prior.log_density(moved)
-    np.testing.assert_allclose(expected - prior.frozen.logpdf(prior.frozen.median()), got)
 
 
 def test_the_default_prior_covers_the_ring_bender() -> None:

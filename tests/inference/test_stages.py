@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.compiled.stages import drive_of, prepared
-from bwbayes.model.operator import Operator
+from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
@@ -39,10 +39,14 @@ def models(operator: Operator, seed: int) -> dict[str, FloatArray]:
 
 
 def compiled(
-    operator: Operator, column: dict[str, FloatArray], voltage: FloatArray, piece: int
+    operator: Operator,
+    column: dict[str, FloatArray],
+    voltage: FloatArray,
+    piece: int,
+    span: Span = SPAN,
 ) -> FloatArray:
     """Return w (models, samples) of the stage, run in pieces of so many samples."""
-    memory = operator.begin(column, float(voltage[0]), SPAN, from_rest=False)
+    memory = operator.begin(column, float(voltage[0]), span, from_rest=False)
     stage = prepared(operator, column, voltage, memory)
     assert stage is not None
     assert stage.able.all()

@@ -129,13 +129,6 @@ def test_constant_voltage_leaves_the_actuator_at_rest(actuator: Actuator) -> Non
 
 
 @every_kind
-def test_mirrored_voltage_mirrors_the_displacement(actuator: Actuator) -> None:
-    forth = actuator.displacement(theta_of(actuator, offset=0.0), random_walk(9))
-    back = actuator.displacement(theta_of(actuator, offset=0.0, initial=-1.5), -random_walk(9))
-    np.testing.assert_allclose(-forth, back, rtol=0, atol=1e-12)
-
-
-@every_kind
 def test_a_model_does_not_depend_on_its_batch(actuator: Actuator) -> None:
     theta = batch_of(actuator, 12)
     together = actuator.displacement(theta, random_walk(10))

@@ -83,17 +83,6 @@ def oscillator_rate(mass: float, damping: float, stiffness: float) -> FloatArray
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-@pytest.mark.parametrize("poles", POLES.values(), ids=POLES)
-def test_second_order_agrees_with_the_matrix_exponential(
-    poles: tuple[complex, complex], hold: Hold
-) -> None:
-    parameters = from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL)
-    expected = by_matrix_exponential(oscillator_rate(*parameters), hold, walk())
-    got = from_rest(oscillator(parameters, hold), walk())
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("hold", HOLDS)
 def test_stiff_poles_of_table_1_agree_with_scipy(hold: Hold) -> None:
     mass, damping, stiffness = TABLE_1
     # Time in ms and position with velocity in um/ms keep scipy's matrices well scaled.

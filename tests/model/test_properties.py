@@ -13,7 +13,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.boucwen import ceiling, hysteresis
 from tests.model.references import Model
 
-TABLE_1 = Model(0.3575, 0.0272, 0.0172)
 NODES, WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(12))
 
 few = settings(deadline=None, max_examples=60)
@@ -265,14 +264,3 @@ def test_minor_loops_drift_until_they_are_symmetric_about_zero(
     h = hysteresis(path, *parameters, initial=share * top_of(parameters))[0]
     assert h[-2] > 0
     assert -h[-2] == pytest.approx(h[-1], rel=1e-9)
-
-
-def test_minor_loops_settle_by_the_same_part_every_round() -> None:
-    """By exp(−2 ((β − γ) v₀ + (β + γ) (w − v₀))): width w, of which v₀ leads from −h to zero."""
-    h = hysteresis(np.array([0.0, 80.0, *[20.0, 80.0] * 12]), *TABLE_1)[0]
-    gaps = np.diff(h[1::2])
-    against, ahead = TABLE_1.beta - TABLE_1.gamma, TABLE_1.beta + TABLE_1.gamma
-    to_zero = np.log1p(h[-1] * against / TABLE_1.alpha) / against
-    part = np.exp(-2 * (against * to_zero + ahead * (60 - to_zero)))
-    assert pytest.approx(0.01617, rel=1e-3) == part
-    assert pytest.approx(part, rel=1e-4) == gaps[4] / gaps[3]

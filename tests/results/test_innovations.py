@@ -6,10 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
-from bwbayes.report.figures.innovations import draw_innovations
 from bwbayes.results.innovations import Innovations, departures, innovations, numbers
 from tests.inference import problems
 
@@ -71,13 +69,3 @@ def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
     said = numbers(result)
     assert 3000 == said["readings"]
     assert {"rate", "voltage", "direction"} == set(said["by"])  # type: ignore[call-overload]
-
-
-def test_the_picture_has_its_four_parts() -> None:
-    figure = draw_innovations(along(np.random.default_rng(1).normal(size=1000)))
-    assert isinstance(figure, Figure)
-    titles = [panel.get_title() for panel in figure.axes]
-    assert 4 == len(titles)
-    assert all(title.endswith("?") for title in titles)
-    short = draw_innovations(along(np.random.default_rng(1).normal(size=30)))
-    assert 4 == len(short.axes)

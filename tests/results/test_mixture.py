@@ -106,12 +106,6 @@ def test_scores_are_stratified_in_every_draw_and_in_all(number: int) -> None:
     np.testing.assert_allclose(np.sort(scores.ravel()), expected, atol=1e-12)
 
 
-def test_the_same_generator_gives_the_same_scores_and_another_one_does_not() -> None:
-    first, second = stratified_scores(50, random()), stratified_scores(50, random())
-    np.testing.assert_array_equal(first, second)
-    assert (first != stratified_scores(50, np.random.default_rng(12))).any()
-
-
 def test_quantiles_of_one_normal_distribution_are_scipys() -> None:
     means, sds = draws("one draw")
     expected = norm.ppf(np.array(LEVELS)[:, np.newaxis], means, sds)
@@ -128,14 +122,6 @@ def test_without_sds_the_quantiles_are_those_of_the_draws(number: int) -> None:
     ranked = ranked_values(means, np.zeros((number, 1)), stratified_scores(number, random()))
     expected = np.quantile(means, LEVELS, axis=0, method="hazen")
     np.testing.assert_allclose([quantile(ranked, p) for p in LEVELS], expected, rtol=1e-12)
-
-
-def test_the_draws_are_left_as_they_are() -> None:
-    means, sds = draws("usual")
-    before = means.copy()
-    for scale in (0.0, 1.0):
-        ranked_values(means, scale * sds, stratified_scores(len(means), random()))
-    np.testing.assert_array_equal(before, means)
 
 
 def test_a_sample_does_not_depend_on_its_neighbours() -> None:

@@ -130,18 +130,6 @@ def test_a_seed_does_not_show(case: Case) -> None:
         assert np.mean(moved[every[0].scored_from :]) < 0.05, (kind, level)
 
 
-def test_a_name_does_not_show() -> None:
-    case = Case()
-    posterior = posterior_of_case(case)
-    record = record_of(case, np.random.default_rng(3))
-    one, other = (
-        predicted(case, posterior, replace(record, origin=name), 1) for name in ("a.csv", "b.csv")
-    )
-    for key in one.lower:
-        np.testing.assert_array_equal(one.lower[key], other.lower[key])
-        np.testing.assert_array_equal(one.upper[key], other.upper[key])
-
-
 # Lead-ins that do not fit
 
 

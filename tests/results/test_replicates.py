@@ -99,17 +99,6 @@ def test_each_band_is_held_against_what_it_is_for() -> None:
     assert [(kind, level, 1.0) for kind, level in around] == parts
 
 
-def test_missing_readings_are_not_counted() -> None:
-    values = np.zeros(80)
-    reading = np.where(np.arange(80) % 2, 0.0, np.nan)
-    bands = example.bands(samples=20)
-    edges = dict.fromkeys(bands.lower, np.ones(20))
-    bands = replace(bands, lower={key: -edge for key, edge in edges.items()}, upper=edges)
-    record = Record(values, reading, 0.01, truth=values)
-    parts = covered([(bands, Simulated(record, values), slice(60, 80))])
-    assert {1.0} == {part for _, _, part in parts}
-
-
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     """Among fewer than others it would have other ranks."""
     plan = replace(PLAN, walkers=6, block=5, most_steps=5)
@@ -210,13 +199,6 @@ def test_another_record_from_rest_with_the_same_offset_is_simulated_so() -> None
     np.testing.assert_allclose(expected, made.model)
 
 
-def test_other_readings_are_missing_where_they_are() -> None:
-    posterior, theta = moving_posterior()
-    made = another().simulated(posterior, theta, np.random.default_rng(1)).record
-    assert made.displacement is not None
-    assert [199] == np.flatnonzero(np.isnan(made.displacement)).tolist()
-
-
 def test_another_record_is_judged_after_its_lead_in() -> None:
     posterior, theta = moving_posterior()
     generator = np.random.default_rng(1)
@@ -276,16 +258,6 @@ def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
     assert np.std(away) == pytest.approx(1.0, rel=0.2)
 
 
-def test_reading_is_truth_and_sensor_noise() -> None:
-    theta, records = module._simulated(small(), np.random.default_rng(1))
-    record = records["record"].record
-    assert record.displacement is not None
-    assert record.truth is not None
-    noise = (record.displacement - record.truth) / theta["sensor_sd"]
-    assert abs(np.std(noise) - 1) < 4 / np.sqrt(2 * noise.size)
-    assert abs(np.mean(noise)) < 4 / np.sqrt(noise.size)
-
-
 # Loop measures
 
 
@@ -307,13 +279,6 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     np.testing.assert_allclose(2 * d * 100 * turn / (1 + turn**2), opening, rtol=1e-3)
     # The crest that it starts from is the range's upper end.
     np.testing.assert_allclose(d * 100 * (1 + 1 / np.sqrt(1 + turn**2)), extent, rtol=1e-3)
-
-
-def test_first_measure_is_the_log_likelihood() -> None:
-    posterior = small().posterior
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 3))
-    result = small().measures(posterior, theta)
-    np.testing.assert_array_equal(posterior.log_likelihood(theta), result[:, 0])
 
 
 @pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])

@@ -15,7 +15,6 @@ from scipy.signal import lfilter
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import pointfit
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
-from bwbayes.report.figures.spectrum import draw_spectrum
 from bwbayes.results.innovations import Innovations, departures, innovations, numbers
 from bwbayes.results.spectrum import ResidualSpectrum, residual_spectrum, without_lines
 from tests.inference.problems import INTERVAL, short_posterior
@@ -180,21 +179,3 @@ def test_density_of_the_noise_model_is_that_of_its_covariance(
     level = dataclasses.replace(series, noise=white).noise_density(frequency)
     assert level is not None
     np.testing.assert_allclose(level, sensor * np.sqrt(2 * interval))
-
-
-def test_picture_names_the_lines_and_has_the_noise_model_beside_the_residual() -> None:
-    """Hum of 0.4 um at 50 Hz; without it, the legend says that there are no lines."""
-    generator, time = np.random.default_rng(4), np.arange(4000) / 200
-    noise, voltage = generator.standard_normal(time.size), np.sin(2 * np.pi * time)
-    steady = WhiteNoise(0.005).steady_state(np.array([[1.0]]))
-    for hum, expected in ((0.4, "50 Hz (mains, 0.4 µm)"), (0.0, "no lines")):
-        values = noise + hum * np.sin(2 * np.pi * 50 * time)
-        series = Innovations(time, values, voltage, voltage, values, 0.005, steady)
-        figure = draw_spectrum(series)
-        panel = figure.axes[0]
-        assert ["residual", "noise model"] == panel.get_legend_handles_labels()[1][:2]
-        texts = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert ["residual", "noise model", expected] == texts
-        assert ("log", "log") == (panel.get_xscale(), panel.get_yscale())
-        if hum:
-            assert 50 == pytest.approx(float(np.asarray(panel.lines[-1].get_xdata())[0]), abs=0.05)

@@ -200,10 +200,8 @@ HARDEST = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("seed", "kind", "holds"),
-    [HARDEST[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in HARDEST[1:])],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "kind", "holds"), HARDEST)
 def test_a_good_run_holds_and_a_spoilt_one_is_not_said_to(
     tmp_path: Path, seed: tuple[int, int], kind: str, holds: bool | None
 ) -> None:

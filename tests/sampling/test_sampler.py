@@ -9,18 +9,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit, fit
-from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.pointfit import PointFit
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import FIRST_CHECK, MOST_TUNING_BLOCKS, first_chain, sample
-from tests.inference.problems import short_posterior, target
+from tests.inference.problems import target
 from tests.sampling.samplings import (
     PLAN,
     POSTERIOR,
@@ -189,24 +187,3 @@ def test_too_few_walkers_are_refused(walkers: int) -> None:
 def test_a_plan_that_cannot_be_is_refused(change: dict[str, int], says: str) -> None:
     with pytest.raises(InputError, match=says):
         replace(PLAN, **change)
-
-
-def test_one_parameter_alone_is_sampled() -> None:
-    """The offset of a known actuator under known white noise: a normal posterior."""
-    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
-    posterior: Posterior = short_posterior("white", 50, fixed={**known, "sensor_sd": 0.3})
-    assert ("offset",) == posterior.names
-    point = fit(posterior, np.random.default_rng(4))
-    plan = replace(PLAN, walkers=8)
-    chain = first_chain(posterior, point, plan, np.random.default_rng(4))
-    with ThreadPoolExecutor(1) as executor:
-        outcome = sample(posterior, plan, chain, executor)
-    assert outcome.converged
-    zero = posterior.prior.theta(np.zeros((1, 1)))
-    residual = posterior.only.displacement - posterior.simulate(zero)[0]
-    expected = stats.norm(np.mean(residual), 0.3 / np.sqrt(50))
-    result = draws(posterior, chain).ravel()
-    error = 4 * expected.std() / np.sqrt(outcome.check.ess_bulk[0])
-    # The prior pulls by less than a thousandth of the posterior's sd.
-    assert expected.mean() == pytest.approx(np.mean(result), abs=error)
-    assert expected.std() == pytest.approx(np.std(result), rel=0.15)

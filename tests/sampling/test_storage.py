@@ -1,29 +1,20 @@
-"""The chain file is whole at every moment: killed, read while written, or damaged on the disk."""
+"""The chain file keeps what was written, what was set aside, and what was said of the run."""
 
 from __future__ import annotations
 
-import itertools
-import os
-import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import pytest
 
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.storage import REFITTED, ChainFile
-from tests.forks import FORKS
 from tests.sampling.chains import (
     ATTRIBUTES,
-    ENSEMBLES,
     PLAN,
     arrays,
     assert_same,
     blocks,
-    committed,
     finish,
     new,
     proposal,
@@ -105,62 +96,3 @@ def test_blocks_that_were_set_aside_stay_so_and_are_kept(tmp_path: Path) -> None
     assert (2, 3, 5) == (read.set_aside, read.blocks("sampling"), len(read.history("sampling")))
     assert read.proposals["sampling"] is not None
     assert read.proposal_in_use("sampling") is None
-
-
-# Killing
-
-
-def mortal(method: Callable[..., Any], moment: Callable[[], None]) -> Callable[..., Any]:
-    """Make a method one of whose two ends may be its process's last moment."""
-
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        moment()
-        result = method(*args, **kwargs)
-        moment()
-        return result
-
-    return wrapped
-
-
-def write(path: Path, last_moment: int | None = None) -> None:
-    """Finish the chain, or die before or after one of the calls that change its file."""
-    moments = itertools.count()
-
-    def moment() -> None:
-        if next(moments) == last_moment:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    for owner, name in (
-        (h5py.Dataset, "__setitem__"),
-        (h5py.Dataset, "resize"),
-        (h5py.File, "flush"),
-        (h5py.File, "close"),
-        (Path, "replace"),
-    ):
-        setattr(owner, name, mortal(getattr(owner, name), moment))
-    with ChainFile.resume(path) if path.exists() else new(path) as chain:
-        finish(chain)
-
-
-def written(path: Path, last_moment: int | None = None) -> int | None:
-    process = FORKS.Process(target=write, args=(path, last_moment))
-    process.start()
-    process.join()
-    return process.exitcode
-
-
-# Some fall into the start, most into a block, its count, or the copy with which a run goes on.
-@pytest.mark.parametrize("first", [0, 3, 20, 44, 48, 53, 60, 71, 120])
-def test_killed_anywhere_it_goes_on_to_the_same_bits(
-    first: int, tmp_path: Path, expected: dict[str, Any]
-) -> None:
-    """Killed twice, the second time when it has gone on: copying, or in a later block."""
-    path = tmp_path / "chain.h5"
-    assert written(path, first) == -signal.SIGKILL
-    before = len(ChainFile.read(path).ends) if path.exists() else 0
-    assert before in (0, ENSEMBLES)
-    counts = committed(path)
-    assert written(path, 5 + first // 2) == -signal.SIGKILL
-    assert all(now >= then for now, then in zip(committed(path), counts, strict=True))
-    assert written(path) == 0
-    assert_same(expected, arrays(ChainFile.read(path)))

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
@@ -169,34 +166,6 @@ def test_without_dynamics_the_inverse_is_a_search_for_each_sample() -> None:
         _, state = actuator.advance(theta, [expected[-1]], state, from_rest=True)
     computed = inverse(actuator, theta, reference, from_rest=True)[0]
     np.testing.assert_allclose(computed, expected, atol=1e-8)
-
-
-SYMMETRIC = ("bouc-wen", "backlash-like", "plays", "preisach", "prandtl-ishlinskii", "maxwell-slip")
-
-
-@pytest.mark.parametrize("name", SYMMETRIC)
-@settings(max_examples=10, deadline=None)
-@given(turns=st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=6), row=st.integers(0, 3))
-def test_the_mirrored_displacement_needs_the_mirrored_voltage(
-    name: str, turns: list[float], row: int
-) -> None:
-    """Along any turns, from the demagnetised state; and simulated, the displacement is returned."""
-    of = posterior(name)
-    actuator = replace(of.likelihood.actuator, dynamics="none")
-    table = dict(of.only.table.columns(drawn(of, 4)))
-    theta = np.array([[table[n][row] for n in actuator.parameters]])
-    column = {n: theta[:, i] for i, n in enumerate(actuator.parameters)}
-    column["offset"][:] = 0.0
-    if name in ("bouc-wen", "backlash-like"):
-        column["initial"][:] = 0.0
-        column["alpha"][:] = np.minimum(column["alpha"], 0.4 * column["d"])
-    path = [np.linspace(a, b, 7)[1:] for a, b in pairwise([0.0, *turns])]
-    reference = 40.0 * np.concatenate(path)
-    if np.ptp(reference) < 1e-6:
-        return
-    voltage = assert_returned(actuator, theta, reference, from_rest=True)
-    mirrored = inverse(actuator, theta, -reference, from_rest=True)
-    np.testing.assert_allclose(mirrored, -voltage, atol=1e-7 * np.max(np.abs(voltage)))
 
 
 def limited() -> tuple[Actuator, FloatArray]:

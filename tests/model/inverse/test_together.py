@@ -18,7 +18,6 @@ from bwbayes.model.inverse.alone import One
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.together import MANY
-from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.one_state import StateMemory
@@ -81,23 +80,6 @@ def followed(
         patch.setattr(side, "MANY", 1)
         right = side.together(ones, columns, here, drive, made)
     return made, right
-
-
-@pytest.mark.parametrize("hold", ["first", "zero"])
-@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
-@pytest.mark.parametrize("from_rest", [True, False])
-def test_side_by_side_as_alone(hold: Hold, dynamics: str, from_rest: bool) -> None:
-    """Both to 1e-9 of the range, from any state, and what they make is the reference."""
-    actuator = Actuator(dynamics, hold, 1e-3, span=SPAN)
-    theta, asked = scattered(actuator), smooth()
-    together = side_by_side(actuator, theta, asked, from_rest=from_rest)
-    alone = np.stack([inverse(actuator, one, asked, from_rest=from_rest)[0] for one in theta])
-    assert np.max(np.abs(together - alone)) < CLOSE * np.ptp(alone)
-    for model, voltage in zip(theta[:10], together, strict=False):
-        made = actuator.displacement(model, voltage, from_rest=from_rest)[0]
-        # A held voltage acts one sample later; the second sample cannot be chosen.
-        late = 2 if not from_rest or dynamics != "none" else 0
-        assert np.max(np.abs(made - asked)[late:]) < CLOSE * np.ptp(asked)
 
 
 def test_steps_as_large_as_the_range_against_a_search() -> None:
@@ -177,20 +159,6 @@ def test_whatever_has_a_step_goes_side_by_side_as_alone(name: str, from_rest: bo
         np.testing.assert_allclose(together[row], alone, rtol=0, atol=CLOSE * np.ptp(alone))
         made = actuator.displacement(theta[row], together[row], from_rest=from_rest)[0]
         np.testing.assert_allclose(made, asked, rtol=0, atol=CLOSE * np.ptp(asked))
-
-
-def test_plays_go_on_from_a_state_side_by_side() -> None:
-    """Loops that are closed and open, as all models' voltage left them."""
-    actuator = cases.actuator("plays, lag, gain")
-    theta = cases.theta(actuator, MANY, "plays")
-    before = np.concatenate([np.linspace(a, b, 20) for a, b in ((0, 60), (60, -30), (-30, 10))])
-    y, state = actuator.advance(theta, before, from_rest=True)
-    asked = y[:, -1:] + smooth(100, 10.0)
-    together = inverse(actuator, theta, asked, state)
-    for row in (0, 7):
-        _, its = actuator.advance(theta[row], before, from_rest=True)
-        made = actuator.advance(theta[row], together[row], its)[0][0]
-        np.testing.assert_allclose(made, asked[row], rtol=0, atol=CLOSE * np.ptp(asked))
 
 
 def test_models_whose_gain_turns_back_are_told() -> None:

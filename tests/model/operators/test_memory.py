@@ -116,17 +116,6 @@ def test_agrees_with_extrema_looked_for_anew(case: Case, span: Span | None) -> N
         assert_close(slowly(case, voltage, span), run(case.operator, case.column, voltage, span))
 
 
-@pytest.mark.parametrize("name", ["plays", "maxwell-slip"])
-@pytest.mark.parametrize("span", SPANS)
-def test_agrees_with_plays_updated_one_by_one(name: str, span: Span | None) -> None:
-    voltage = walk(5, turns=40)
-    got = run(CASES[name].operator, CASES[name].column, voltage, span)
-    for start, row in zip(INITIALS, got, strict=True):
-        full = path(start, voltage, span)
-        expected = by_plays(0.7, np.array(VOLTS), np.array(WEIGHTS), full)
-        assert_close(expected[-voltage.size :], row)
-
-
 def test_exponential_thresholds_are_the_limit_of_many_plays() -> None:
     voltage = walk(6, turns=30)
     case, span = CASES["prandtl-ishlinskii"], SPANS[0]
@@ -423,11 +412,6 @@ def test_ramps_wider_than_ten_bells_are_refused() -> None:
 def test_thresholds_that_cannot_be_are_refused(kind: type[Plays], thresholds: object) -> None:
     with pytest.raises(InputError, match=r"^thresholds: "):
         kind(thresholds)  # type: ignore[arg-type]
-
-
-def test_thresholds_may_come_as_a_config_has_them() -> None:
-    assert Plays([1, 2]) == Plays((1.0, 2.0))  # type: ignore[arg-type]
-    assert len(Plays(7).parameters) == 10
 
 
 def test_ramps_of_no_width_are_relays() -> None:
