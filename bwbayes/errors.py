@@ -1,6 +1,6 @@
 """What can go wrong for a user, and how it is said: in one line.
 
-An error that a person can fix (a broken record, a misspelt key, a parameter outside its domain)
+An error that a person can fix (a broken record, a misspelled key, a parameter outside its domain)
 is an :class:`InputError`; its text says where, what, and what to do. The command line prints that
 line and ends with status 2. Anything else is a defect of bwbayes and keeps its traceback.
 """

@@ -61,7 +61,7 @@ def promises(
     draws
         (draws, free), parameters in their own units.
     candidates
-        Voltages (samples,) by name, V, at the interval of the fitted record, from a demagnetised
+        Voltages (samples,) by name, V, at the interval of the fitted record, from a demagnetized
         actuator at rest.
     target
         The name of a free parameter of the actuator, or a drive (samples,), V, whose parameter band

@@ -115,10 +115,10 @@ def evidence(
     size = log_density[:, half:].size
     thin = max(size // BRIDGED, 1)
     sampled = coordinates[::thin, half:]
-    at_draws = log_density[::thin, half:] - _normalised(proposal, sampled)
+    at_draws = log_density[::thin, half:] - _normalized(proposal, sampled)
     random = np.random.RandomState(generator.integers(2**32))
     places = proposal.draw(random, PROPOSED)
-    at_places = posterior.log_density(places) - _normalised(proposal, places)
+    at_places = posterior.log_density(places) - _normalized(proposal, places)
     bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
@@ -220,7 +220,7 @@ def _effective(values: FloatArray) -> float:
     return bulk if np.isfinite(bulk) else 1.0
 
 
-def _normalised(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
+def _normalized(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
     """Log density of a proposal with its constant, shaped as the coordinates less the last axis."""
     first = proposal.components[0]
     free, freedom = first.center.size, first.freedom

@@ -170,7 +170,7 @@ def compensate(
         the reference at the next sample, just before it changes; ``"first"``, it goes in straight
         lines.
     from_rest
-        The actuator starts demagnetised; otherwise it has waited at zero volts until it stood
+        The actuator starts demagnetized; otherwise it has waited at zero volts until it stood
         still, in a state of its hysteresis that nothing tells.
     limits, nearest
         The amplifier's, and whether to come as near as they allow; see

@@ -138,7 +138,7 @@ class Exported:
             finalize=_in_c,
         )
         actuator, step = self.model.actuator, self.model.step
-        remembered = step.demagnetised()[0]
+        remembered = step.demagnetized()[0]
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] if actuator.gain else []
         parts += ["creep"] if actuator.creep else []

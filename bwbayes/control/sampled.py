@@ -72,7 +72,7 @@ class SteppedState(NamedTuple):
 class SampledModel:
     """A batch of models, a sample at a time.
 
-    They start demagnetised at zero volts, go to a first voltage and settle there, with dynamics and
+    They start demagnetized at zero volts, go to a first voltage and settle there, with dynamics and
     creep at rest. 0 um is where they stand at zero volts: the displacement is without the sensor's
     offset.
 
@@ -116,7 +116,7 @@ class SampledModel:
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        equilibrium, _, memory = self.drive(self.step.demagnetised(), voltage)
+        equilibrium, _, memory = self.drive(self.step.demagnetized(), voltage)
         filters = np.zeros((*self.sections.gains.shape, 2))
         return SteppedState(
             memory, voltage, equilibrium, equilibrium * self._growth(voltage), filters

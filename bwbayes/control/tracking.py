@@ -194,7 +194,7 @@ def _plan(
 
 def _reach(mean: SampledModel, limits: Span) -> Span:
     """Return the displacements, um, that slow sweeps between the limits end at."""
-    memory = mean.step.demagnetised()
+    memory = mean.step.demagnetized()
     ends = []
     for voltage in (0.0, limits.high, limits.low, limits.high, limits.low):
         w, _, memory = mean.drive(memory, np.array([voltage]))

@@ -74,7 +74,7 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     judged = usable[rows]
     displacement = record.displacement[rows[judged]]
     time = record.time[rows]
-    centred = displacement - displacement.mean()
+    centered = displacement - displacement.mean()
 
     elapsed = time[judged] - time[judged][0]
     trend_shape = elapsed / elapsed[-1] - 0.5
@@ -86,20 +86,20 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), judged), strict=True):
         basis = np.column_stack([loops, trend_shape])
-        remainder, which = _best_decay(basis, decays, centred)
+        remainder, which = _best_decay(basis, decays, centered)
         if best is None or remainder < best[0]:
             best = remainder, basis, lag, which
     assert best is not None
     _, basis, lag, which = best
     design = np.column_stack([basis, decays[:, which]])
-    products = _products(design, centred[:, np.newaxis])
+    products = _products(design, centered[:, np.newaxis])
     among = _products(design, design)
     coefficients = _inverse(among) @ products[:, 0]
     shared = among[:-2, -2]  # the products of the loops' columns with the trend's
     imitated = float(shared @ _inverse(among[:-2, :-2]) @ shared)
-    residual = centred - (design * coefficients).sum(axis=1)
+    residual = centered - (design * coefficients).sum(axis=1)
     undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
-    driven = centred - undriven
+    driven = centered - undriven
     lagged = basis[:, 1] - basis[:, 1].mean()
     return LoopFit(
         rows[judged],

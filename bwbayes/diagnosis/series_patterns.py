@@ -29,7 +29,7 @@ __all__ = [
 NORMAL = 1.4826
 
 # Samples in the median that a spike is held against: two beside each other are a spike still.
-NEIGHBOURS = 5
+NEIGHBORS = 5
 
 # Times the range of a line through the values, and of most residuals, that no actuator's
 # hysteresis, lag, creep or ringing lies off that line.
@@ -91,7 +91,7 @@ def spikes(
 ) -> IntArray:
     """Return the samples of isolated outliers in values (samples,).
 
-    A spike is one or two samples that lie off the median of their neighbourhood by eight times what
+    A spike is one or two samples that lie off the median of their neighborhood by eight times what
     is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
     unit, has a spike of its own nearby, the values may have one of twice its size. With `ends` the
     first and the last value may be spikes too, though a fast transient begins like one.
@@ -100,14 +100,14 @@ def spikes(
     allowed = np.zeros_like(values)
     if drive is not None:
         allowed = 2 * scipy.ndimage.maximum_filter1d(
-            np.abs(_off_median(drive, ends)), 2 * NEIGHBOURS + 1
+            np.abs(_off_median(drive, ends)), 2 * NEIGHBORS + 1
         )
     usual = scatter(off[off != 0]) if np.any(off) else 0.0
     limit = max(8 * usual, least) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
-    # A spike moves its neighbours' medians too. The largest comes first, and a straight line takes
+    # A spike moves its neighbors' medians too. The largest comes first, and a straight line takes
     # its place before the next is judged.
-    half = NEIGHBOURS // 2
+    half = NEIGHBORS // 2
     rest = np.pad(values, half, mode="reflect" if ends else "edge")
     isolated = np.zeros(rest.size, dtype=np.bool_)
     for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
@@ -143,14 +143,14 @@ def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
     low, high = np.quantile(values - coefficients @ line, (0.1, 0.9))
     far = off > GROSS * (abs(coefficients[1]) * np.ptp(drive) + high - low)
     first, length = runs(far)
-    short = length <= NEIGHBOURS // 2
+    short = length <= NEIGHBORS // 2
     gross: IntArray = np.union1d(first[short], (first + length - 1)[short])
     return gross
 
 
 def _off_median(values: FloatArray, ends: bool) -> FloatArray:
     mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
-    off: FloatArray = values - scipy.ndimage.median_filter(values, NEIGHBOURS, mode=mode)
+    off: FloatArray = values - scipy.ndimage.median_filter(values, NEIGHBORS, mode=mode)
     return off
 
 
@@ -168,8 +168,8 @@ def decay(time: FloatArray, values: FloatArray, longest: float) -> DecayingStart
     times = np.geomspace(max(elapsed[1], longest * 1e-6), longest, 40)
     shapes = np.exp(-elapsed[:, np.newaxis] / times)
     shapes -= shapes.mean(axis=0)
-    centred = values - values.mean()
-    sizes = shapes.T @ centred / (shapes**2).sum(axis=0)
+    centered = values - values.mean()
+    sizes = shapes.T @ centered / (shapes**2).sum(axis=0)
     best = int(np.argmax(sizes**2 * (shapes**2).sum(axis=0)))
     return DecayingStart(float(sizes[best]), float(times[best]))
 

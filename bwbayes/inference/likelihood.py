@@ -125,7 +125,7 @@ class Likelihood:
     engine
         What computes it; see :mod:`bwbayes.inference.engine`.
     from_rest
-        The actuator is demagnetised and at rest when the record starts: nothing is unknown, and
+        The actuator is demagnetized and at rest when the record starts: nothing is unknown, and
         the initial state of θ is the one at zero volts before.
     half_range
         Half the range of the voltages that the actuator may have seen, V.

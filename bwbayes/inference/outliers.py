@@ -29,7 +29,7 @@ from bwbayes.inference.readings import Readings
 
 __all__ = ["LIMIT", "outliers", "surprise"]
 
-# Standard deviations from what its neighbours predict at which a reading is an outlier.
+# Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0
 
 # Fits at most, each to the readings that the one before retained.

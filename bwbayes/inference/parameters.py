@@ -259,7 +259,7 @@ class JointPrior:
 
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
         """
-        # A parameter is a row here, so that what is done with one is done with neighbours.
+        # A parameter is a row here, so that what is done with one is done with neighbors.
         unclipped = np.ascontiguousarray(coordinates.T)
         safe = np.clip(unclipped, -FARTHEST, FARTHEST)
         free, possible = np.empty_like(safe), np.equal(safe, unclipped).all(axis=0)

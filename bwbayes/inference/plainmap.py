@@ -16,7 +16,7 @@ from bwbayes.model.closed import Scored
 
 __all__ = ["PlainMap"]
 
-# Places among the free parameters, and centres and scales as columns.
+# Places among the free parameters, and centers and scales as columns.
 _Kind = tuple[IntArray, FloatArray, FloatArray]
 
 
@@ -37,7 +37,7 @@ class PlainMap:
         forms = {row: form for row, form in formulas.items() if form is not None}
         kinds = (
             [
-                (row, form.centre, form.scale)
+                (row, form.center, form.scale)
                 for row, form in forms.items()
                 if form.logarithmic == kind
             ]
@@ -47,14 +47,14 @@ class PlainMap:
 
     def fill(self, free: FloatArray, scores: FloatArray) -> None:
         """Write the values of their scores, both (free, models)."""
-        rows, centre, scale = self.normal
+        rows, center, scale = self.normal
         if rows.size:
-            free[rows] = centre + scale * scores[rows]
-        rows, centre, scale = self.lognormal
+            free[rows] = center + scale * scores[rows]
+        rows, center, scale = self.lognormal
         if rows.size:
-            free[rows] = centre * np.exp(scale * scores[rows])
+            free[rows] = center * np.exp(scale * scores[rows])
 
 
 def _columns(kind: list[tuple[int, float, float]]) -> _Kind:
-    rows, centres, scales = np.array(kind).reshape(-1, 3).T
-    return rows.astype(np.int64), centres[:, np.newaxis], scales[:, np.newaxis]
+    rows, centers, scales = np.array(kind).reshape(-1, 3).T
+    return rows.astype(np.int64), centers[:, np.newaxis], scales[:, np.newaxis]

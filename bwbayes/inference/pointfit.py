@@ -70,13 +70,13 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     """
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
-    centre, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
+    center, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
     density = posterior.log_density(draws[:DRAWS])
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
     valleys = []
     for steps in (False, True):
-        least_squares = _LeastSquares(posterior, centre, np.sqrt(np.diag(spread)), steps=steps)
+        least_squares = _LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
         valleys += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
     noise = draws[:DRAWS, ~least_squares.physical]
@@ -182,9 +182,9 @@ class _LeastSquares:
     """
 
     def __init__(
-        self, posterior: Posterior, centre: FloatArray, spread: FloatArray, *, steps: bool
+        self, posterior: Posterior, center: FloatArray, spread: FloatArray, *, steps: bool
     ) -> None:
-        self.posterior, self.centre, self.spread, self.steps = posterior, centre, spread, steps
+        self.posterior, self.center, self.spread, self.steps = posterior, center, spread, steps
         self.physical = np.array([n in posterior.table.physical for n in posterior.names])
         stride = RESIDUALS // len(posterior.datasets)
         training = [dataset.readings.rows for dataset in posterior.datasets]
@@ -207,7 +207,7 @@ class _LeastSquares:
                 residuals[possible] = self.residuals(coordinates[possible])
             return residuals
         theta = self.posterior.prior.theta(free)
-        pull = ((coordinates - self.centre) / self.spread)[:, self.physical]
+        pull = ((coordinates - self.center) / self.spread)[:, self.physical]
         missed = [
             (self.posterior.simulate(theta, rows, dataset.name) - target) / scale
             for dataset, rows, target, scale in zip(
@@ -225,10 +225,10 @@ class _LeastSquares:
     def optimum(self, start: FloatArray) -> FloatArray:
         """Return the coordinates (free,) of the optimum that ``start`` leads to."""
         if not self.physical.any():
-            return self.centre
+            return self.center
 
         def full(values: FloatArray) -> FloatArray:
-            everywhere = np.tile(self.centre, (np.atleast_2d(values).shape[0], 1))
+            everywhere = np.tile(self.center, (np.atleast_2d(values).shape[0], 1))
             everywhere[:, self.physical] = values
             return everywhere
 
@@ -331,14 +331,14 @@ def _units(posterior: Posterior, position: FloatArray, spread: FloatArray) -> Fl
 
 
 class _Surface:
-    """Minus the log density over w, coordinates = centre + axes w, with batched differences."""
+    """Minus the log density over w, coordinates = center + axes w, with batched differences."""
 
     STEP = 0.1
 
-    def __init__(self, posterior: Posterior, centre: FloatArray, axes: FloatArray) -> None:
-        self.posterior, self.centre = posterior, centre
+    def __init__(self, posterior: Posterior, center: FloatArray, axes: FloatArray) -> None:
+        self.posterior, self.center = posterior, center
         self.axes = np.diag(axes) if axes.ndim == 1 else axes
-        size = centre.size
+        size = center.size
         steps = self.STEP * np.eye(size)
         pairs = [(i, j) for i in range(size) for j in range(i)]
         self._pairs = tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
@@ -347,14 +347,14 @@ class _Surface:
         self._cross = np.concatenate([sides[0] + sides[1], -sides[0] - sides[1]])
 
     def outwards(self, w: FloatArray) -> FloatArray:
-        position: FloatArray = self.centre + w @ self.axes.T
+        position: FloatArray = self.center + w @ self.axes.T
         return position
 
     def inwards(self, position: FloatArray) -> FloatArray:
         with warnings.catch_warnings():
             # Axes of very different lengths are as they should be.
             warnings.simplefilter("ignore", linalg.LinAlgWarning)
-            w: FloatArray = linalg.solve(self.axes, position - self.centre)
+            w: FloatArray = linalg.solve(self.axes, position - self.center)
         return w
 
     def values(self, w: FloatArray) -> FloatArray:
@@ -378,12 +378,12 @@ class _Surface:
         result[i, j] = result[j, i] = cross / (2 * self.STEP**2)
         return result
 
-    def rescaled(self, centre: FloatArray, curvature: FloatArray) -> _Surface:
+    def rescaled(self, center: FloatArray, curvature: FloatArray) -> _Surface:
         """Return the same surface, measured so that its curvature is the identity."""
         size, directions = linalg.eigh((curvature + curvature.T) / 2)
         # Where the surface is flat or bends the wrong way, keep the old unit of length.
         axes = self.axes @ (directions / np.sqrt(np.maximum(size, 1e-2)))
-        return _Surface(self.posterior, centre, axes)
+        return _Surface(self.posterior, center, axes)
 
 
 def _distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:

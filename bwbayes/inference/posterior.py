@@ -47,7 +47,7 @@ class Dataset:
     actuator, noise
         The model, at the record's own sampling interval and hold.
     from_rest
-        The record starts with a demagnetised actuator at rest, and ``initial`` is h at zero volts
+        The record starts with a demagnetized actuator at rest, and ``initial`` is h at zero volts
         before. Otherwise the state of the dynamics at the first sample is unknown.
     name
         What the record is called.

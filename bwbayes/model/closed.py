@@ -40,23 +40,23 @@ class Form(Protocol):
 class Scored:
     """Normal, x = c + s z, or lognormal, x = c exp(s z), of a standard normal z."""
 
-    centre: float
+    center: float
     scale: float
     logarithmic: bool
 
     def score(self, x: FloatArray) -> FloatArray:
         """Return z of values x."""
         if not self.logarithmic:
-            return (x - self.centre) / self.scale
+            return (x - self.center) / self.scale
         with np.errstate(divide="ignore"):
-            logs = np.log(np.maximum(x, 0.0) / self.centre)
+            logs = np.log(np.maximum(x, 0.0) / self.center)
         return np.asarray(logs / self.scale)
 
     def value(self, score: FloatArray) -> FloatArray:
         """Return x of scores z."""
         if not self.logarithmic:
-            return self.centre + self.scale * score
-        return np.asarray(self.centre * np.exp(self.scale * score))
+            return self.center + self.scale * score
+        return np.asarray(self.center * np.exp(self.scale * score))
 
     def cdf(self, x: FloatArray) -> FloatArray:
         """Φ(z)."""

@@ -27,7 +27,7 @@ _BLOCK = 16384
 class ExponentFlow:
     """The flow of dg/dv = alpha - beta g |g|^(n-1) - gamma |g|^n along monotone stretches.
 
-    Equation (6) of the paper with a general exponent: v = |u - u0| is the voltage travelled since
+    Equation (6) of the paper with a general exponent: v = |u - u0| is the voltage traveled since
     the stretch began and g = s h the hysteretic displacement in the direction of travel s. With
     lambda = beta + gamma and G = (alpha / lambda)^(1/n), z = g / G follows dz/dtau = 1 - z^n in
     tau = v alpha / G from g >= 0 on; while g < 0, the same holds for -g with mu = beta - gamma.
@@ -69,7 +69,7 @@ class ExponentFlow:
             Displacement g0 at the start of the stretch, in um, in the direction of travel. It may
             lie above the ceiling G, but where gamma > beta its size must stay below.
         travel : FloatArray, shape (points,)
-            Voltage travelled |u - u0| in V: ascending, zero or above.
+            Voltage traveled |u - u0| in V: ascending, zero or above.
 
         Returns
         -------

@@ -70,7 +70,7 @@ class MasterCurve:
 
     @classmethod
     def outside(cls, exponent: FloatArray, sign: float) -> MasterCurve:
-        """Curves down from z^n = e^36 towards 1; the time is counted from this top."""
+        """Curves down from z^n = e^36 toward 1; the time is counted from this top."""
         even = np.linspace(-_REACH, 0.0, round(_REACH / _FAR_STEP) + 1)
         logit = np.concatenate((even, _graded_half(_FAR_STEP)[1:]))
         n = exponent[:, None]

@@ -84,7 +84,7 @@ class Operator(ABC):
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Any:
         """Return the memory at a record's first voltage.
 
-        From rest the voltage came straight from zero volts, where the actuator was demagnetised
+        From rest the voltage came straight from zero volts, where the actuator was demagnetized
         (or in the state ``initial``, where that is a displacement). Otherwise ``initial`` says
         which of the reachable states it is.
         """

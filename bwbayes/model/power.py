@@ -84,7 +84,7 @@ class PowerStep(OneStateStep):
         x = select(time < 0.0, parameters[2], parameters[3]) * height**n
         return d * voltage - h, d - alpha * (1 - x)
 
-    def demagnetised(self) -> FloatArray:
+    def demagnetized(self) -> FloatArray:
         """Return zero volts, h = 0, no direction and no time."""
         return np.zeros((self.d.size, 4))
 

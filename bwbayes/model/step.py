@@ -59,8 +59,8 @@ class HysteresisStep(ABC):
         """
 
     @abstractmethod
-    def demagnetised(self) -> FloatArray:
-        """Return the memory of a demagnetised actuator at zero volts."""
+    def demagnetized(self) -> FloatArray:
+        """Return the memory of a demagnetized actuator at zero volts."""
 
     @abstractmethod
     def remembered(self, memory: Any) -> FloatArray:
@@ -75,7 +75,7 @@ class HysteresisStep(ABC):
 
     @abstractmethod
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
-        """Return bounds of dw/du that hold on every path from the demagnetised state.
+        """Return bounds of dw/du that hold on every path from the demagnetized state.
 
         The path keeps within limits, V.
         """
@@ -97,7 +97,7 @@ class HysteresisStep(ABC):
 class OneStateStep(HysteresisStep):
     """A step that remembers the voltage and one displacement h, (models, 2)."""
 
-    def demagnetised(self) -> FloatArray:
+    def demagnetized(self) -> FloatArray:
         """Return zero volts and h = 0."""
         return np.zeros((len(self.parameters), 2))
 

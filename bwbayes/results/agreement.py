@@ -13,8 +13,8 @@ alone, and ℓ its log likelihood,
 is what the joint fit costs the record, less what the prior at m_r has cost it already. Were all
 normal, D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
 If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C): the
-covariance of a mean that was learnt from more is larger by what the posterior's is smaller (the law
-of total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
+covariance of a mean learned from more is larger by what the posterior's is smaller (the law of
+total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
 A (C_r − C): what the record does not tell, or tells alone, has no weight. That sum is nearly a
 multiple of a χ² variable, with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946;
 at p = 1e-3 off by less than a factor of two). With (m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in

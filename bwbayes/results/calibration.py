@@ -126,7 +126,7 @@ class Calibration:
     positions
         (ranked replicates, statistics) in (0, 1): where each truth lies in its posterior.
     statistics
-        Judgement by statistic.
+        Judgment by statistic.
     ecdf
         The band of the rank test.
     limits

@@ -30,7 +30,7 @@ ROUNDS = 6
 # A node less probable than the best by this much (nats) is outside of the next grid.
 IMPROBABLE = 10.0
 
-# The grid is fine enough when neighbours within two nats of the best node differ by less than this.
+# The grid is fine enough when neighbors within two nats of the best node differ by less than this.
 FINE = 1.5
 
 # Draws that are asked about each of many histories, and pairs of a history and a state that they

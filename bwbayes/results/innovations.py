@@ -60,7 +60,7 @@ FEWEST = 100
 
 @dataclass(frozen=True)
 class Innovations:
-    """Normalised innovations of the readings that were fitted, and the drive there.
+    """Normalized innovations of the readings that were fitted, and the drive there.
 
     All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
     ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
@@ -98,10 +98,10 @@ class Innovations:
     @property
     def correlation(self) -> FloatArray:
         """Autocorrelation at lags 1 to LAGS, (lags,)."""
-        centred = self.white - np.mean(self.white)
-        total = float(np.sum(centred**2))
-        lags = range(1, min(LAGS, centred.size - 1) + 1)
-        return np.array([np.sum(centred[lag:] * centred[:-lag]) / total for lag in lags])
+        centered = self.white - np.mean(self.white)
+        total = float(np.sum(centered**2))
+        lags = range(1, min(LAGS, centered.size - 1) + 1)
+        return np.array([np.sum(centered[lag:] * centered[:-lag]) / total for lag in lags])
 
     @property
     def kurtosis(self) -> float:

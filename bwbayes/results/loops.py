@@ -2,7 +2,7 @@
 
 Every posterior draw is driven slowly, without dynamics, creep and offset: up and down over the
 whole range of the record's voltage until the loop closes (the major loop), the same over half of
-that range (the minor loop), and once from the demagnetised state (the initial curve). What can be
+that range (the minor loop), and once from the demagnetized state (the initial curve). What can be
 read off these, the range, the opening, the remanence, the coercive voltage and the area, then has a
 mean, an sd and an interval as any parameter has, and so can be held against another operator's or a
 data sheet's.
@@ -146,7 +146,7 @@ class Loops:
     """The loops of an actuator, from its posterior.
 
     ``major`` goes over the whole range of the record's voltage, ``minor`` over half of it about the
-    same middle; ``initial`` is the curve from the demagnetised state, along ``initial_voltage``
+    same middle; ``initial`` is the curve from the demagnetized state, along ``initial_voltage``
     (points,), V.
     """
 
@@ -194,7 +194,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
 def steady_loop(
     actuator: Actuator, column: Values, low: float, high: float, points: int = POINTS
 ) -> Traced:
-    """Drive models from the demagnetised state up and down until the loop closes.
+    """Drive models from the demagnetized state up and down until the loop closes.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def steady_loop(
         ``low`` is not below ``high``, or an even number of points.
     """
     voltage = _voltages(low, high, points)
-    column = _demagnetised(column)
+    column = _demagnetized(column)
     memory = actuator.begin(column, np.zeros(1), from_rest=True)
     operator = actuator.hysteresis
     cycles, closed = CYCLES, False
@@ -234,13 +234,13 @@ def initial_curve(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the voltages (points,), V, and the curve (models, points), um, from the virgin state.
 
-    The demagnetised actuator at zero volts goes straight to ``low``, and another time straight to
+    The demagnetized actuator at zero volts goes straight to ``low``, and another time straight to
     ``high``; where both lie on one side of zero, only to the farther one. Parameters as in
     :func:`steady_loop`.
     """
     low, high = min(low, 0.0), max(high, 0.0)
     voltage = _voltages(low, high, points)
-    column = _demagnetised(column)
+    column = _demagnetized(column)
     sides = [voltage[voltage < 0][::-1], voltage[voltage >= 0]]
     curves = [
         actuator.hysteresis.advance(
@@ -273,7 +273,7 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
     ``coercive_V``
         (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
         the loop's width there. In a loop that is symmetric about zero it is the voltage that takes
-        the displacement back to zero, as the coercive field does a polarisation.
+        the displacement back to zero, as the coercive field does a polarization.
     ``area_um_V``
         −∮ x du = ∮ u dx over one cycle, positive where the displacement lags: the energy lost in a
         cycle, in µJ, once multiplied with the actuator's force per volt, N/V.
@@ -348,7 +348,7 @@ def _voltages(low: float, high: float, points: int) -> FloatArray:
     return np.linspace(low, high, points)
 
 
-def _demagnetised(column: Values) -> dict[str, FloatArray]:
+def _demagnetized(column: Values) -> dict[str, FloatArray]:
     return {**column, "initial": np.zeros_like(column["initial"])}
 
 

@@ -1,7 +1,7 @@
 """The files of a finished run: posterior, bands, summary.
 
 Each is written under another name and renamed when it is whole, so a reader never sees half a
-file. This module alone knows arviz's labelled posterior.
+file. This module alone knows arviz's labeled posterior.
 """
 
 from __future__ import annotations

@@ -33,11 +33,11 @@ __all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "t
 # Posterior draws in the mixture.
 DRAWS = 1000
 
-# Samples that are simulated and summarised at once: few enough for a core's own cache. Not a power
+# Samples that are simulated and summarized at once: few enough for a core's own cache. Not a power
 # of two: rows of draws that far apart would take each other's place in it.
 PIECE = 400
 
-# Threads that summarise pieces, while this one simulates the next.
+# Threads that summarize pieces, while this one simulates the next.
 THREADS = 2
 
 
@@ -215,7 +215,7 @@ def _bands(
     window: slice,
     watch: Callable[[int], None] = lambda _: None,
 ) -> Bands:
-    """Walk through a record and summarise the mixture over a window."""
+    """Walk through a record and summarize the mixture over a window."""
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(mixed.start.model))
@@ -229,7 +229,7 @@ def _bands(
 
     with ThreadPoolExecutor(THREADS) as executor:
         for first, simulated in _simulated(mixed.start, record.voltage, window):
-            work = executor.submit(_summarised, mixed, record, first, simulated)
+            work = executor.submit(_summarized, mixed, record, first, simulated)
             pending.append((first - window.start, work))
             totals += simulated.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
@@ -269,16 +269,16 @@ def _simulated(
         first += simulated.shape[1]
 
 
-def _summarised(
+def _summarized(
     mixed: _Draws, record: Record, first: int, simulated: FloatArray
 ) -> dict[str, Floating]:
-    """Mean, band edges, and the judgement of the readings, each (samples,)."""
+    """Mean, band edges, and the judgment of the readings, each (samples,)."""
     samples = simulated.shape[1]
     expected, carried = simulated, mixed.start.carried
     if carried is not None:
         expected = simulated + carried.means(first, samples)
     mean = np.mean(expected, axis=0)
-    summarised: dict[str, Floating] = {"mean": mean}
+    summarized: dict[str, Floating] = {"mean": mean}
     # About their mean, so that a single precision is one of the band's width.
     scores = mixed.scores.astype(np.float32)
     away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
@@ -288,12 +288,12 @@ def _summarised(
         ranked = mixture.ranked_values(means, sds, scores)
         for level in LEVELS:
             tail = (100 - level) / 200
-            summarised[f"{kind} {level} lower"] = mean + mixture.quantile(ranked, tail)
-            summarised[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
+            summarized[f"{kind} {level} lower"] = mean + mixture.quantile(ranked, tail)
+            summarized[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
         if kind == "sensor" and record.displacement is not None:
             reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
             z = (reading - means) / sds
-            summarised["pit"] = np.mean(ndtr(z), axis=0, dtype=np.float64)
-            summarised["crps"] = mixture.crps(ranked, reading)
-            summarised["log_score"] = mixture.log_density(z, sds)
-    return summarised
+            summarized["pit"] = np.mean(ndtr(z), axis=0, dtype=np.float64)
+            summarized["crps"] = mixture.crps(ranked, reading)
+            summarized["log_score"] = mixture.log_density(z, sds)
+    return summarized

@@ -40,7 +40,7 @@ STATISTICS: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range of the readings", "um"),
     "loop_area_um_V": ("Area of the loops", "um V"),
     "residual_sd_um": ("Sd of the residuals", "um"),
-    "residual_lag_1": ("Correlation of neighbouring residuals", "-"),
+    "residual_lag_1": ("Correlation of neighboring residuals", "-"),
     "residual_slow": (f"Power of the residuals below {SLOW:g} of the highest frequency", "-"),
     "residual_fast": (f"Power of the residuals above {MIDDLE:g} of the highest frequency", "-"),
     "pit_mean": ("Mean place in the band", "-"),
@@ -107,10 +107,10 @@ def replicated(
     sd = np.sqrt(np.mean(variance) + spread)
     voltage, samples = dataset.voltage[rows], int(rows[-1]) + 1
     # Where readings are missing they are missing in all.
-    neighbours = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
+    neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
 
     def looked_at(readings: FloatArray) -> FloatArray:
-        return _statistics(readings, voltage, middle, sd, neighbours)
+        return _statistics(readings, voltage, middle, sd, neighbors)
 
     pieces, noises_left = [], iter(noise)
     # Once more, rather than to keep them all.
@@ -164,14 +164,14 @@ def _statistics(
     voltage: FloatArray,
     middle: FloatArray,
     sd: FloatArray,
-    neighbours: IntArray,
+    neighbors: IntArray,
 ) -> FloatArray:
     """Work out all ``STATISTICS`` of readings (records, readings): (records, statistics)."""
     residual = readings - middle
-    centred = residual - np.mean(residual, axis=1, keepdims=True)
-    at = neighbours
-    total = np.sum(centred**2, axis=1)
-    lag = np.sum(centred[:, at] * centred[:, at + 1], axis=1)
+    centered = residual - np.mean(residual, axis=1, keepdims=True)
+    at = neighbors
+    total = np.sum(centered**2, axis=1)
+    lag = np.sum(centered[:, at] * centered[:, at + 1], axis=1)
     frequency, power = scipy.signal.periodogram(residual, detrend="constant")
     whole = np.sum(power, axis=1)
     place = frequency / frequency[-1]

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.results.bands import Bands, Kind
 
-__all__ = ["Z_90", "Standard", "standardised"]
+__all__ = ["Z_90", "Standard", "standardized"]
 
 # Half the width of a 90 % band, in sds.
 Z_90 = float(ndtri(0.95))
@@ -69,7 +69,7 @@ def _sd(bands: Bands, kind: Kind, judged: BoolArray) -> FloatArray:
     return sd
 
 
-def standardised(bands: Bands, judged: BoolArray, memory: float, unsure: float) -> Standard:
+def standardized(bands: Bands, judged: BoolArray, memory: float, unsure: float) -> Standard:
     """Take the residuals over their sd, and work out how many independent ones they are worth.
 
     With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in the

@@ -56,7 +56,7 @@ class Start:
     Parameters
     ----------
     from_rest
-        The actuator starts demagnetised and at rest: the voltage came from zero volts. Otherwise
+        The actuator starts demagnetized and at rest: the voltage came from zero volts. Otherwise
         h is a state that an earlier drive within the voltage range could have left, and the
         dynamics may be moving.
     own_offset

@@ -43,7 +43,7 @@ from bwbayes.results.departures import (
     size,
     too_wide,
 )
-from bwbayes.results.standard import Standard, standardised
+from bwbayes.results.standard import Standard, standardized
 from bwbayes.shown import brief
 
 __all__ = ["STATUSES", "Background", "Verdict", "assess"]
@@ -51,7 +51,7 @@ __all__ = ["STATUSES", "Background", "Verdict", "assess"]
 # Worth fewer independent readings than this a record cannot show that bands hold.
 FEWEST = 5.0
 
-# The quantile of the discrepancy's time that the judgement goes by: rather too long than too short.
+# The quantile of the discrepancy's time that the judgment goes by: rather too long than too short.
 LONG = 0.9
 
 # Part of the bands' variance that an offset from a lead-in of sufficient length has.
@@ -195,7 +195,7 @@ def assess(
     judged[: bands.scored_from] = False
     if not judged.any():
         return None
-    standard = standardised(bands, judged, background.memory, background.unsure)
+    standard = standardized(bands, judged, background.memory, background.unsure)
     chances = [
         *coverage(bands, judged, standard),
         *size(standard),

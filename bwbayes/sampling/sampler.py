@@ -6,10 +6,10 @@ draws for its last one. Where walkers take few of the places that it proposes, t
 each time with a new fit and twice as long, and with steps that go part of the way to such places: a
 long, curved posterior needs more draws to be seen whole, and walkers that spread. Pilot and tuning
 are thrown away. Then draws count, and the chain is judged
-(:mod:`bwbayes.sampling.diagnostics`), until two judgements in a row find nothing wrong, the first
+(:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row find nothing wrong, the first
 on half the draws that are to be reached, the second on all of them and a fifth more than the first
 at least; or the budget of steps is used up.
-To judge costs as much as many steps, so each judgement predicts how long the chain must become,
+To judge costs as much as many steps, so each judgment predicts how long the chain must become,
 and the next one waits until then, and until the chain is long against its autocorrelation times.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away

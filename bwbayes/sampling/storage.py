@@ -7,7 +7,7 @@ that was cut or changed on the disk the blocks before the damage are read. Going
 first copies what counts into a fresh one. This module alone knows the layout:
 
     /start, /pilot, /tuning, /sampling   coordinates, log_density, accepted, moves, random_state
-    /proposal/PHASE                      weights, centres, factors of the proposals; bend
+    /proposal/PHASE                      weights, centers, factors of the proposals; bend
     /point                               the point fit
     /committed                           blocks of each phase; proposals of each phase (0 or 1);
                                          blocks of the sampling that were set aside, and those

@@ -23,7 +23,7 @@ from bwbayes.report.figures import interactive, picture_of, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.loop import draw_loop
 from bwbayes.report.figures.series import _around_largest_error, draw_bands
-from bwbayes.report.figures.style import MEAN_COLOUR, envelope, zigzag
+from bwbayes.report.figures.style import MEAN_COLOR, envelope, zigzag
 from tests.app import example
 
 
@@ -168,7 +168,7 @@ def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
                 polygons = [np.asarray(corners) for corners in path.to_polygons()]
                 assert all(np.ptp(corners[:, 0]) < 1.01 for corners in polygons)
     whole = draw_loop([bands]).axes[0]
-    sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == MEAN_COLOUR]
+    sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == MEAN_COLOR]
     assert 2 == len(sizes)
     every = interactive._series(bands).references()
     times = [np.asarray(one.data["time"]) for one in every if isinstance(one, ColumnDataSource)]
@@ -186,7 +186,7 @@ def test_file_time_stands_beside_the_time_axis() -> None:
     )
 
 
-def test_ranks_of_independent_draws_keep_inside_the_grey_band() -> None:
+def test_ranks_of_independent_draws_keep_inside_the_gray_band() -> None:
     """Ninety-five percent of them, whatever the distribution."""
     ensembles, bins = 4, 20
     generator = np.random.default_rng(5)

@@ -94,7 +94,7 @@ def test_arrays_become_bands_in_five_lines(folder: Path, fit: Fit) -> None:
     assert bands.plot().axes
 
 
-def test_draws_and_summary_are_labelled_and_agree(fit: Fit) -> None:
+def test_draws_and_summary_are_labeled_and_agree(fit: Fit) -> None:
     assert ("chain", "draw") == tuple(fit.draws.sizes)
     table = fit.summary
     assert set(fit.draws.data_vars) == set(table.index)
@@ -345,7 +345,7 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
     assert "\n" not in str(error.value)
 
 
-def test_the_columns_of_a_file_are_recognised(
+def test_the_columns_of_a_file_are_recognized(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def created(*arguments: Any) -> None:

@@ -57,7 +57,7 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
     assert (False, "sign") == (result["holds"], result["cause"])
 
 
-def test_a_files_own_columns_are_recognised(run: Path, record: Record, tmp_path: Path) -> None:
+def test_a_files_own_columns_are_recognized(run: Path, record: Record, tmp_path: Path) -> None:
     """As by `bwbayes run`: a user's next file has the columns of the first."""
     assert record.displacement is not None
     rows = zip(1e3 * record.time, record.voltage, record.displacement, strict=True)

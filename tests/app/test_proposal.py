@@ -67,7 +67,7 @@ def proposed(path: Path, **units: str) -> ConfigProposal:
     return propose(path, path.parent, Naming(units=units))
 
 
-# What is recognised
+# What is recognized
 
 
 def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:

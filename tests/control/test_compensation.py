@@ -119,7 +119,7 @@ def covered_early(of: Problem, command: Compensation, truths: FloatArray) -> dic
 
 
 def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: Reference) -> None:
-    """The twin, which takes them to be demagnetised, is found."""
+    """The twin, which takes them to be demagnetized, is found."""
     of, source = problem(), np.random.default_rng(3)
     flat, truths = (about(of, 0.02, 400, source) for _ in range(2))
     flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.4

@@ -80,7 +80,7 @@ def test_a_mapping_that_is_wrong_is_one_line(
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".h5", ".mat"])
-def test_columns_are_recognised_where_none_are_said(tmp_path: Path, suffix: str) -> None:
+def test_columns_are_recognized_where_none_are_said(tmp_path: Path, suffix: str) -> None:
     """A unit is all that has to be said, and of a MATLAB file's, which have none, each."""
     units = UNIT | ({"time": "ms"} if suffix == ".mat" else {})
     path = write(tmp_path / f"a{suffix}")
@@ -89,7 +89,7 @@ def test_columns_are_recognised_where_none_are_said(tmp_path: Path, suffix: str)
         read_record(path)
 
 
-def test_a_column_that_is_recognised_by_its_unit_alone_is_named(tmp_path: Path) -> None:
+def test_a_column_that_is_recognized_by_its_unit_alone_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv")
     path.write_text(path.read_text().replace("pos", "displcement_nm").replace("U_mV", "u_mV"))
     with pytest.warns(InputWarning, match=r"taken by its unit: displacement is 'displcement_nm';"):
@@ -204,7 +204,7 @@ def test_a_unit_is_read_from_any_usual_name(one: tuple[str, str], form: str, wor
         (["Time", "Volt", "x"], None),
     ],
 )
-def test_columns_are_recognised(names: list[str], expected: list[str] | None) -> None:
+def test_columns_are_recognized(names: list[str], expected: list[str] | None) -> None:
     source = Source(Path("a"), tuple(Series(name, 9, lambda: np.arange(9.0)) for name in names))
     quantities = ("time", "voltage", "displacement")
     with warnings.catch_warnings():
@@ -278,7 +278,7 @@ def test_arrays_that_are_no_record_are_one_line(arrays: tuple[Any, Any], line: s
         Record.from_arrays(*arrays, interval=0.01)
 
 
-def test_a_tables_columns_and_index_are_recognised() -> None:
+def test_a_tables_columns_and_index_are_recognized() -> None:
     frame = pd.DataFrame(VALUES)
     assert_same(Record.from_pandas(frame, units=UNIT))
     assert_same(Record.from_pandas(frame.set_index("t [ms]"), units=UNIT))

@@ -194,7 +194,7 @@ def test_spikes_are_neither_edges_nor_turns() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("pairs", [False, True])
-def test_every_spike_counts_once_and_its_neighbours_do_not(seed: int, pairs: bool) -> None:
+def test_every_spike_counts_once_and_its_neighbors_do_not(seed: int, pairs: bool) -> None:
     """On a steep drive with little noise too, where a spike moves the medians beside it."""
     generator = np.random.default_rng(seed)
     time = np.arange(0, 12, 0.005)

@@ -48,7 +48,7 @@ def simulated(theta: FloatArray, samples: int, generator: np.random.Generator) -
 
 
 def decimal_log_density(theta: tuple[float, float, float], residual: FloatArray) -> float:
-    """Log density by a dense Cholesky factorisation with eighty digits."""
+    """Log density by a dense Cholesky factorization with eighty digits."""
     with localcontext() as context:
         context.prec = 80
         sensor, process, time = (Decimal(value) for value in theta)
@@ -186,7 +186,7 @@ def test_the_correlation_time_is_in_seconds() -> None:
 
 @pytest.mark.parametrize("kind", ["white", "discrepancy"])
 def test_rows_are_independent(kind: str) -> None:
-    """A model's density does not depend on its neighbours in the batch, bit for bit."""
+    """A model's density does not depend on its neighbors in the batch, bit for bit."""
     generator = np.random.default_rng(7)
     noise = noise_model("white" if kind == "white" else "discrepancy", 0.01)
     theta = np.exp(generator.normal(size=(8, len(noise.declarations))))

@@ -1,7 +1,7 @@
 """Where the posterior is known in closed form, the sampler's draws are draws from it.
 
 With the hysteresis' shape, the dynamics and the noise fixed, the displacement is linear in d and
-the offset; for an exponent of one and a demagnetised start it is linear in α as well, because h is
+the offset; for an exponent of one and a demagnetized start it is linear in α as well, because h is
 α times a path that does not depend on it. With normal priors the posterior is then normal: its
 precision is Gᵀ C⁻¹ G plus that of the prior, with G the model's columns (from the plain model in
 ``tests.reference``) and C the noise's dense covariance. Priors are about as wide as the likelihood,

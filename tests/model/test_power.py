@@ -30,7 +30,7 @@ def test_any_exponent_is_the_simulation(turns: list[float], exponent: float, par
     path = np.array([0.0, *turns])
     shape = {"alpha": 0.3575, "beta": beta, "gamma": part * beta, "exponent": exponent}
     expected = hysteresis(path, **shape)[0]
-    memory, made = step.demagnetised(), []
+    memory, made = step.demagnetized(), []
     for one in path:
         w, _, memory = step.go(memory, np.array([one]))
         made.append(0.7 * one - w[0])
@@ -40,7 +40,7 @@ def test_any_exponent_is_the_simulation(turns: list[float], exponent: float, par
 
 def test_the_slope_is_that_of_the_displacement() -> None:
     step = power(1.7)
-    _, _, memory = step.go(step.demagnetised(), np.array([60.0]))
+    _, _, memory = step.go(step.demagnetized(), np.array([60.0]))
     for voltage in (59.0, 20.0, -40.0, -90.0):
         here, near = (step.go(memory, np.array([voltage + part])) for part in (-1e-5, 1e-5))
         slope = step.go(memory, np.array([voltage])).slope
@@ -56,12 +56,12 @@ def test_at_the_ceiling_h_stays() -> None:
     assert w == pytest.approx(0.7 * 50 - top)
     assert slope == pytest.approx(0.7, abs=1e-12)
     # A jump of any size leads there.
-    assert step.go(step.demagnetised(), np.array([1e4])).memory[0, 1] == pytest.approx(top)
+    assert step.go(step.demagnetized(), np.array([1e4])).memory[0, 1] == pytest.approx(top)
 
 
 def test_without_rates_h_grows_with_the_voltage() -> None:
     step = power(2.0, 0.0, 0.0)
-    w, slope, _ = step.go(step.demagnetised(), np.array([80.0]))
+    w, slope, _ = step.go(step.demagnetized(), np.array([80.0]))
     assert w == pytest.approx((0.7 - 0.3575) * 80)
     assert slope == pytest.approx(0.7 - 0.3575)
     least, most = step.slopes(Span(-100.0, 100.0))

@@ -1,6 +1,6 @@
 """Runs in short: records of a simulated stand, fitted, predicted and judged as a run does it.
 
-The draws are those of a mixture around the point fit, weighted towards the posterior by
+The draws are those of a mixture around the point fit, weighted toward the posterior by
 Pareto-smoothed importance sampling (Vehtari et al., "Pareto smoothed importance sampling", 2024)
 and chosen again by their weights: a run in two seconds. All else is the run's own code.
 """

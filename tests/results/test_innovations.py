@@ -30,7 +30,7 @@ def test_innovations_of_the_right_model_raise_no_remark() -> None:
     assert alarms <= 4
 
 
-def coloured(white: FloatArray, _: Innovations) -> FloatArray:
+def colored(white: FloatArray, _: Innovations) -> FloatArray:
     return white + 0.3 * np.concatenate([[0.0], white[:-1]])
 
 
@@ -41,7 +41,7 @@ def rising(white: FloatArray, result: Innovations) -> FloatArray:
 @pytest.mark.parametrize(
     ("spoil", "part"),
     [
-        (coloured, "innovations 0.005 s apart correlate by 0."),
+        (colored, "innovations 0.005 s apart correlate by 0."),
         (rising, "SD where the voltage is rising"),
     ],
 )

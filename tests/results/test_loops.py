@@ -119,7 +119,7 @@ def test_symmetric_loop_of_bouc_wen_is_the_closed_form(
 
 
 def slow_plays(voltage: FloatArray, d: float, thresholds: Any, weights: Any) -> FloatArray:
-    """Sum plays sample by sample, from the demagnetised state."""
+    """Sum plays sample by sample, from the demagnetized state."""
     plays = [0.0 for _ in thresholds]
     result = []
     for u in voltage.tolist():

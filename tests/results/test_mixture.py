@@ -124,7 +124,7 @@ def test_without_sds_the_quantiles_are_those_of_the_draws(number: int) -> None:
     np.testing.assert_allclose([quantile(ranked, p) for p in LEVELS], expected, rtol=1e-12)
 
 
-def test_a_sample_does_not_depend_on_its_neighbours() -> None:
+def test_a_sample_does_not_depend_on_its_neighbors() -> None:
     means, sds = draws("sds along the record")
     scores = stratified_scores(len(means), random())
     together = ranked_values(means, sds, scores)

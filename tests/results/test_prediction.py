@@ -92,9 +92,9 @@ def posterior(record: Record) -> Posterior:
 def draws(posterior: Posterior) -> FloatArray:
     """Draws around the truth, a few per cent wide: stand-ins for a posterior's."""
     generator = np.random.default_rng(1)
-    centre = np.array([TRUTH[name] for name in posterior.names])
-    wide = 0.03 * np.abs(centre) + np.where(centre == 0, 0.1, 0.0)
-    return centre + wide * generator.standard_normal((300, centre.size))
+    center = np.array([TRUTH[name] for name in posterior.names])
+    wide = 0.03 * np.abs(center) + np.where(center == 0, 0.1, 0.0)
+    return center + wide * generator.standard_normal((300, center.size))
 
 
 def predicted(
@@ -211,11 +211,11 @@ def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
     model[:, offset] = 0.0
     clean = posterior.only.actuator.displacement(model, record.voltage)[0]
     residual = record.displacement[rows] - clean[rows]
-    centre = np.array([np.mean(record.displacement[rows]), 0.0])
+    center = np.array([np.mean(record.displacement[rows]), 0.0])
     inverse = np.linalg.inv(noise)
     precision = np.diag(np.array(wide) ** -2.0) + response @ inverse @ response.T
     covariance = np.linalg.inv(precision)
-    mean = centre + covariance @ response @ inverse @ (residual - centre @ response)
+    mean = center + covariance @ response @ inverse @ (residual - center @ response)
     got = begun.model[near, offset].mean(), begun.unrest[near, 0].mean()
     spread = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(mean, got, atol=0.1 * spread.max())
@@ -244,14 +244,14 @@ def test_unrest_is_part_of_the_simulation(posterior: Posterior, draws: FloatArra
 def test_the_state_is_that_of_a_fine_grid_whatever_the_seed(posterior: Posterior) -> None:
     """Mean and sd of the hysteretic state against 8,000 states of running drives, three seeds."""
     record = made(start=0.7)
-    centre = np.array([TRUTH[name] for name in posterior.names])
-    same = np.tile(centre, (2000, 1))
+    center = np.array([TRUTH[name] for name in posterior.names])
+    same = np.tile(center, (2000, 1))
     begun = [start_of(posterior, same, record, Start(lead_in=1.0), seed) for seed in range(3)]
     states = [initial(posterior, one) for one in begun]
     window = Start(lead_in=1.0).window(record)
     assert window is not None
     assert record.displacement is not None
-    theta = np.tile(posterior.prior.theta(centre[np.newaxis]), (8000, 1))
+    theta = np.tile(posterior.prior.theta(center[np.newaxis]), (8000, 1))
     every = np.concatenate([record.voltage, posterior.only.voltage])
     nodes = left_by_running_drives(TRUTH, float(record.voltage[0]), every, len(theta))
     theta[:, posterior.prior.names.index("initial")] = nodes

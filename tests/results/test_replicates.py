@@ -223,7 +223,7 @@ def test_a_planned_voltage_is_predicted_without_its_readings() -> None:
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:
-    """As the likelihood takes it: over 200 records, neighbours on a border are correlated too.
+    """As the likelihood takes it: over 200 records, neighbors on a border are correlated too.
 
     Less than those in a window only because correlation times that the prior draws differ.
     """

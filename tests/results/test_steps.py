@@ -114,7 +114,7 @@ def test_a_gain_counts_from_the_displacement_before_the_step() -> None:
 
 
 @pytest.mark.parametrize("name", ["step10", "step50", "step100"])
-def test_the_papers_steps_are_recognised(name: str) -> None:
+def test_the_papers_steps_are_recognized(name: str) -> None:
     _, voltage = signal(name).sample(100)
     step = step_of(Record(voltage, None, INTERVAL))
     assert step is not None

@@ -34,9 +34,9 @@ STANDARD = JointPrior(
 def normal_posterior(mean: float, sd: float, draws: int = 40_000) -> FloatArray:
     """Draw (draws, 2) from prior N(0, 1) times likelihood N(x; mean, sd), in each column."""
     precision = 1 + 1 / sd**2
-    centre = mean / sd**2 / precision
+    center = mean / sd**2 / precision
     generator = np.random.default_rng(1)
-    made: FloatArray = centre + generator.standard_normal((draws, 2)) / np.sqrt(precision)
+    made: FloatArray = center + generator.standard_normal((draws, 2)) / np.sqrt(precision)
     return made
 
 

@@ -107,7 +107,7 @@ def improper_tails(x: FloatArray) -> FloatArray:
 
 
 def improper_peak(x: FloatArray) -> FloatArray:
-    """Grows without limit towards the origin, and has no integral there."""
+    """Grows without limit toward the origin, and has no integral there."""
     density: FloatArray = -6 * np.log(np.linalg.norm(x, axis=1))
     return density
 

@@ -24,7 +24,7 @@ __all__ = ["predict"]
 @click.option("--record", type=FILE, help="A record to predict; measured or a voltage alone.")
 @naming_options
 @click.option("--signal", "waveform", help="A signal to predict instead, by its name.")
-@click.option("--from-rest", is_flag=True, help="The record starts from a demagnetised actuator.")
+@click.option("--from-rest", is_flag=True, help="The record starts from a demagnetized actuator.")
 @click.option(
     "--lead-in",
     type=float,

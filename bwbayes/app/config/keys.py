@@ -241,7 +241,7 @@ def toml_value(value: object) -> str:
 def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     """Say the first thing that is wrong with a config: where, what, what to do."""
     errors = error.errors()
-    # Unknown keys first: a misspelt key is often why another one seems to be missing. Then the
+    # Unknown keys first: a misspelled key is often why another one seems to be missing. Then the
     # deepest place: the branch of a union that the user meant.
     first = min(errors, key=lambda e: (e["type"] != "extra_forbidden", -len(e["loc"])))
     names = [str(name) for name in first["loc"] if not _is_branch(str(name))]

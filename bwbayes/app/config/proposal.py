@@ -206,7 +206,7 @@ def _start(record: Record) -> list[str]:
     if away:
         return [f"# from_rest = false  # it starts {state}: its history is unknown, and estimated"]
     return [
-        f"# from_rest = true  # it starts {state}; say so if the actuator was demagnetised and "
+        f"# from_rest = true  # it starts {state}; say so if the actuator was demagnetized and "
         "nothing moved"
     ]
 

@@ -118,7 +118,7 @@ class RecordConfig(_Source):
     """
 
     from_rest: bool = key(False, example="true")
-    """Whether the record starts at rest, demagnetised."""
+    """Whether the record starts at rest, demagnetized."""
     continues: Name | None = key(None, example='"first"')
     """Of several records, the one that this one goes on from at once: state, offset and discrepancy
     carry over, and the two are fitted as one record of that name.
@@ -189,7 +189,7 @@ class ModelConfig(ActuatorConfig):
     shared: Texts = key([], example='["offset"]')
     """Of initial and offset, what all of several records share."""
     outliers: bool = key(False, example="true")
-    """Whether readings far from what their neighbours predict are set aside."""
+    """Whether readings far from what their neighbors predict are set aside."""
 
 
 class StandModelConfig(ActuatorConfig):
@@ -276,7 +276,7 @@ class ValidationConfig(_Source):
     record takes where nothing tells its own; by default the first.
     """
     from_rest: bool = key(False, example="true")
-    """Whether another record starts at rest, demagnetised."""
+    """Whether another record starts at rest, demagnetized."""
     own_offset: bool = key(True, example="false")
     """Whether the sensor may have been set to zero again before another record."""
     lead_in: Positive | None = key(None, unit="s", example="2.0")

@@ -39,7 +39,7 @@ def fit(
     Parameters
     ----------
     record
-        The training record, or its file, whose columns are recognised unless ``columns`` says them.
+        The training record, or its file, whose columns are recognized unless ``columns`` says them.
         Several records of one actuator are fitted jointly: a list of them, or a dict by name, in
         which a record may be a dict of the keys of [record.NAME], with ``record`` the record
         itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
@@ -67,7 +67,7 @@ def fit(
     Raises
     ------
     InputError
-        A misspelt key, a record that cannot be used, a folder that exists.
+        A misspelled key, a record that cannot be used, a folder that exists.
 
     Warns
     -----

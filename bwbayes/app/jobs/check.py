@@ -36,10 +36,10 @@ __all__ = ["check"]
 CAPTIONS = {
     "time": (
         "Along time",
-        "Voltage and displacement. Grey: readings that are not fitted; coloured: the parts of the "
+        "Voltage and displacement. Gray: readings that are not fitted; colored: the parts of the "
         "record with which something is wrong.",
     ),
-    "loop": ("Hysteresis loop", "Displacement against voltage, coloured by time."),
+    "loop": ("Hysteresis loop", "Displacement against voltage, colored by time."),
     "drive": ("Spectrum of the drive", "Amplitude of the voltage at each frequency."),
 }
 

@@ -181,7 +181,7 @@ def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Par
     return Parameter(
         name,
         stated.unit or unit,
-        stated.label or labelled(declared.label, record),
+        stated.label or labeled(declared.label, record),
         stated.description or declared.description + (f" of {record}" if record else ""),
         prior,
         fixed,
@@ -192,7 +192,7 @@ def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Par
     )
 
 
-def labelled(label: str, record: str) -> str:
+def labeled(label: str, record: str) -> str:
     """Return a label in LaTeX with the name of its record, if it has one, above."""
     return rf"{label}^{{\mathrm{{{record.replace('_', chr(92) + '_')}}}}}" if record else label
 

@@ -157,7 +157,7 @@ class CampaignResult:
         picture = Picture(
             "parameters",
             "Parameters side by side",
-            "Median and 95 % interval of every record that has converged: grey, by itself; blue, "
+            "Median and 95 % interval of every record that has converged: gray, by itself; blue, "
             "with the population for a prior; red, if it lies off the population that all others "
             "show. Line and band: the population's middle, and where 95 % of specimens not "
             "measured yet lie.",

@@ -1,7 +1,7 @@
 """Bouc-Wen hysteresis whose loops need not be symmetric.
 
 How fast h settles may depend on the signs of the voltage, of its rate and of h, as in the
-generalised Bouc-Wen model of Song and Der Kiureghian. Between the places where one of them changes
+generalized Bouc-Wen model of Song and Der Kiureghian. Between the places where one of them changes
 its sign, that is plain Bouc-Wen hysteresis with a β and a γ of its own; the places are known in
 closed form, so it is as exact.
 """
@@ -51,7 +51,7 @@ SLACK = 1e-12
 
 @dataclass(frozen=True)
 class BoucWenAsymmetric(OneState):
-    """Generalised Bouc-Wen hysteresis with n = 1, w = d u − h, exact.
+    """Generalized Bouc-Wen hysteresis with n = 1, w = d u − h, exact.
 
     The hysteretic displacement h in um follows the voltage u in V by
 

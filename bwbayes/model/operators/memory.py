@@ -57,7 +57,7 @@ class Extremum(NamedTuple):
 class Memory:
     """Where a path stands, ``voltage``, V, and ``displacement`` (models,), um, and what it keeps.
 
-    ``extrema`` are those that still count; the first is the demagnetised state at zero volts.
+    ``extrema`` are those that still count; the first is the demagnetized state at zero volts.
     ``direction`` is the one in which the path left the last of them, zero if it did not move yet.
     """
 
@@ -75,11 +75,11 @@ class RemembersExtrema(Operator):
         w = w_r ± E(u_r, u),
 
     with the upper sign for a rising voltage. E is the operator's Everett function; it has a factor
-    of two in it that other authors write before it. The path from the demagnetised state on, where
+    of two in it that other authors write before it. The path from the demagnetized state on, where
     |u| is larger than ever before, is w = ± E(−|u|, |u|) / 2 if the operator is odd.
 
     The state before a record is one number in each model, ``initial``, from −1 to 1: an earlier
-    drive went from the demagnetised state to the span's highest voltage u₊, to its lowest, up to
+    drive went from the demagnetized state to the span's highest voltage u₊, to its lowest, up to
     m = u₀ + (initial + 1) / 2 (u₊ − u₀), and down to the record's first voltage u₀. So −1 is the
     ascending branch and 1 the descending one, and w at u₀ rises with ``initial`` from one to the
     other.
@@ -126,7 +126,7 @@ class RemembersExtrema(Operator):
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:
         """Return the memory at a record's first voltage.
 
-        From rest the voltage came straight from zero volts, where the actuator was demagnetised,
+        From rest the voltage came straight from zero volts, where the actuator was demagnetized,
         and ``initial`` does not count. A first voltage outside of the span widens it.
         """
         nothing = np.zeros(column[INITIAL.name].size)

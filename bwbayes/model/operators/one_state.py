@@ -170,7 +170,7 @@ def below_d(column: Values) -> BoolArray:
 
 
 def beta(scale: float = 1.0, bounds: Bounds | None = None) -> Declaration:
-    """Declare β, near 1/U or a ``scale`` of it, where other parameters' bounds favour a large β."""
+    """Declare β, near 1/U or a ``scale`` of it, where other parameters' bounds favor a large β."""
     return Declaration(
         "beta",
         "1/V",

@@ -62,7 +62,7 @@ class PrandtlIshlinskii(RemembersExtrema):
 
         w = d u + ∫ (α / r₀) exp(−r / r₀) z_r dr
 
-    with z_r the play of threshold r, V. The curve from the demagnetised state on is w = ± Φ(|u|),
+    with z_r the play of threshold r, V. The curve from the demagnetized state on is w = ± Φ(|u|),
 
         Φ(x) = (d + α) x − α r₀ (1 − exp(−x / r₀)),
 
@@ -226,7 +226,7 @@ class PlaysStep(HysteresisStep):
             after[j] = play
         return w, slope
 
-    def demagnetised(self) -> FloatArray:
+    def demagnetized(self) -> FloatArray:
         """Return all plays at zero, (models, plays)."""
         return np.zeros_like(self.weights)
 
@@ -244,8 +244,8 @@ class PlaysStep(HysteresisStep):
         return self._led(high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage)
 
     def _led(self, *ends: float | FloatArray) -> FloatArray:
-        """Return where a voltage that goes to each of its ends leaves demagnetised plays."""
-        plays = self.demagnetised()
+        """Return where a voltage that goes to each of its ends leaves demagnetized plays."""
+        plays = self.demagnetized()
         for voltage in ends:
             plays = self.go(plays, np.broadcast_to(voltage, self.slope.shape)).memory
         return plays

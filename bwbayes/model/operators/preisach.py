@@ -2,7 +2,7 @@
 
 A relay switches up at one voltage and down at a lower one. Here the density of relays is a product
 of two bells, one over each of the switching voltages, so that loops are wide about zero volts and
-narrow towards saturation. Loops between the same two voltages are alike, as in every Preisach
+narrow toward saturation. Loops between the same two voltages are alike, as in every Preisach
 model; loops of the same size at another mean voltage are not, unlike in Prandtl-Ishlinskii.
 """
 
@@ -52,7 +52,7 @@ DENSITY = (
 
 @dataclass(frozen=True)
 class Preisach(RemembersExtrema):
-    """Relays with a density that factorises, and a reversible part d u.
+    """Relays with a density that factorizes, and a reversible part d u.
 
     The density of relays over the voltages a and b ≤ a at which they switch up and down is
 
@@ -63,7 +63,7 @@ class Preisach(RemembersExtrema):
         w = w_r ± E(u_r, u),   E = d |u − u_r| + (α_R / 2) (F(u) − F(u_r))²
 
     with w in um, voltages in V, d in um/V, α_R in um/V². Where u_s is far beyond the drive this is
-    Rayleigh's law, with α_R as its coefficient. It is odd: from the demagnetised state w = d u ±
+    Rayleigh's law, with α_R as its coefficient. It is odd: from the demagnetized state w = d u ±
     α_R F(u)².
 
     Sources: F. Preisach, Z. Phys. 94 (1935) 277-302; I. D. Mayergoyz, Mathematical Models of

@@ -133,7 +133,7 @@ def save_pictures(pictures: Mapping[str, bytes], folder: Path) -> None:
 def _png(figure: Figure) -> bytes:
     """Return a figure as PNG, laid out and drawn once: ``savefig`` does either twice.
 
-    Of its thousands of colours, nearly all from smooth edges, it keeps those that come nearest to
+    Of its thousands of colors, nearly all from smooth edges, it keeps those that come nearest to
     all: nobody sees the difference, and the file has a third of the size.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415

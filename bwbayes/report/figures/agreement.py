@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, MEAN_COLOUR
+from bwbayes.report.figures.style import COLORS, MEAN_COLOR
 from bwbayes.results.agreement import Agreement
 
 __all__ = ["draw_agreement"]
@@ -18,14 +18,14 @@ def draw_agreement(agreements: Mapping[str, Agreement]) -> Figure:
     figure = Figure(figsize=(11, 0.9 + 1.9 * len(agreements)), layout="constrained")
     panels = figure.subplots(len(agreements), 1, squeeze=False)[:, 0]
     for panel, (name, agreement) in zip(panels, agreements.items(), strict=True):
-        for values, colour, label in (
-            (agreement.joint, COLOURS[0], f"joint fit: {agreement.joint_um:.3g} µm rms"),
-            (agreement.own, COLOURS[1], f"own fit: {agreement.own_um:.3g} µm rms"),
+        for values, color, label in (
+            (agreement.joint, COLORS[0], f"joint fit: {agreement.joint_um:.3g} µm rms"),
+            (agreement.own, COLORS[1], f"own fit: {agreement.own_um:.3g} µm rms"),
         ):
             panel.plot(
-                agreement.time, values, ".", color=colour, ms=2, mew=0, alpha=0.7, label=label
+                agreement.time, values, ".", color=color, ms=2, mew=0, alpha=0.7, label=label
             )
-        panel.axhline(0, color=MEAN_COLOUR, lw=0.8)
+        panel.axhline(0, color=MEAN_COLOR, lw=0.8)
         verdict = "DOES NOT AGREE" if agreement.disagrees else "agrees"
         distance = f"chi-square {agreement.distance:.3g} of {agreement.degrees:.3g}"
         panel.set_title(

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
-from bwbayes.report.figures.style import COLOURS, axis_label, hide_unused, share_legend
+from bwbayes.report.figures.style import COLORS, axis_label, hide_unused, share_legend
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import LIMIT, LIMITS, Calibration
 from bwbayes.results.replicates import EXTRA
@@ -20,8 +20,8 @@ __all__ = ["draw_coverage", "draw_ecdf", "draw_histograms"]
 RANK_BINS = 20
 COLUMNS = 4
 
-EVEN_COLOUR = "#dddddd"
-NOMINAL_COLOUR = "#777777"
+EVEN_COLOR = "#dddddd"
+NOMINAL_COLOR = "#777777"
 
 # What is ranked besides parameters.
 EXTRA_LABELS = dict(
@@ -32,7 +32,7 @@ EXTRA_LABELS = dict(
 def draw_histograms(calibration: Calibration) -> Figure:
     """Draw how the ranks of each statistic are spread, over what is expected.
 
-    The grey band holds each bar of an even statistic with a probability of 99 %.
+    The gray band holds each bar of an even statistic with a probability of 99 %.
     """
     labels = _labels(calibration)
     count = calibration.positions.shape[0]
@@ -41,9 +41,9 @@ def draw_histograms(calibration: Calibration) -> Figure:
     for panel, column in zip(panels, calibration.positions.T, strict=True):
         heights, edges = np.histogram(column, RANK_BINS, range=(0, 1))
         scale = RANK_BINS / count
-        panel.axhspan(low * scale, high * scale, color=EVEN_COLOUR, lw=0, label="99 % of even bars")
-        panel.axhline(1.0, color=NOMINAL_COLOUR, lw=0.8)
-        panel.stairs(heights * scale, 100 * edges, color=COLOURS[0], lw=1.2, label="replicates")
+        panel.axhspan(low * scale, high * scale, color=EVEN_COLOR, lw=0, label="99 % of even bars")
+        panel.axhline(1.0, color=NOMINAL_COLOR, lw=0.8)
+        panel.stairs(heights * scale, 100 * edges, color=COLORS[0], lw=1.2, label="replicates")
     panels[0].set_ylim(bottom=0)
     share_legend(figure)
     return figure
@@ -59,13 +59,13 @@ def draw_ecdf(calibration: Calibration) -> Figure:
     lower, upper = (100 * _closed(edge - band.points, 0, 0) for edge in (band.lower, band.upper))
     for i, (panel, ranks) in enumerate(zip(panels, calibration.statistics.values(), strict=True)):
         panel.fill_between(
-            100 * at, lower, upper, color=EVEN_COLOUR, lw=0, label="simultaneous band"
+            100 * at, lower, upper, color=EVEN_COLOR, lw=0, label="simultaneous band"
         )
-        panel.axhline(0.0, color=NOMINAL_COLOUR, lw=0.8)
+        panel.axhline(0.0, color=NOMINAL_COLOR, lw=0.8)
         panel.plot(
             100 * at,
             100 * _closed(ecdf[:, i] - band.points, 0, 0),
-            color=COLOURS[1] if ranks.outside else COLOURS[0],
+            color=COLORS[1] if ranks.outside else COLORS[0],
             label="leaves the band" if ranks.outside else "replicates",
         )
         panel.text(
@@ -94,10 +94,10 @@ def _draw_intervals(panel: Axes, calibration: Calibration, labels: Sequence[str]
     rows = np.arange(len(labels))
     for i, level in enumerate(LEVELS):
         low, high = calibration.limits[level]
-        panel.axvspan(100 * low, 100 * high, color=COLOURS[i], alpha=0.13, lw=0)
-        panel.axvline(level, color=COLOURS[i], lw=0.8, ls="--")
+        panel.axvspan(100 * low, 100 * high, color=COLORS[i], alpha=0.13, lw=0)
+        panel.axvline(level, color=COLORS[i], lw=0.8, ls="--")
         covered = [100 * ranks.covered[level] for ranks in calibration.statistics.values()]
-        panel.plot(covered, rows, "o", color=COLOURS[i], ms=4.5, label=f"{level} %")
+        panel.plot(covered, rows, "o", color=COLORS[i], ms=4.5, label=f"{level} %")
     panel.set_yticks(rows, labels)
     panel.invert_yaxis()
     panel.set_xlabel("truths inside the interval (%)")
@@ -120,9 +120,9 @@ def _draw_bands(panel: Axes, calibration: Calibration, other: str) -> None:
         )
         x = np.arange(len(LEVELS)) + 0.15 * (i - 1)
         panel.errorbar(
-            x, off, error, fmt="os^"[i], ms=5, capsize=3, color=COLOURS[i], label=f"{kind} band"
+            x, off, error, fmt="os^"[i], ms=5, capsize=3, color=COLORS[i], label=f"{kind} band"
         )
-    panel.axhline(0.0, color=NOMINAL_COLOUR, lw=0.8, ls="--")
+    panel.axhline(0.0, color=NOMINAL_COLOR, lw=0.8, ls="--")
     panel.set_xticks(range(len(LEVELS)), [f"{level} %" for level in LEVELS])
     panel.set_xlabel("nominal coverage (%)")
     panel.set_ylabel("measured less nominal coverage (%)")

@@ -8,13 +8,13 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import BAND_COLOURS, COLOURS, hide_unused, plain
+from bwbayes.report.figures.style import BAND_COLORS, COLORS, hide_unused, plain
 
 __all__ = ["Interval", "ParameterPanel", "draw_parameters"]
 
 COLUMNS = 3
 
-ALONE_COLOUR = "#999999"
+ALONE_COLOR = "#999999"
 
 
 class Interval(NamedTuple):
@@ -42,7 +42,7 @@ class ParameterPanel(NamedTuple):
 def draw_parameters(records: Sequence[str], parameters: Sequence[ParameterPanel]) -> Figure:
     """Draw a panel for each parameter: the records' 95 % intervals in the order of their names.
 
-    Grey alone and blue with the population for a prior, the population's median and where 95 % of
+    Gray alone and blue with the population for a prior, the population's median and where 95 % of
     specimens not measured yet lie. Outliers are red.
     """
     lines = -(-len(parameters) // COLUMNS)
@@ -63,15 +63,15 @@ def draw_parameters(records: Sequence[str], parameters: Sequence[ParameterPanel]
 def _draw_parameter(panel: Axes, records: Sequence[str], parameter: ParameterPanel) -> None:
     if parameter.specimen is not None:
         low, median, high, _ = parameter.specimen
-        panel.axhspan(low, high, color=BAND_COLOURS["sensor"], zorder=0)
-        panel.axhline(median, color=COLOURS[0], lw=0.8, zorder=1)
+        panel.axhspan(low, high, color=BAND_COLORS["sensor"], zorder=0)
+        panel.axhline(median, color=COLORS[0], lw=0.8, zorder=1)
     for x, name in enumerate(records, start=1):
         alone, shrunk = parameter.alone.get(name), parameter.shrunk.get(name)
         if alone is not None:
-            panel.vlines(x, alone.lower, alone.upper, color=ALONE_COLOUR, lw=0.8)
+            panel.vlines(x, alone.lower, alone.upper, color=ALONE_COLOR, lw=0.8)
         if shrunk is not None:
-            colour = COLOURS[1] if shrunk.outlier else COLOURS[0]
-            panel.vlines(x + 0.25, shrunk.lower, shrunk.upper, color=colour, lw=1.4)
-            panel.plot(x + 0.25, shrunk.median, "o", color=colour, ms=2.5)
+            color = COLORS[1] if shrunk.outlier else COLORS[0]
+            panel.vlines(x + 0.25, shrunk.lower, shrunk.upper, color=color, lw=1.4)
+            panel.plot(x + 0.25, shrunk.median, "o", color=color, ms=2.5)
         elif alone is not None:
-            panel.plot(x, alone.median, ".", color=ALONE_COLOUR, ms=3)
+            panel.plot(x, alone.median, ".", color=ALONE_COLOR, ms=3)

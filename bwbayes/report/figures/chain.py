@@ -12,8 +12,8 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.report.figures.style import (
-    COLOURS,
-    TRUTH_COLOUR,
+    COLORS,
+    TRUTH_COLOR,
     axis_label,
     hide_unused,
     share_legend,
@@ -60,7 +60,7 @@ def draw_corner(result: Result) -> Figure:
         if row == column:
             low, high = ranges[row]
             bins = np.linspace(low, high, CORNER_BINS + 1).tolist()
-            heights = panel.hist(flat[:, row], bins, histtype="step", color=COLOURS[0])[0]
+            heights = panel.hist(flat[:, row], bins, histtype="step", color=COLORS[0])[0]
             panel.set(xlim=ranges[row], ylim=(0, 1.1 * np.max(heights)))
         else:
             corner.hist2d(
@@ -69,7 +69,7 @@ def draw_corner(result: Result) -> Figure:
                 bins=CORNER_BINS,
                 range=[ranges[column], ranges[row]],
                 levels=(0.5, 0.9),
-                color=COLOURS[0],
+                color=COLORS[0],
                 smooth=0.8,
                 plot_density=False,
                 fill_contours=True,
@@ -108,9 +108,9 @@ def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
 def _mark_truth(panel: Axes, across: float | None, upright: float | None) -> None:
     """Draw the true values that are known."""
     if across is not None:
-        panel.axvline(across, color=TRUTH_COLOUR)
+        panel.axvline(across, color=TRUTH_COLOR)
     if upright is not None:
-        panel.axhline(upright, color=TRUTH_COLOUR)
+        panel.axhline(upright, color=TRUTH_COLOR)
 
 
 def draw_trace(result: Result) -> Figure:
@@ -132,11 +132,11 @@ def draw_trace(result: Result) -> Figure:
         panel.tick_params(labelbottom=bool(panel.get_xlabel()))
         panel.set_ylabel(names[i])
         for ensemble in range(series.shape[1]):
-            colour = COLOURS[ensemble % len(COLOURS)]
+            color = COLORS[ensemble % len(COLORS)]
             edges = (low[:, ensemble, i], high[:, ensemble, i])
-            panel.fill_between(ends + 1, *edges, color=colour, alpha=0.15, lw=0, step="post")
+            panel.fill_between(ends + 1, *edges, color=color, alpha=0.15, lw=0, step="post")
             panel.plot(
-                steps + 1, mean[:, ensemble, i], color=colour, label=f"ensemble {ensemble + 1}"
+                steps + 1, mean[:, ensemble, i], color=color, label=f"ensemble {ensemble + 1}"
             )
     share_legend(figure)
     return figure
@@ -161,7 +161,7 @@ def draw_ranks(result: Result) -> Figure:
     """Draw, for each parameter, how the ranks of each ensemble's draws among all are spread.
 
     Ensembles that draw from the same distribution have ranks that are spread evenly: each line
-    stays near one, 19 times out of 20 inside the grey band. The band is what independent draws
+    stays near one, 19 times out of 20 inside the gray band. The band is what independent draws
     show, one for each autocorrelation time τ of each walker: with n draws of E ensembles in B bins
     its half width is 1.96 √((B − 1)(E − 1) τ/n).
     """
@@ -185,7 +185,7 @@ def draw_ranks(result: Result) -> Figure:
                 heights,
                 np.linspace(0, 100, RANK_BINS + 1),
                 baseline=None,
-                color=COLOURS[ensemble % len(COLOURS)],
+                color=COLORS[ensemble % len(COLORS)],
                 lw=1.2,
                 label=f"ensemble {ensemble + 1}",
             )

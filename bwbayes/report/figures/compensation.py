@@ -12,9 +12,9 @@ from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, N
 
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures.style import (
-    BAND_COLOURS,
-    COLOURS,
-    MEAN_COLOUR,
+    BAND_COLORS,
+    COLORS,
+    MEAN_COLOR,
     envelope,
     plain,
     share_legend,
@@ -24,8 +24,8 @@ from bwbayes.results.bands import Bands, Kind
 
 __all__ = ["Command", "draw_error", "draw_loops", "draw_tracking"]
 
-COLOUR_OF = {"uncompensated": COLOURS[3], "compensated": MEAN_COLOUR}
-REFERENCE_COLOUR = "#222222"
+COLOR_OF = {"uncompensated": COLORS[3], "compensated": MEAN_COLOR}
+REFERENCE_COLOR = "#222222"
 BAND_OF: Mapping[Kind, str] = {
     "displacement": "95 % displacement",
     "parameter": "95 % parameters alone",
@@ -65,12 +65,12 @@ def draw_tracking(
     time = _time(bands)
     _ribbon(center, bands, 0.0)
     for label, command in commands.items():
-        color = COLOUR_OF[label]
+        color = COLOR_OF[label]
         top.plot(*zigzag(time, command.voltage), color=color, label=label)
         center.plot(*zigzag(time, command.bands.mean), color=color, label=label)
     top.set_ylabel("voltage (V)")
     top.set_title(plain(f"command for {name}"))
-    center.plot(*zigzag(time, reference), "--", color=REFERENCE_COLOUR, label="reference")
+    center.plot(*zigzag(time, reference), "--", color=REFERENCE_COLOR, label="reference")
     center.set_ylabel("displacement (µm)")
     _errors(below, reference, commands, limit)
     share_legend(figure, ncols=5)
@@ -87,7 +87,7 @@ def draw_error(reference: FloatArray, commands: Commands, limit: float | None) -
     low = max(float(rms.min()), 1e-9)
     bins = np.geomspace(low, max(float(rms.max()), 1.1 * low), 61)
     for label, command in commands.items():
-        spread.hist(command.rms, bins=bins, color=COLOUR_OF[label], alpha=0.6, label=label)
+        spread.hist(command.rms, bins=bins, color=COLOR_OF[label], alpha=0.6, label=label)
     spread.set_xlabel("rms of the error (µm)")
     spread.set_ylabel("draws")
     spread.set_xscale("log")
@@ -112,8 +112,8 @@ def draw_loops(reference: FloatArray, commands: Commands) -> Figure:
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for panel, (label, command) in zip(panels, commands.items(), strict=True):
         ends = [float(reference.min()), float(reference.max())]
-        panel.plot(ends, ends, "--", color=REFERENCE_COLOUR, label="reference")
-        panel.plot(reference, command.bands.mean, color=MEAN_COLOUR, label="predicted")
+        panel.plot(ends, ends, "--", color=REFERENCE_COLOR, label="reference")
+        panel.plot(reference, command.bands.mean, color=MEAN_COLOR, label="predicted")
         panel.set_title(label)
         panel.set_xlabel("reference (µm)")
         panel.legend(fontsize=8)
@@ -126,10 +126,10 @@ def _errors(panel: Axes, reference: FloatArray, commands: Commands, limit: float
     _ribbon(panel, bands, reference)
     for label, command in commands.items():
         error = command.bands.mean - reference
-        panel.plot(*zigzag(_time(bands), error), color=COLOUR_OF[label], label=label)
+        panel.plot(*zigzag(_time(bands), error), color=COLOR_OF[label], label=label)
     if limit is not None:
         for side in (-limit, limit):
-            panel.axhline(side, color=REFERENCE_COLOUR, lw=0.8, ls=":")
+            panel.axhline(side, color=REFERENCE_COLOR, lw=0.8, ls=":")
     panel.set_xlabel("time (s)")
     panel.set_ylabel("error (µm)")
 
@@ -139,7 +139,7 @@ def _ribbon(panel: Axes, bands: Bands, about: float | FloatArray) -> None:
     for kind, label in BAND_OF.items():
         edges = (bands.lower[kind, 95] - about, bands.upper[kind, 95] - about)
         drawn = envelope(_time(bands), *edges)
-        panel.fill_between(*drawn, fc=BAND_COLOURS[kind], lw=0, label=label)
+        panel.fill_between(*drawn, fc=BAND_COLORS[kind], lw=0, label=label)
 
 
 def _time(bands: Bands) -> FloatArray:

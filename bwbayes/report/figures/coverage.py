@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, plain, title
+from bwbayes.report.figures.style import COLORS, plain, title
 from bwbayes.results.bands import LEVELS, Bands
 from bwbayes.results.scores import Scores
 
@@ -32,12 +32,12 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     nominal, pit = figure.subplots(1, 2)
     _draw_nominal(nominal)
     for i, bands in enumerate(judged):
-        colour = COLOURS[i % len(COLOURS)]
+        color = COLORS[i % len(COLORS)]
         _draw_measured(
-            nominal, scores[bands.name], plain(title(bands)), colour, i - (len(judged) - 1) / 2
+            nominal, scores[bands.name], plain(title(bands)), color, i - (len(judged) - 1) / 2
         )
         if bands.pit is not None:
-            _draw_pit(pit, bands, colour)
+            _draw_pit(pit, bands, color)
     nominal.set_xticks(range(len(LEVELS)), [f"{level} %" for level in LEVELS])
     nominal.set_xlabel("nominal coverage (%)")
     nominal.set_ylabel("measured coverage (%)")
@@ -63,7 +63,7 @@ def _draw_nominal(panel: Axes) -> None:
         )
 
 
-def _draw_measured(panel: Axes, scores: Scores, name: str, colour: str, position: float) -> None:
+def _draw_measured(panel: Axes, scores: Scores, name: str, color: str, position: float) -> None:
     """Draw one validation, beside the others."""
     for shift, (kind, marker) in zip((-0.03, 0.03), MARKERS.items(), strict=True):
         covered, error = scores.coverage[kind], scores.coverage_error[kind]
@@ -77,12 +77,12 @@ def _draw_measured(panel: Axes, scores: Scores, name: str, colour: str, position
             fillstyle=FILLS[kind],
             ms=5,
             capsize=3,
-            color=colour,
+            color=color,
             label=f"{name}: {kind} band",
         )
 
 
-def _draw_pit(panel: Axes, bands: Bands, colour: str) -> None:
+def _draw_pit(panel: Axes, bands: Bands, color: str) -> None:
     assert bands.pit is not None
     heights, edges = np.histogram(bands.pit[bands.scored_from :], 20, range=(0, 1), density=True)
-    panel.stairs(heights, edges, baseline=None, color=colour, lw=1.4, label=plain(title(bands)))
+    panel.stairs(heights, edges, baseline=None, color=color, lw=1.4, label=plain(title(bands)))

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
-from bwbayes.report.figures.style import COLOURS, MEAN_COLOUR, plain, zigzag
+from bwbayes.report.figures.style import COLORS, MEAN_COLOR, plain, zigzag
 
 __all__ = ["draw_promises", "draw_signal"]
 
@@ -24,12 +24,12 @@ def draw_promises(
     figure = Figure(figsize=(7, 1.2 + 0.32 * len(names)), layout="constrained")
     panel = figure.subplots()
     rows = np.arange(len(names))
-    colours = [MEAN_COLOUR, *[COLOURS[0]] * (len(names) - 1)]
+    colors = [MEAN_COLOR, *[COLORS[0]] * (len(names) - 1)]
     panel.hlines(rows, 100 * remaining, 100, color="#bbbbbb", lw=1)
     # A bar reaches two standard errors to either side.
     bars = 100 * 2.0 * error
     panel.errorbar(100 * remaining, rows, xerr=bars, fmt="none", ecolor="#222222", capsize=5)
-    panel.scatter(100 * remaining, rows, color=colours, s=28, zorder=3)
+    panel.scatter(100 * remaining, rows, color=colors, s=28, zorder=3)
     panel.axvline(100, color="#222222", lw=1, ls=":")
     panel.set_yticks(rows, [plain(name) for name in names])
     panel.invert_yaxis()
@@ -45,7 +45,7 @@ def draw_signal(
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     panel = figure.subplots()
     panel.plot(
-        *zigzag(interval * np.arange(voltage.size, dtype=np.float64), voltage), color=MEAN_COLOUR
+        *zigzag(interval * np.arange(voltage.size, dtype=np.float64), voltage), color=MEAN_COLOR
     )
     for limit in limits:
         panel.axhline(limit, color="#222222", lw=1, ls=":")

@@ -7,7 +7,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, MEAN_COLOUR, MEASURED_COLOUR
+from bwbayes.report.figures.style import COLORS, MEAN_COLOR, MEASURED_COLOR
 from bwbayes.results.innovations import Innovations
 
 __all__ = ["draw_innovations"]
@@ -33,8 +33,8 @@ def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
     bound = scipy.stats.norm.isf(0.025) / np.sqrt(innovations.white.size)
     lags = np.arange(1, correlation.size + 1)
     panel.axhspan(-bound, bound, color="#dddddd", lw=0, label="95 % of independent ones")
-    panel.vlines(lags, 0, correlation, color=COLOURS[0], lw=2)
-    panel.axhline(0, color=MEASURED_COLOUR, lw=0.8)
+    panel.vlines(lags, 0, correlation, color=COLORS[0], lw=2)
+    panel.axhline(0, color=MEASURED_COLOR, lw=0.8)
     reach = max(float(np.max(np.abs(correlation))), 2 * float(bound), 0.1) * 1.15
     panel.set(ylim=(-reach, reach), xlim=(0, lags[-1] + 1))
     panel.set(title="Are they white?", xlabel="lag (readings)", ylabel="autocorrelation")
@@ -54,8 +54,8 @@ def _draw_quantiles(panel: Axes, innovations: Innovations) -> None:
         for level in (0.025, 0.975)
     )
     panel.fill_between(expected[at], low, high, color="#dddddd", lw=0, label="95 % of normal ones")
-    panel.plot(expected[at], expected[at], color=MEAN_COLOUR, lw=1)
-    panel.plot(expected[at], ordered[at], ".", color=COLOURS[0], ms=3, mew=0)
+    panel.plot(expected[at], expected[at], color=MEAN_COLOR, lw=1)
+    panel.plot(expected[at], ordered[at], ".", color=COLORS[0], ms=3, mew=0)
     panel.set(title="Are they normal?", xlabel="normal quantile", ylabel="innovation (sds)")
     panel.legend(loc="upper left")
 
@@ -66,7 +66,7 @@ def _draw_time(panel: Axes, innovations: Innovations) -> None:
     dim = min(0.7, 8000 / white.size)
     reach = max(4.5, 1.1 * float(np.quantile(np.abs(white), 0.9995)))
     shown = np.clip(white, -reach, reach)
-    panel.plot(time, shown, ".", color=MEASURED_COLOUR, ms=2, mew=0, alpha=dim)
+    panel.plot(time, shown, ".", color=MEASURED_COLOR, ms=2, mew=0, alpha=dim)
     # The size is shown of 40 stretches of time, or fewer that have enough readings.
     stretches = min(40, max(white.size // 20, 1))
     # A gap of this part of the time ends the line.
@@ -76,9 +76,9 @@ def _draw_time(panel: Axes, innovations: Innovations) -> None:
         pieces = np.array_split(window, max(round(stretches * window.size / white.size), 1))
         centers = [float(np.mean(time[segment])) for segment in pieces]
         size = [float(np.sqrt(np.mean(white[segment] ** 2))) for segment in pieces]
-        panel.plot(centers, size, color=MEAN_COLOUR, lw=1.5, label=label)
+        panel.plot(centers, size, color=MEAN_COLOR, lw=1.5, label=label)
         label = "_nolegend_"
-    panel.axhline(1, color=MEAN_COLOUR, lw=0.8, ls=":")
+    panel.axhline(1, color=MEAN_COLOR, lw=0.8, ls=":")
     panel.set(ylim=(-reach, reach), title="Does the record go on as it starts?")
     panel.set(xlabel="time (s)", ylabel="innovation (sds)")
     panel.legend(loc="upper right")
@@ -96,19 +96,19 @@ def _draw_drive(panel: Axes, innovations: Innovations) -> None:
             sd, mean, many = float(np.std(values)), float(np.mean(values)), values.size
             first = not names
             panel.errorbar(
-                x, sd, yerr=1.96 * sd / np.sqrt(2 * many), fmt="o", color=COLOURS[0], ms=5,
+                x, sd, yerr=1.96 * sd / np.sqrt(2 * many), fmt="o", color=COLORS[0], ms=5,
                 label="sd: 1 is right" if first else None,
             )  # fmt: skip
             panel.errorbar(
-                x, mean, yerr=1.96 * sd / np.sqrt(many), fmt="s", color=COLOURS[1], ms=4,
+                x, mean, yerr=1.96 * sd / np.sqrt(many), fmt="s", color=COLORS[1], ms=4,
                 label="mean: 0 is right" if first else None,
             )  # fmt: skip
             names.append((x, name))
             x += 1
         edges.append((x - 0.5, quantity))
         x += 0.5
-    for level, colour in ((1, COLOURS[0]), (0, COLOURS[1])):
-        panel.axhline(level, color=colour, lw=0.8, ls=":")
+    for level, color in ((1, COLORS[0]), (0, COLORS[1])):
+        panel.axhline(level, color=color, lw=0.8, ls=":")
     panel.set_xticks([at for at, _ in names], [name for _, name in names])
     start = -0.5
     for edge, quantity in edges:

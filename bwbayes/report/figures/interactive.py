@@ -32,12 +32,12 @@ from markupsafe import Markup
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.report.figures.loop import paths, polygons
 from bwbayes.report.figures.style import (
-    BAND_COLOURS,
+    BAND_COLORS,
     BAND_NAMES,
-    EDGE_COLOUR,
-    LEAD_IN_COLOUR,
-    MEAN_COLOUR,
-    MEASURED_COLOUR,
+    EDGE_COLOR,
+    LEAD_IN_COLOR,
+    MEAN_COLOR,
+    MEASURED_COLOR,
     starts,
     time_label,
     title,
@@ -148,7 +148,7 @@ def _series(bands: Bands) -> Model:
     ]
     voltage = _figure(HEIGHTS["voltage"], "voltage (V)", x_range=DataRange1d(range_padding=0.01))
     for source in sources:
-        voltage.line("time", "voltage", source=source, color=MEASURED_COLOUR)
+        voltage.line("time", "voltage", source=source, color=MEASURED_COLOR)
     plots = [voltage]
     residual = "band − mean (µm)" if bands.measured is None else "measured − mean (µm)"
     for about, label in (("", "displacement (µm)"), ("_residual", residual)):
@@ -158,7 +158,7 @@ def _series(bands: Bands) -> Model:
         if bands.scored_from:
             until = float(bands.time[min(bands.scored_from, bands.time.size - 1)])
             lead_in: dict[str, Any] = {"left": float(bands.time[0]), "right": until}
-            plot.add_layout(BoxAnnotation(**lead_in, fill_color=LEAD_IN_COLOUR, fill_alpha=0.35))
+            plot.add_layout(BoxAnnotation(**lead_in, fill_color=LEAD_IN_COLOR, fill_alpha=0.35))
         plot.add_tools(HoverTool(renderers=means, mode="vline", tooltips=_tips(bands)))
         plots.append(plot)
     _legend(plots[1])
@@ -175,7 +175,7 @@ def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> 
     """Draw the bands, the mean and the readings of a window; return the mean's line."""
     _ribbons(plot, source, about)
     mean = plot.line(
-        "time", f"mean{about}", source=source, color=MEAN_COLOUR, **_named("mean", about)
+        "time", f"mean{about}", source=source, color=MEAN_COLOR, **_named("mean", about)
     )
     if bands.measured is not None:
         plot.scatter(
@@ -183,7 +183,7 @@ def _along(plot: figure, bands: Bands, source: ColumnDataSource, about: str) -> 
             f"measured{about}",
             source=source,
             size=2.5,
-            color=MEASURED_COLOUR,
+            color=MEASURED_COLOR,
             alpha=0.6,
             **_named("measured", about),
         )
@@ -197,16 +197,16 @@ def _named(label: str, about: str) -> dict[str, Any]:
 
 def _ribbons(plot: figure, source: ColumnDataSource, about: str) -> None:
     """Draw the bands, the widest first, the sensor's with a dashed edge."""
-    for kind, colour in BAND_COLOURS.items():
+    for kind, color in BAND_COLORS.items():
         edges = [f"{side}_{kind}{about}" for side in ("lower", "upper")]
         named = _named(BAND_NAMES[kind], about)
-        plot.varea("time", *edges, source=source, color=colour, **named)
+        plot.varea("time", *edges, source=source, color=color, **named)
     for side in ("lower", "upper"):
         plot.line(
             "time",
             f"{side}_sensor{about}",
             source=source,
-            color=EDGE_COLOUR,
+            color=EDGE_COLOR,
             line_dash="dashed",
             **_named(BAND_NAMES["sensor"], about),
         )
@@ -248,7 +248,7 @@ def _columns(bands: Bands, at: IntArray) -> dict[str, FloatArray]:
     columns["mean_residual"] = np.zeros_like(bands.mean)
     if bands.measured is not None:
         columns |= {"measured": bands.measured, "measured_residual": bands.measured - bands.mean}
-    for kind in BAND_COLOURS:
+    for kind in BAND_COLORS:
         for side, edge in (("lower", bands.lower), ("upper", bands.upper)):
             values = edge[kind, LEVEL]
             columns[f"{side}_{kind}"] = values
@@ -276,7 +276,7 @@ def _loop(bands: Bands) -> figure:
             }
         )
         plot.patches(
-            "x", "y", source=ribbon, color=BAND_COLOURS[kind], legend_label=BAND_NAMES[kind]
+            "x", "y", source=ribbon, color=BAND_COLORS[kind], legend_label=BAND_NAMES[kind]
         )
     if bands.measured is not None:
         read = _one_in_each_cell(bands.voltage, bands.measured)
@@ -284,7 +284,7 @@ def _loop(bands: Bands) -> figure:
             bands.voltage[read].astype(np.float32),
             bands.measured[read].astype(np.float32),
             size=2,
-            color=MEASURED_COLOUR,
+            color=MEASURED_COLOR,
             alpha=0.4,
             legend_label="measured",
         )
@@ -294,7 +294,7 @@ def _loop(bands: Bands) -> figure:
         {n: np.insert(x, ends, np.nan) for n, x in columns.items() if not n.endswith("_residual")}
     )
     mean = plot.line(
-        "voltage", "mean", source=source, color=MEAN_COLOUR, line_width=1.5, legend_label="mean"
+        "voltage", "mean", source=source, color=MEAN_COLOR, line_width=1.5, legend_label="mean"
     )
     plot.add_tools(HoverTool(renderers=[mean], line_policy="nearest", tooltips=_tips(bands)))
     _legend(plot, 1)

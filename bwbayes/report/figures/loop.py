@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.report.figures.style import (
-    BAND_COLOURS,
+    BAND_COLORS,
     BAND_NAMES,
-    MEAN_COLOUR,
-    MEASURED_COLOUR,
-    ZOOM_COLOUR,
+    MEAN_COLOR,
+    MEASURED_COLOR,
+    ZOOM_COLOR,
     plain,
     title,
 )
@@ -66,12 +66,12 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
         panel.add_collection(_ribbon(bands, windows, kind))
     for number, path in enumerate(windows):
         label = "_nolegend_" if number else "mean"
-        panel.plot(bands.voltage[path], bands.mean[path], color=MEAN_COLOUR, lw=0.7, label=label)
+        panel.plot(bands.voltage[path], bands.mean[path], color=MEAN_COLOR, lw=0.7, label=label)
     if bands.measured is not None:
-        panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
+        panel.plot([], [], ".", color=MEASURED_COLOR, label="measured")
         sparse = bands.measured.size <= FEW
         dots = panel.plot(
-            bands.voltage, bands.measured, "." if sparse else dot, color=MEASURED_COLOUR
+            bands.voltage, bands.measured, "." if sparse else dot, color=MEASURED_COLOR
         )
         size, alpha = (3.0, 0.7) if sparse else (2.0, 0.25)
         dots[0].set(markersize=size, markeredgewidth=0.0, zorder=1.5, alpha=alpha)
@@ -104,10 +104,10 @@ def _ribbon(bands: Bands, windows: Sequence[IntArray], kind: Kind) -> PolyCollec
 
     Opaque, because what overlaps where the path turns must not look like a denser band.
     """
-    colour = BAND_COLOURS[kind]
+    color = BAND_COLORS[kind]
     corners = list(polygons(bands, windows, kind))
     return PolyCollection(
-        corners, facecolor=colour, edgecolor=colour, linewidth=0.4, label=BAND_NAMES[kind]
+        corners, facecolor=color, edgecolor=color, linewidth=0.4, label=BAND_NAMES[kind]
     )
 
 
@@ -143,7 +143,7 @@ def _zoom(full: Axes, tip: Axes, bands: Bands) -> None:
     tip.set_ylim(top - upright, top)
     full.indicate_inset(
         (side, top - upright, across, upright),
-        edgecolor=ZOOM_COLOUR,
+        edgecolor=ZOOM_COLOR,
         alpha=1.0,
         linewidth=1.5,
     )

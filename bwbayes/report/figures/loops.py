@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, share_legend
+from bwbayes.report.figures.style import COLORS, share_legend
 from bwbayes.results.loops import Loops
 
 __all__ = ["draw_loops"]
@@ -23,20 +23,20 @@ def draw_loops(loops: Loops) -> Figure:
     panels = figure.subplots(1, 2)
     major, minor = loops.major, loops.minor
     curves = (
-        ("major loop", COLOURS[0], "-", major.voltage, (major.rising, major.falling)),
-        ("minor loop", COLOURS[1], "-", minor.voltage, (minor.rising, minor.falling)),
-        ("initial curve", COLOURS[2], "--", loops.initial_voltage, (loops.initial,)),
+        ("major loop", COLORS[0], "-", major.voltage, (major.rising, major.falling)),
+        ("minor loop", COLORS[1], "-", minor.voltage, (minor.rising, minor.falling)),
+        ("initial curve", COLORS[2], "--", loops.initial_voltage, (loops.initial,)),
     )
     ends = major.falling.mean[0], major.rising.mean[-1]
     line = np.polyfit(major.voltage[[0, -1]], ends, 1)
     for panel, subtracted in zip(panels, (0 * line, line), strict=True):
-        for name, colour, style, voltage, branches in curves:
+        for name, color, style, voltage, branches in curves:
             away = np.polyval(subtracted, voltage)
             for number, bands in enumerate(branches):
                 label = "_nolegend_" if number else name
                 lower, upper = bands.lower - away, bands.upper - away
-                panel.fill_between(voltage, lower, upper, fc=colour, alpha=BAND_ALPHA, lw=0)
-                panel.plot(voltage, bands.mean - away, style, color=colour, label=label)
+                panel.fill_between(voltage, lower, upper, fc=color, alpha=BAND_ALPHA, lw=0)
+                panel.plot(voltage, bands.mean - away, style, color=color, label=label)
         panel.set_xlabel("voltage (V)")
     panels[0].set_ylabel("displacement (µm)")
     panels[1].set_ylabel("displacement − straight line (µm)")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.report.figures.style import COLOURS, LEAD_IN_COLOUR, MEASURED_COLOUR, zigzag
+from bwbayes.report.figures.style import COLORS, LEAD_IN_COLOR, MEASURED_COLOR, zigzag
 
 __all__ = ["record_drawings"]
 
@@ -30,7 +30,7 @@ def record_drawings(
     record
         The record, with or without a displacement.
     training
-        The windows that are fitted; what lies outside is shown in grey.
+        The windows that are fitted; what lies outside is shown in gray.
     findings
         What is wrong; where it is only a part of the record, the part is marked.
     """
@@ -46,16 +46,16 @@ def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Fin
     read = record.displacement is not None
     figure = Figure(figsize=(11, 5.6 if read else 3.2), layout="constrained")
     panels = figure.subplots(1 + read, 1, sharex=True, squeeze=False)[:, 0]
-    panels[0].plot(*zigzag(record.time, record.voltage), color=COLOURS[0], lw=0.9)
+    panels[0].plot(*zigzag(record.time, record.voltage), color=COLORS[0], lw=0.9)
     panels[0].set_ylabel("voltage (V)")
     if record.displacement is not None:
         rows = np.flatnonzero(record.has_reading)
         time, values = record.time[rows], record.displacement[rows]
         # More readings are shown as a line.
         if rows.size < 2000:
-            panels[1].plot(time, values, ".", color=MEASURED_COLOUR, ms=2.5, mew=0)
+            panels[1].plot(time, values, ".", color=MEASURED_COLOR, ms=2.5, mew=0)
         else:
-            panels[1].plot(*zigzag(time, _with_gaps(record, rows)), color=MEASURED_COLOUR, lw=0.7)
+            panels[1].plot(*zigzag(time, _with_gaps(record, rows)), color=MEASURED_COLOR, lw=0.7)
         panels[1].set_ylabel("displacement (µm)")
     for panel in panels:
         _mark(panel, record, training, findings)
@@ -88,15 +88,15 @@ def _mark(
     ]
     for start, stop in [*edges, *([(end, end)] if edges else [])]:
         if start - at > record.interval / 2:
-            panel.axvspan(at, start, color=LEAD_IN_COLOUR, alpha=0.25, lw=0, label=label)
+            panel.axvspan(at, start, color=LEAD_IN_COLOR, alpha=0.25, lw=0, label=label)
             label = "_nolegend_"
         at = max(at, stop)
     kinds: dict[str, str] = {}
     for finding in findings:
         if finding.stop - finding.start < 0.98 * record.duration:
-            colour = kinds.setdefault(finding.kind, COLOURS[1 + len(kinds) % (len(COLOURS) - 2)])
+            color = kinds.setdefault(finding.kind, COLORS[1 + len(kinds) % (len(COLORS) - 2)])
             panel.axvspan(
-                finding.start, finding.stop, color=colour, alpha=0.3, lw=1, label=finding.kind
+                finding.start, finding.stop, color=color, alpha=0.3, lw=1, label=finding.kind
             )
 
 
@@ -129,7 +129,7 @@ def _draw_drive(record: Record) -> Figure:
     amplitude = np.sqrt(2 * power[1:])
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     panel = figure.subplots()
-    panel.loglog(*_thinned(frequency[1:], amplitude), color=COLOURS[0], lw=0.9)
+    panel.loglog(*_thinned(frequency[1:], amplitude), color=COLORS[0], lw=0.9)
     top = float(amplitude.max())
     # Six decades below the peak.
     panel.set_ylim(max(top * 10.0**-6, float(amplitude.min()) / 2, 1e-12), 3 * top)

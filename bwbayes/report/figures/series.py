@@ -9,14 +9,14 @@ from matplotlib.ticker import MaxNLocator
 
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures.style import (
-    BAND_COLOURS,
+    BAND_COLORS,
     BAND_NAMES,
-    EDGE_COLOUR,
-    LEAD_IN_COLOUR,
-    MEAN_COLOUR,
-    MEASURED_COLOUR,
-    TRUTH_COLOUR,
-    ZOOM_COLOUR,
+    EDGE_COLOR,
+    LEAD_IN_COLOR,
+    MEAN_COLOR,
+    MEASURED_COLOR,
+    TRUTH_COLOR,
+    ZOOM_COLOR,
     envelope,
     plain,
     share_legend,
@@ -50,7 +50,7 @@ def draw_bands(bands: Bands) -> Figure:
     short = _around_largest_error(bands)
     for column, window in zip(axes.T, (slice(None), short), strict=True):
         voltage = zigzag(bands.time[window], bands.voltage[window])
-        column[0].plot(*voltage, color=MEASURED_COLOUR, lw=0.8)
+        column[0].plot(*voltage, color=MEASURED_COLOR, lw=0.8)
         _draw_displacement(column[1], bands, window)
         _draw_residual(column[2], bands, window)
         column[2].set_xlabel(time_label(bands.time_offset))
@@ -86,50 +86,50 @@ def _around_largest_error(bands: Bands) -> slice:
 
 def _draw_displacement(panel: Axes, bands: Bands, window: slice) -> None:
     _draw_ribbons(panel, bands, window, np.zeros_like(bands.mean))
-    panel.plot(*zigzag(bands.time[window], bands.mean[window]), color=MEAN_COLOUR, lw=0.8)
+    panel.plot(*zigzag(bands.time[window], bands.mean[window]), color=MEAN_COLOR, lw=0.8)
     if bands.measured is not None:
         _draw_readings(panel, bands.time[window], bands.measured[window])
 
 
 def _draw_residual(panel: Axes, bands: Bands, window: slice) -> None:
     _draw_ribbons(panel, bands, window, bands.mean)
-    panel.axhline(0.0, color=MEAN_COLOUR, lw=1.0, label="mean")
+    panel.axhline(0.0, color=MEAN_COLOR, lw=1.0, label="mean")
     if bands.measured is not None:
         _draw_readings(panel, bands.time[window], (bands.measured - bands.mean)[window])
-        panel.plot([], [], ".", color=MEASURED_COLOUR, label="measured")
+        panel.plot([], [], ".", color=MEASURED_COLOR, label="measured")
     if bands.truth is not None and bands.time[window].size < DOTS:
         drawn = zigzag(bands.time[window], (bands.truth - bands.mean)[window])
-        panel.plot(*drawn, color=TRUTH_COLOUR, lw=1.0, label="true displacement, without noise")
+        panel.plot(*drawn, color=TRUTH_COLOR, lw=1.0, label="true displacement, without noise")
 
 
 def _draw_ribbons(panel: Axes, bands: Bands, window: slice, about: FloatArray) -> None:
     """Draw the three 95 % bands, the widest first."""
-    for kind, colour in BAND_COLOURS.items():
+    for kind, color in BAND_COLORS.items():
         lower = (bands.lower[kind, 95] - about)[window]
         upper = (bands.upper[kind, 95] - about)[window]
         drawn = envelope(bands.time[window], lower, upper)
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
         edge, style = (1.0, "--") if kind == "sensor" else (0.0, "-")
         panel.fill_between(
-            *drawn, fc=colour, ec=EDGE_COLOUR, lw=edge, ls=style, label=BAND_NAMES[kind]
+            *drawn, fc=color, ec=EDGE_COLOR, lw=edge, ls=style, label=BAND_NAMES[kind]
         )
 
 
 def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
     """Draw every reading: an envelope of noise would hide how few lie outside the band."""
     if time.size < DOTS:
-        panel.plot(time, readings, ".", color=MEASURED_COLOUR, ms=2.5, mew=0, alpha=0.7)
+        panel.plot(time, readings, ".", color=MEASURED_COLOR, ms=2.5, mew=0, alpha=0.7)
     else:
-        panel.plot(time, readings, ",", color=MEASURED_COLOUR, alpha=min(1.0, 15_000 / time.size))
+        panel.plot(time, readings, ",", color=MEASURED_COLOR, alpha=min(1.0, 15_000 / time.size))
 
 
 def _mark(panel: Axes, bands: Bands, short: slice) -> None:
     """Show where the zoom is, and which samples are not judged."""
     span = bands.time[short]
     label = "shown on the right"
-    panel.axvspan(span[0], span[-1], color=ZOOM_COLOUR, alpha=0.5, lw=1, zorder=0.5, label=label)
+    panel.axvspan(span[0], span[-1], color=ZOOM_COLOR, alpha=0.5, lw=1, zorder=0.5, label=label)
     if bands.scored_from:
         last = bands.time[min(bands.scored_from, bands.time.size - 1)]
         panel.axvspan(
-            bands.time[0], last, fc=LEAD_IN_COLOUR, alpha=0.35, lw=0, label="lead-in, not judged"
+            bands.time[0], last, fc=LEAD_IN_COLOR, alpha=0.35, lw=0, label="lead-in, not judged"
         )

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, MEAN_COLOUR, MEASURED_COLOUR
+from bwbayes.report.figures.style import COLORS, MEAN_COLOR, MEASURED_COLOR
 from bwbayes.report.words import unit_text
 from bwbayes.results.innovations import Innovations
 
 __all__ = ["draw_spectrum"]
 
 # Colors of lines: not that of the noise model.
-LINE_COLOURS = tuple(colour for colour in COLOURS if colour != MEAN_COLOUR)
+LINE_COLORS = tuple(color for color in COLORS if color != MEAN_COLOR)
 
 
 def draw_spectrum(innovations: Innovations) -> Figure:
@@ -21,16 +21,16 @@ def draw_spectrum(innovations: Innovations) -> Figure:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     panel = figure.subplots()
     panel.loglog(
-        spectrum.frequency, spectrum.density, color=MEASURED_COLOUR, lw=0.9, label="residual"
+        spectrum.frequency, spectrum.density, color=MEASURED_COLOR, lw=0.9, label="residual"
     )
     model = innovations.noise_density(spectrum.frequency)
     if model is not None:
-        panel.loglog(spectrum.frequency, model, color=MEAN_COLOUR, lw=1.5, label="noise model")
+        panel.loglog(spectrum.frequency, model, color=MEAN_COLOR, lw=1.5, label="noise model")
     for number, line in enumerate(spectrum.lines):
         panel.axvline(
             line.frequency,
-            color=LINE_COLOURS[number % len(LINE_COLOURS)],
-            ls="--" if number < len(LINE_COLOURS) else ":",
+            color=LINE_COLORS[number % len(LINE_COLORS)],
+            ls="--" if number < len(LINE_COLORS) else ":",
             lw=1.2,
             zorder=1.5,
             label=unit_text(line.description),

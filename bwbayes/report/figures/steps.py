@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import COLOURS, plain, share_legend
+from bwbayes.report.figures.style import COLORS, plain, share_legend
 from bwbayes.results.steps import CREEP_FROM, StepResponse
 
 __all__ = ["draw_steps"]
@@ -22,7 +22,7 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
     panels = figure.subplots(1, 1 + creeps, squeeze=False)[0]
     first = np.inf
     for number, (name, response) in enumerate(responses.items()):
-        colour, label = COLOURS[number % len(COLOURS)], plain(f"{name}, {response.step.height:g} V")
+        color, label = COLORS[number % len(COLORS)], plain(f"{name}, {response.step.height:g} V")
         # The rise is drawn from this part of its final value on.
         started = np.abs(response.response.mean) > 1e-3 * abs(float(response.response.mean[-1]))
         # Without dynamics there is no rise to be seen.
@@ -31,9 +31,9 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
         for panel, curve in zip(panels, (response.response, response.crept), strict=False):
             if curve is not None:
                 panel.fill_between(
-                    response.time, curve.lower, curve.upper, fc=colour, alpha=BAND_ALPHA, lw=0
+                    response.time, curve.lower, curve.upper, fc=color, alpha=BAND_ALPHA, lw=0
                 )
-                panel.plot(response.time, curve.mean, color=colour, label=label)
+                panel.plot(response.time, curve.mean, color=color, label=label)
     for panel in panels:
         panel.set_xscale("log")
         panel.set_xlabel("time since the step (s)")

@@ -1,6 +1,6 @@
 """What all pictures share: their look, the words on their axes, and how long series are thinned.
 
-The colours are Okabe and Ito's, which colour-blind readers can tell apart; bands differ by
+The colors are Okabe and Ito's, which color-blind readers can tell apart; bands differ by
 lightness besides.
 """
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "BAND_COLOURS",
+    "BAND_COLORS",
     "BAND_NAMES",
-    "COLOURS",
-    "EDGE_COLOUR",
-    "LEAD_IN_COLOUR",
-    "MEAN_COLOUR",
-    "MEASURED_COLOUR",
+    "COLORS",
+    "EDGE_COLOR",
+    "LEAD_IN_COLOR",
+    "MEAN_COLOR",
+    "MEASURED_COLOR",
     "STYLE",
-    "TRUTH_COLOUR",
-    "ZOOM_COLOUR",
+    "TRUTH_COLOR",
+    "ZOOM_COLOR",
     "axis_label",
     "envelope",
     "hide_unused",
@@ -66,21 +66,21 @@ STYLE: dict[Any, Any] = {
     "path.simplify": True,
 }
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
-MEAN_COLOUR = "#D55E00"
-MEASURED_COLOUR = "#222222"
-TRUTH_COLOUR = "#E69F00"
-LEAD_IN_COLOUR = "#999999"
-ZOOM_COLOUR = "#CC79A7"
+MEAN_COLOR = "#D55E00"
+MEASURED_COLOR = "#222222"
+TRUTH_COLOR = "#E69F00"
+LEAD_IN_COLOR = "#999999"
+ZOOM_COLOR = "#CC79A7"
 
 # From the widest band, drawn first, to the narrowest.
-BAND_COLOURS: Mapping[Kind, str] = {
+BAND_COLORS: Mapping[Kind, str] = {
     "sensor": "#DCEAF4",
     "displacement": "#ACD0E8",
     "parameter": "#6FAAD6",
 }
-EDGE_COLOUR = "#12344D"
+EDGE_COLOR = "#12344D"
 BAND_NAMES: Mapping[Kind, str] = {
     "sensor": "95 % sensor reading",
     "displacement": "95 % displacement",

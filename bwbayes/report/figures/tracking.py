@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from bwbayes.report.figures.style import COLOURS, hide_unused, share_legend
+from bwbayes.report.figures.style import COLORS, hide_unused, share_legend
 
 __all__ = ["draw_tracking"]
 
@@ -27,11 +27,11 @@ def draw_tracking(table: Any, controllers: Sequence[str]) -> Figure:
     panels = hide_unused(axes, len(signals), "frequency (Hz)")
     curves = table.groupby(["signal", "controller"])
     for panel, signal in zip(panels, signals, strict=True):
-        for controller, colour in zip(controllers, COLOURS, strict=False):
+        for controller, color in zip(controllers, COLORS, strict=False):
             curve = curves.get_group((signal, controller))
             frequency, band = curve["frequency_Hz"], (curve["rms_um_low"], curve["rms_um_high"])
-            panel.fill_between(frequency, *band, fc=colour, alpha=BAND_ALPHA, lw=0)
-            panel.plot(frequency, curve["rms_um"], "o-", ms=3, color=colour, label=controller)
+            panel.fill_between(frequency, *band, fc=color, alpha=BAND_ALPHA, lw=0)
+            panel.plot(frequency, curve["rms_um"], "o-", ms=3, color=color, label=controller)
         panel.set_title(signal)
         panel.set_xscale("log")
         panel.set_yscale("log")

@@ -46,13 +46,13 @@ def walk(seed: int, turns: int = 25) -> FloatArray:
 
 
 def history(initial: float, voltage: float, span: Span) -> list[float]:
-    """Return the turning points from the demagnetised state to a record's first voltage."""
+    """Return the turning points from the demagnetized state to a record's first voltage."""
     high, low = max(span.high, voltage), min(span.low, voltage)
     return [0.0, high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage]
 
 
 def path(initial: float, voltage: FloatArray, span: Span | None) -> list[float]:
-    """Return all voltages from the demagnetised state on, of which the record is the end."""
+    """Return all voltages from the demagnetized state on, of which the record is the end."""
     before = [0.0] if span is None else history(initial, float(voltage[0]), span)[:-1]
     return before + [float(u) for u in voltage]
 

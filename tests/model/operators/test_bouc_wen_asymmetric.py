@@ -1,4 +1,4 @@
-"""The generalised Bouc-Wen operator: its equation, plain Bouc-Wen hysteresis, and its energy."""
+"""The generalized Bouc-Wen operator: its equation, plain Bouc-Wen hysteresis, and its energy."""
 
 from __future__ import annotations
 

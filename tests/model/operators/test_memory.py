@@ -178,7 +178,7 @@ def test_pieces_do_not_matter(
 @every_case
 @settings(max_examples=15, deadline=None)
 @given(voltage=paths, span=spans)
-def test_a_model_does_not_feel_its_neighbours(
+def test_a_model_does_not_feel_its_neighbors(
     case: Case, voltage: FloatArray, span: Span | None
 ) -> None:
     together = run(case.operator, case.column, voltage, span)
