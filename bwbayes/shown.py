@@ -39,7 +39,7 @@ def head(text: str) -> str:
     if len(lines) <= MOST_LINES and len(text) <= LONGEST:
         return text
     shown: list[str] = []
-    for line in (one.rstrip()[: 2 * WIDTH] for one in lines[: MOST_LINES - 1]):
+    for line in (raw.rstrip()[: 2 * WIDTH] for raw in lines[: MOST_LINES - 1]):
         if len("\n".join([*shown, line])) > LONGEST - WIDTH:
             break
         shown.append(line)
@@ -72,12 +72,12 @@ def _value(value: Any, *, nested: bool = True) -> str:
     if isinstance(value, np.ndarray):
         return _array(value)
     if isinstance(value, Mapping):
-        items = (f"{key!r}: {_value(one, nested=False)}" for key, one in value.items())
+        items = (f"{key!r}: {_value(item, nested=False)}" for key, item in value.items())
         return _joined("{", items, len(value), "}")
     if isinstance(value, list | tuple | set | frozenset):
-        return _joined("[", (_value(one, nested=False) for one in value), len(value), "]")
+        return _joined("[", (_value(item, nested=False) for item in value), len(value), "]")
     if nested and is_dataclass(value) and not isinstance(value, type):
-        parts = [f"{name}={_value(one, nested=False)}" for name, one in _fields(value)]
+        parts = [f"{name}={_value(item, nested=False)}" for name, item in _fields(value)]
         line = f"{type(value).__name__}({', '.join(parts)})"
         return line if len(line) <= VALUE else f"{type(value).__name__}(...)"
     plain = value.item() if isinstance(value, np.generic) else value

@@ -92,8 +92,8 @@ class Candidate:
     @property
     def log_evidence(self) -> float:
         """Its log evidence, nats; −∞ if it is not known."""
-        known = self.evidence is not None and np.isfinite(self.evidence.log_evidence)
-        return self.evidence.log_evidence if known and self.evidence is not None else -np.inf
+        finite = self.evidence is not None and np.isfinite(self.evidence.log_evidence)
+        return self.evidence.log_evidence if finite and self.evidence is not None else -np.inf
 
     @property
     def log_likelihood(self) -> float | None:

@@ -127,13 +127,13 @@ class Comparison:
             "windows": {name: as_summary(scores) for name, scores in model.scores.items()},
             "parts": {
                 name: {
-                    "log_score": float(np.sum(part.log_scores)),
-                    "readings": part.readings,
-                    "independent": part.worth,
-                    "joint": part.joint,
+                    "log_score": float(np.sum(section.log_scores)),
+                    "readings": section.readings,
+                    "independent": section.worth,
+                    "joint": section.joint,
                     "votes": name in self.voting,
                 }
-                for name, part in model.parts.items()
+                for name, section in model.parts.items()
             },
             "log_evidence": None if evidence is None else evidence.log_evidence,
             "log_evidence_error": None if evidence is None else evidence.error,

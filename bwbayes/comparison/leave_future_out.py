@@ -123,7 +123,7 @@ def leave_future_out(
         if earlier is not None:
             parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng)
     for record, name, windows in (
-        (record, *part) for record, named in held_out.items() for part in named.items()
+        (record, *scores_ow) for record, named in held_out.items() for scores_ow in named.items()
     ):
         displacement = next(d.displacement for d in posterior.datasets if d.name == record)
         rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
@@ -137,13 +137,13 @@ def leave_future_out(
             for edge in _edges(rows)
         ]
         path.append(posterior.trained(training))
-        part = _scored(path, {0: flat}, {record: rows}, rng)
-        if part.effective < MIN_EFFECTIVE:
+        scores_ow = _scored(path, {0: flat}, {record: rows}, rng)
+        if scores_ow.effective < MIN_EFFECTIVE:
             longer = _fitted(path[-1], plan, flat, rng, executor)
             if longer is not None:
-                part = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
+                scores_ow = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
                 flat = longer
-        parts[name] = part
+        parts[name] = scores_ow
     return parts
 
 
@@ -229,10 +229,10 @@ def _scored(
     worth = 0.0
     for dataset in path[-1].datasets:
         if dataset.name in rows:
-            own = rows[dataset.name]
-            simulated = path[-1].simulate(likeliest, own, dataset.name if several else None)[0]
-            worth += own.size / _correlation_time(dataset.displacement[own] - simulated)
-    readings = sum(own.size for own in rows.values())
+            its_rows = rows[dataset.name]
+            simulated = path[-1].simulate(likeliest, its_rows, dataset.name if several else None)[0]
+            worth += its_rows.size / _correlation_time(dataset.displacement[its_rows] - simulated)
+    readings = sum(its_rows.size for its_rows in rows.values())
     return Part(np.diff(log_z), readings, worth, effective=float(np.min(effective)))
 
 

@@ -120,10 +120,10 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
 def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Candidate:
     """Let readings that were scored one by one count as independent ones do."""
     parts = {
-        name: part
-        if part.joint or name not in worth
-        else replace(part, log_scores=part.log_scores * worth[name] / part.readings)
-        for name, part in candidate.parts.items()
+        name: section
+        if section.joint or name not in worth
+        else replace(section, log_scores=section.log_scores * worth[name] / section.readings)
+        for name, section in candidate.parts.items()
     }
     return replace(candidate, parts=parts)
 

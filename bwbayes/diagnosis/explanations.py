@@ -73,8 +73,12 @@ def explain(
 
 def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
     """Return the best of ranked explanations and those that tie with it; none below the limit."""
-    leading = [found for found in ranked if found.nats > max(LIMIT, ranked[0].nats - TIED)]
-    keeping = [found for found in leading if not found.removes]
+    leading = [
+        explanation
+        for explanation in ranked
+        if explanation.nats > max(LIMIT, ranked[0].nats - TIED)
+    ]
+    keeping = [explanation for explanation in leading if not explanation.removes]
     return tuple(keeping or leading)
 
 
@@ -84,8 +88,10 @@ def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
     What is beyond chance is enough by itself: parameters that followed it need not find back. Even
     odds are enough where a parameter moves as well: a good fit hardly has both.
     """
-    best = max((found.nats for found in ranked), default=0.0)
-    near = [found for found in ranked if found.nats > max(0.0, best - TIED)]
+    best = max((explanation.nats for explanation in ranked), default=0.0)
+    near = [explanation for explanation in ranked if explanation.nats > max(0.0, best - TIED)]
     return tuple(
-        found for found in near if found.foreign and (found.nats > LIMIT or found.shift > SHIFTED)
+        explanation
+        for explanation in near
+        if explanation.foreign and (explanation.nats > LIMIT or explanation.shift > SHIFTED)
     )

@@ -64,24 +64,29 @@ def beyond_training(
     window
         The samples that are predicted; those before are what the actuator went through.
     """
-    found = [
+    findings = [
         _range(posterior, voltage[window]),
         _speed(posterior, voltage[window], interval),
         _slow(posterior, voltage, interval, window),
         _duration(posterior, voltage[: window.stop].size * interval),
     ]
-    return [one for one in found if one is not None]
+    return [finding for finding in findings if finding is not None]
 
 
 def _fitted_range(posterior: Posterior) -> tuple[float, float]:
-    windows = [one.voltage[window] for one in posterior.datasets for window in one.training]
+    windows = [
+        dataset.voltage[window] for dataset in posterior.datasets for window in dataset.training
+    ]
     return min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
 
 
 def _turn_times(posterior: Posterior) -> list[float]:
     """Return the typical time between turning points in each record that was fitted, s."""
     every = posterior.datasets
-    return [time_between_turns(one.voltage, one.actuator.interval, one.training) for one in every]
+    return [
+        time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
+        for dataset in every
+    ]
 
 
 def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
@@ -99,10 +104,13 @@ def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
 
 def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Finding | None:
     before = now = math.inf
-    for one, a_turn in zip(posterior.datasets, _turn_times(posterior), strict=True):
-        own = one.actuator.interval
+    for dataset, a_turn in zip(posterior.datasets, _turn_times(posterior), strict=True):
+        own = dataset.actuator.interval
         over = PART * min(a_turn, time_between_turns(voltage, interval))
-        its, this = fastest(one.voltage, own, over, one.training), fastest(voltage, interval, over)
+        its, this = (
+            fastest(dataset.voltage, own, over, dataset.training),
+            fastest(voltage, interval, over),
+        )
         # Of several records the one that comes nearest to the drive.
         if this * before <= now * its or before == math.inf:
             before, now = its, this
@@ -132,8 +140,8 @@ def _slow(
     times = longest / 10 ** (np.arange(1 + math.ceil(A_DECADE * decades)) / A_DECADE)
     planned = _slow_means(inside, interval, times, [window])
     fitted = [
-        _slow_means(one.voltage, one.actuator.interval, times, one.training)
-        for one in posterior.datasets
+        _slow_means(dataset.voltage, dataset.actuator.interval, times, dataset.training)
+        for dataset in posterior.datasets
     ]
     now, before = SIDES * planned, np.max([SIDES * _filled(means) for means in fitted], axis=0)
     # A mean over a longer time is that over a shorter one somewhere.
@@ -156,13 +164,15 @@ def _slow(
 
 def _filled(means: FloatArray) -> FloatArray:
     """Replace each nan of (sides, times) by the first number after it: that of the next time."""
-    known = np.flatnonzero(np.isfinite(means[0]))
-    filled: FloatArray = means[:, known[np.searchsorted(known, np.arange(means.shape[1]))]]
+    finite = np.flatnonzero(np.isfinite(means[0]))
+    filled: FloatArray = means[:, finite[np.searchsorted(finite, np.arange(means.shape[1]))]]
     return filled
 
 
 def _duration(posterior: Posterior, duration: float) -> Finding | None:
-    before = max(one.training[-1].stop * one.actuator.interval for one in posterior.datasets)
+    before = max(
+        dataset.training[-1].stop * dataset.actuator.interval for dataset in posterior.datasets
+    )
     if duration <= LONGER * before:
         return None
     return Finding(

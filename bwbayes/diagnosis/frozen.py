@@ -57,15 +57,15 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     at_top = values == levels[-1]
     first, lengths = runs(at_top)
     if np.mean(np.diff(values)[~(at_top[1:] & at_top[:-1])] == 0) < MOST_REPEATED:
-        some = _enough(first, first + lengths - 1, np.full(first.size, np.ptp(other[at_top]) > 0))
+        enough = _enough(first, first + lengths - 1, np.full(first.size, np.ptp(other[at_top]) > 0))
     else:
         resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
         travel = max(0.01, 3 * resolution) * float(np.ptp(other))
         moving = _quartile_distances(other[at_top], lengths) > travel
-        some = _enough(first, first + lengths - 1, (lengths >= SHORTEST_AT_END) & moving)
-    if some is None or some.samples <= 3 * np.count_nonzero(values == levels[-2]):
+        enough = _enough(first, first + lengths - 1, (lengths >= SHORTEST_AT_END) & moving)
+    if enough is None or enough.samples <= 3 * np.count_nonzero(values == levels[-2]):
         return None
-    return some
+    return enough
 
 
 def clipped_drive(values: FloatArray, other: FloatArray, usual: float) -> Stuck | None:
@@ -78,21 +78,24 @@ def clipped_drive(values: FloatArray, other: FloatArray, usual: float) -> Stuck 
     """
     first, lengths = runs(values == values.max())
     last = first + lengths - 1
-    quarter, some = lengths // 4, lengths // 8 + 1
+    quarter, shortest = lengths // 4, lengths // 8 + 1
     whole = (lengths >= SHORTEST_AT_END) & (last + quarter < values.size)
     if not whole.any():
         return None
-    first, last, quarter, some = (each[whole] for each in (first, last, quarter, some))
+    first, last, quarter, shortest = (each[whole] for each in (first, last, quarter, shortest))
     sums = np.concatenate([[0.0], np.cumsum(other)])
     before, end, after = (
-        (sums[at + 1] - sums[at + 1 - some]) / some for at in (last - quarter, last, last + quarter)
+        (sums[at + 1] - sums[at + 1 - shortest]) / shortest
+        for at in (last - quarter, last, last + quarter)
     )
     falls, count = before - end, last.size
     sure = falls.sum() > 4 * usual * np.sqrt(count)
     if count >= 6:
         sure |= falls.mean() > 4 * falls.std(ddof=1) / np.sqrt(count)
-    least = max(LEAST_FALL * float((end - after).sum()), LEAST_OF_RANGE * float(np.ptp(other)))
-    if not sure or falls.sum() < least:
+    lowest_fall = max(
+        LEAST_FALL * float((end - after).sum()), LEAST_OF_RANGE * float(np.ptp(other))
+    )
+    if not sure or falls.sum() < lowest_fall:
         return None
     return _enough(first, last, np.ones(count, dtype=np.bool_))
 

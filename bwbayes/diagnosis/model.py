@@ -89,8 +89,8 @@ def _changed(
     if posterior is None:
         return
     places = []
-    for place, start in product(scene.places, starts):
-        values = {**dict(zip(scene.posterior.names, place, strict=True)), **start}
+    for coordinates, start in product(scene.places, starts):
+        values = {**dict(zip(scene.posterior.names, coordinates, strict=True)), **start}
         places.append([values.get(name, 0.0) for name in posterior.names])
     fit = scene.climbed(posterior, np.array(places))
     fix = _lines(changes)

@@ -63,12 +63,12 @@ def growing_noise(scene: Scene) -> Iterator[Explanation]:
 def _grown(white: FloatArray, growth: FloatArray) -> tuple[float, float]:
     """Return the nats that b adds, with b ~ N(0, 1), and b."""
 
-    def cost(place: FloatArray) -> float:
-        level, slope = place
+    def cost(coordinates: FloatArray) -> float:
+        level, slope = coordinates
         logs = level + slope * growth
         return float(np.sum(logs + 0.5 * white**2 * np.exp(-2 * logs)) + 0.5 * slope**2)
 
-    found = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
+    optimum = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
     level = np.log(np.sqrt(np.mean(white**2)))
-    gained = cost(np.array([level, 0.0])) - float(found.fun)
-    return gained - 0.5 * float(np.log(1 + 2 * white.size)), float(found.x[1])
+    gained = cost(np.array([level, 0.0])) - float(optimum.fun)
+    return gained - 0.5 * float(np.log(1 + 2 * white.size)), float(optimum.x[1])

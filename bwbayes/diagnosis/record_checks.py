@@ -76,9 +76,13 @@ def inspect(record: Record) -> tuple[Finding, ...]:
         return (*findings, *spiky)
     loop = fit_loop(record)
     unlike = [*_relation(record, loop)]
-    if {"few readings", "coarse sampling"} & {one.kind for one in findings}:
+    if {"few readings", "coarse sampling"} & {finding.kind for finding in findings}:
         # Of so little only the most obvious can be said.
-        return (*findings, *(one for one in unlike if one.kind == "no relation"), *spiky)
+        return (
+            *findings,
+            *(finding for finding in unlike if finding.kind == "no relation"),
+            *spiky,
+        )
     unlike += [*_stuck(record), *_clipping(record), *_clipped_drive(record)]
     findings += [*unlike, *spiky]
     if not unlike:
@@ -157,8 +161,8 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     levels = np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    least = max(SPIKE_PART * extent, 6 * resolution)
-    near = spikes(displacement, drive, least, ends=ends)
+    threshold = max(SPIKE_PART * extent, 6 * resolution)
+    near = spikes(displacement, drive, threshold, ends=ends)
     isolated = np.union1d(gross, others[near])
     return rows[isolated] if isolated.size <= MOST_SPIKES * rows.size else rows[:0]
 
@@ -231,19 +235,18 @@ def _stuck(record: Record) -> Iterator[Finding]:
     assert record.displacement is not None
     rows = np.flatnonzero(record.has_reading)
     voltage, displacement = record.voltage[rows], _readings(record)
-    some = repeated(voltage, displacement)
-    if some is not None:
-        text = (
-            f"{some.samples} samples repeat the one before, voltage and displacement, and then jump"
-        )
-        yield _where(record, rows, "repeated samples", text, some)
+    stuck = repeated(voltage, displacement)
+    if stuck is not None:
+        count = f"{stuck.samples} samples repeat"
+        text = f"{count} the one before, voltage and displacement, and then jump"
+        yield _where(record, rows, "repeated samples", text, stuck)
         return
-    some = held(voltage, displacement)
-    if some is not None:
+    stuck = held(voltage, displacement)
+    if stuck is not None:
         text = (
-            f"{some.samples} readings repeat the one before and then jump, while the voltage moves"
+            f"{stuck.samples} readings repeat the one before and then jump, while the voltage moves"
         )
-        yield _where(record, rows, "held readings", text, some)
+        yield _where(record, rows, "held readings", text, stuck)
 
 
 def _where(record: Record, rows: IntArray, kind: str, text: str, stuck: Stuck) -> Finding:
@@ -268,11 +271,11 @@ def _clipping(record: Record) -> Iterator[Finding]:
     rows = np.flatnonzero(record.has_reading)
     voltage, displacement = record.voltage[rows], _readings(record)
     for side, sign in (("largest", 1.0), ("smallest", -1.0)):
-        some = clipped(sign * displacement, voltage)
-        if some is not None:
-            value = displacement[some.first[0]]
-            text = f"{some.samples} readings stay at the {side} value, {value:g} um, while the "
-            yield _where(record, rows, "clipping", text + "voltage moves", some)
+        stuck = clipped(sign * displacement, voltage)
+        if stuck is not None:
+            value = displacement[stuck.first[0]]
+            text = f"{stuck.samples} readings stay at the {side} value, {value:g} um, while the "
+            yield _where(record, rows, "clipping", text + "voltage moves", stuck)
 
 
 def _clipped_drive(record: Record) -> Iterator[Finding]:
@@ -285,12 +288,12 @@ def _clipped_drive(record: Record) -> Iterator[Finding]:
         if runs(at_end)[1].max() < SHORTEST_AT_END or (~at_end[rows]).sum() < LEAST_READINGS:
             continue
         loop = fit_loop(record, at_end)
-        some = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
-        if some is not None:
+        stuck = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
+        if stuck is not None:
             text = (
-                f"{some.samples} voltages stay at the {side} value, "
-                f"{record.voltage[rows[some.first[0]]]:g} V, while the displacement goes on and "
-                f"returns, first at {record.clock(record.time[rows[some.first[0]]])} s"
+                f"{stuck.samples} voltages stay at the {side} value, "
+                f"{record.voltage[rows[stuck.first[0]]]:g} V, while the displacement goes on and "
+                f"returns, first at {record.clock(record.time[rows[stuck.first[0]]])} s"
             )
             yield _whole(record, "clipping", text, "record the voltage over its whole range")
 
@@ -301,8 +304,8 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     usual, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
     velocity = float(np.quantile(steps, 0.99)) / record.interval
-    left = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
-    alone = max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * left)
+    lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
+    alone = max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * lagged)
     # With another hysteretic state at the start, which steps of the voltage do not show.
     moving = np.count_nonzero(steps) > steps.size / 2
     in_all = max(START_SDS * usual, START_PART * extent)
@@ -330,8 +333,8 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     if loop.decay.time > LONG_DECAY * record.duration:
         size -= loop.decay.size * (1 - float(np.exp(-record.duration / loop.decay.time)))
     told = max(loop.trend_told, 1e-12)
-    least = max(TREND_SDS * usual / np.sqrt(told), TREND_PART * extent)
-    if told > TREND_TOLD and abs(size) > least:
+    threshold = max(TREND_SDS * usual / np.sqrt(told), TREND_PART * extent)
+    if told > TREND_TOLD and abs(size) > threshold:
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")

@@ -138,7 +138,7 @@ class Scene:
             places = np.concatenate([optima, point.optima])
         except InputError:
             pass  # the rest has too few readings for these priors
-        fits = [climb(posterior, place[np.newaxis]) for place in places]
+        fits = [climb(posterior, optimum[np.newaxis]) for optimum in places]
         best = max(fits, key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = np.concatenate([best.coordinates[np.newaxis], places])

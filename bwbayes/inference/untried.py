@@ -59,7 +59,7 @@ def with_creep(
     generator
         Draws the strengths.
     """
-    if any(one.actuator.creep for one in posterior.datasets):
+    if any(dataset.actuator.creep for dataset in posterior.datasets):
         return posterior, draws
     creep = _creep(posterior, duration)
     extended = _extended(posterior, creep)
@@ -92,12 +92,16 @@ def with_creep(
 def _creep(posterior: Posterior, duration: float) -> Creep:
     """Return creep from what is as fast as the drives that were fitted to a plan's length."""
     turns = [
-        time_between_turns(one.voltage, one.actuator.interval, one.training)
-        for one in posterior.datasets
+        time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
+        for dataset in posterior.datasets
     ]
-    interval = max(min(one.actuator.interval for one in posterior.datasets), min(turns) / FAST)
-    longest = max(one.voltage.size * one.actuator.interval for one in posterior.datasets)
-    spans = [one.span for one in posterior.datasets]
+    interval = max(
+        min(dataset.actuator.interval for dataset in posterior.datasets), min(turns) / FAST
+    )
+    longest = max(
+        dataset.voltage.size * dataset.actuator.interval for dataset in posterior.datasets
+    )
+    spans = [dataset.span for dataset in posterior.datasets]
     span = Span(min(span.low for span in spans), max(span.high for span in spans))
     return Creep(tuple(creep_times(interval, max(duration, longest))), reference=span)
 
@@ -107,26 +111,26 @@ def _extended(posterior: Posterior, creep: Creep) -> Posterior:
     datasets = tuple(
         replace(one, actuator=replace(one.actuator, creep=creep)) for one in posterior.datasets
     )
-    known = {parameter.name: parameter for parameter in posterior.prior.parameters}
-    known |= {one.name: Parameter.of(one, creep.strength) for one in creep.parameters}
+    declared = {parameter.name: parameter for parameter in posterior.prior.parameters}
+    declared |= {one.name: Parameter.of(one, creep.strength) for one in creep.parameters}
     joint = replace(posterior.table, table=datasets[0].table)
-    prior = JointPrior((known[name] for name in joint.names), posterior.prior.constraint)
+    prior = JointPrior((declared[name] for name in joint.names), posterior.prior.constraint)
     return Posterior(datasets, prior, posterior.engine, joint)
 
 
-def _score(posterior: Posterior, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _score(posterior: Posterior, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return u (free,) and I (free, free) of the coordinates at a place (free,)."""
-    steps = STEP * np.eye(place.size)
-    around = np.concatenate([[place], place + steps, place - steps])
+    steps = STEP * np.eye(coordinates.size)
+    around = np.concatenate([[coordinates], coordinates + steps, coordinates - steps])
     theta = posterior.prior.theta(posterior.prior.constrain(around)[0])
-    pull, information = np.zeros(place.size), np.zeros((place.size, place.size))
-    for one, likelihood in zip(posterior.datasets, posterior.likelihoods, strict=True):
-        own = posterior.table.of(theta, one.name)
-        voltage = one.voltage[: one.readings.samples]
-        model = one.table.actuator(own)
-        simulated = likelihood.simulate(model, voltage)[:, one.readings.rows]
-        here, plus, minus = np.split(simulated, [1, 1 + place.size])
-        score = likelihood.score(own[:1], (plus - minus) / (2 * STEP), here)
+    pull, information = np.zeros(coordinates.size), np.zeros((coordinates.size, coordinates.size))
+    for dataset, likelihood in zip(posterior.datasets, posterior.likelihoods, strict=True):
+        its_theta = posterior.table.of(theta, dataset.name)
+        voltage = dataset.voltage[: dataset.readings.samples]
+        model = dataset.table.actuator(its_theta)
+        simulated = likelihood.simulate(model, voltage)[:, dataset.readings.rows]
+        here, plus, minus = np.split(simulated, [1, 1 + coordinates.size])
+        score = likelihood.score(its_theta[:1], (plus - minus) / (2 * STEP), here)
         pull += score.pull[0]
         information += score.information[0]
     return pull, information

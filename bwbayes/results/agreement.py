@@ -140,14 +140,14 @@ def agreements(
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
     for name, alone, its in posterior.each(free):
-        known = _with_noise(alone, its)
-        own = pointfit.fit(known, generator)
-        best, _ = known.prior.constrain(own.mode[np.newaxis])
+        with_noise = _with_noise(alone, its)
+        own = pointfit.fit(with_noise, generator)
+        best, _ = with_noise.prior.constrain(own.mode[np.newaxis])
         rows = alone.only.readings.rows
-        missed, own_missed = _residuals(alone, its), _residuals(known, best)
-        distance, degrees, moved = _apart(posterior, point, known, own)
+        missed, own_missed = _residuals(alone, its), _residuals(with_noise, best)
+        distance, degrees, moved = _apart(posterior, point, with_noise, own)
         white = innovations(alone, its[0]).white
-        some = slice(None, None, -(-rows.size // KEPT))
+        kept = slice(None, None, -(-rows.size // KEPT))
         first = (begin or {}).get(name, 0.0)
         compared[name] = Agreement(
             float(np.sqrt(np.mean(missed**2))),
@@ -157,9 +157,9 @@ def agreements(
             moved,
             float(np.sqrt(np.mean(white**2))),
             rows.size,
-            first + alone.only.actuator.interval * rows[some].astype(np.float64),
-            missed[some],
-            own_missed[some],
+            first + alone.only.actuator.interval * rows[kept].astype(np.float64),
+            missed[kept],
+            own_missed[kept],
         )
     return compared
 
@@ -182,7 +182,7 @@ def _residuals(alone: Posterior, free: FloatArray) -> FloatArray:
 
 
 def _apart(
-    posterior: Posterior, point: PointFit, alone: Posterior, own: PointFit
+    posterior: Posterior, point: PointFit, alone: Posterior, its_point: PointFit
 ) -> tuple[float, float, tuple[str, float]]:
     """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off."""
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
@@ -193,26 +193,26 @@ def _apart(
     here = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
     precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
-    taken = own.covariance - linalg.inv(precision)[np.ix_(here, here)]
-    added = linalg.inv(own.covariance) - linalg.inv(own.prior_covariance)
+    taken = its_point.covariance - linalg.inv(precision)[np.ix_(here, here)]
+    added = linalg.inv(its_point.covariance) - linalg.inv(its_point.prior_covariance)
     weights = np.maximum(linalg.eigvals(added @ taken).real, 0.0)
     if not weights.sum() > TAKEN:
         return 0.0, 0.0, ("", 0.0)
     unit = float(np.sum(weights**2) / np.sum(weights))
-    moved = own.mode - point.mode[columns]
-    spread = np.sqrt(np.maximum(np.diag(taken), TAKEN * np.diag(own.covariance)))
+    moved = its_point.mode - point.mode[columns]
+    spread = np.sqrt(np.maximum(np.diag(taken), TAKEN * np.diag(its_point.covariance)))
     shared = [i for i, name in enumerate(alone.names) if name in posterior.names]
     away = moved[shared] / spread[shared]
     worst = int(np.argmax(np.abs(away)))
     farthest = alone.names[shared[worst]], float(away[worst])
-    cost = max(_cost(alone, own.mode, point.mode[columns]), 0.0)
+    cost = max(_cost(alone, its_point.mode, point.mode[columns]), 0.0)
     return cost / unit, float(np.sum(weights)) / unit, farthest
 
 
-def _cost(alone: Posterior, own: FloatArray, joint: FloatArray) -> float:
+def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
     """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
-    step = STEP * (joint - own)
-    places = np.stack([own, joint, own + step, own - step])
+    step = STEP * (joint - coordinates)
+    places = np.stack([coordinates, joint, coordinates + step, coordinates - step])
     _, log_prior = alone.prior.constrain(places)
     log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
     # At the mode, the likelihood's slope is the prior's turned round.

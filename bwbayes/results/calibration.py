@@ -55,9 +55,6 @@ LARGEST_UNCONVERGED = 0.01
 LIMIT = 3.0
 JUDGED_FROM = 500
 
-# Probability of the binomial limits around the coverage of intervals.
-LIMITS = 0.99
-
 # Points at which the distribution functions of ranks are held against their band.
 POINTS = 49
 
@@ -201,7 +198,12 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
     p = smooth_test(positions)
     adjusted, outside = holm(p), ecdf.left(positions)
     statistics = {
-        name: Uniformity(float(p[i]), float(adjusted[i]), bool(outside[i]), _covered(column))
+        name: Uniformity(
+            float(p[i]),
+            float(adjusted[i]),
+            bool(outside[i]),
+            {level: float(np.mean(np.abs(column - 0.5) < level / 200)) for level in LEVELS},
+        )
         for i, (name, column) in enumerate(zip(names, positions.T, strict=True))
     }
     unconverged = tuple(entry["number"] for entry in entries if not entry["converged"])
@@ -283,9 +285,9 @@ def ecdf_band(count: int, level: float) -> EcdfBand:
     # log γ between values that certainly leave the band and certainly keep inside.
     high, low = 0.0, np.log(level) - np.log(2 * POINTS)
     for _ in range(40):
-        middle = (low + high) / 2
-        inside = _stays_inside(count, *_pointwise(count, points, np.exp(middle)))
-        low, high = (middle, high) if inside >= 1 - level else (low, middle)
+        center = (low + high) / 2
+        inside = _stays_inside(count, *_pointwise(count, points, np.exp(center)))
+        low, high = (center, high) if inside >= 1 - level else (low, center)
     lower, upper = _pointwise(count, points, np.exp(low))
     return EcdfBand(points, lower / count, upper / count)
 
@@ -317,13 +319,8 @@ def _legendre(u: FloatArray) -> FloatArray:
     return np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u * (u - 1) + 1)])
 
 
-def _covered(positions: FloatArray) -> dict[int, float]:
-    """Part of the truths (replicates,) in the central interval of each level."""
-    return {level: float(np.mean(np.abs(positions - 0.5) < level / 200)) for level in LEVELS}
-
-
 def _binomial_limits(count: int, level: int) -> tuple[float, float]:
-    low, high = scipy.stats.binom.interval(LIMITS, count, level / 100)
+    low, high = scipy.stats.binom.interval(0.99, count, level / 100)
     return float(low / count), float(high / count)
 
 

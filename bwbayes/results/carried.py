@@ -69,15 +69,15 @@ def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) ->
         likelihood.readings,
         likelihood.spaced.steady_state(likelihood.table.noise(theta)),
     )
-    own, sensor = steady.predicted + steady.surplus, steady.variance - steady.predicted
-    mean, unsure = np.zeros(len(theta)), own.copy()
+    discrepancy, sensor = steady.predicted + steady.surplus, steady.variance - steady.predicted
+    mean, unsure = np.zeros(len(theta)), discrepancy.copy()
     residual = readings.values - simulated
     for t, missing in enumerate(readings.skipped.tolist()):
         if t:
             kept = np.exp(-(1 + missing) * steady.rate)
-            mean, unsure = kept * mean, own - kept**2 * (own - unsure)
+            mean, unsure = kept * mean, discrepancy - kept**2 * (discrepancy - unsure)
         total = unsure + sensor
         gain = np.divide(unsure, total, out=np.zeros_like(total), where=total > 0)
         mean, unsure = mean + gain * (residual[:, t] - mean), gain * sensor
     last = int(readings.rows[-1])
-    return Carried(last, mean, np.maximum(own - unsure, 0.0), steady.rate / readings.stride)
+    return Carried(last, mean, np.maximum(discrepancy - unsure, 0.0), steady.rate / readings.stride)

@@ -135,10 +135,10 @@ class Residuals:
             float(np.mean((bands.upper[kind, 90] - bands.lower[kind, 90])[rows] ** 2)) / 3.29**2
             for kind in KINDS
         ]
-        least = 1e-12 * max(variances[2], 1e-300)
-        discrepancy, sensor = np.sqrt(np.maximum(np.diff(variances), least))
+        floor = 1e-12 * max(variances[2], 1e-300)
+        discrepancy, sensor = np.sqrt(np.maximum(np.diff(variances), floor))
         if memory <= 0:
-            discrepancy = np.sqrt(least)
+            discrepancy = np.sqrt(floor)
         shape = (mean - np.mean(mean)) / (np.std(mean) or 1.0)
         varying = np.sqrt(max(variances[0] - bands.common_sd**2, 0.0))
         expected = np.stack([np.full(rows.size, bands.common_sd), varying * shape], axis=1)

@@ -53,7 +53,7 @@ def coverage(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[
     """Say where fewer readings lie in the sensor band than promised, with the chance of that."""
     assert bands.measured is not None
     worth = standard.for_size
-    found = []
+    chances = []
     for level in reversed(LEVELS):
         covered = float(np.mean(bands.covers("sensor", level, bands.measured)[judged]))
         nominal = level / 100
@@ -67,8 +67,8 @@ def coverage(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[
             scipy.stats.norm.isf((1 - nominal) / 2) / standard.scales
         )
         chance = float(np.mean(special.betainc(worth - hits, hits + 1, 1 - within)))
-        found.append((f"the {level}% sensor band covers {percent(covered)} of readings", chance))
-    return _least_likely(found)
+        chances.append((f"the {level}% sensor band covers {percent(covered)} of readings", chance))
+    return _least_likely(chances)
 
 
 def size(standard: Standard) -> list[tuple[str, float]]:
@@ -76,7 +76,7 @@ def size(standard: Standard) -> list[tuple[str, float]]:
 
     As they are, and about their mean: an offset's error is one and the same for all of them.
     """
-    found = []
+    chances = []
     for z, worth, about in (
         (standard.z, standard.for_size, ""),
         (standard.varying, standard.for_varying, " about their mean"),
@@ -86,8 +86,8 @@ def size(standard: Standard) -> list[tuple[str, float]]:
         if square > ODDS:
             ratio = f"{np.sqrt(square):.2g} times as large{about}"
             text = f"the residuals are {ratio} as the sensor band predicts"
-            found.append((text, chance))
-    return _least_likely(found)
+            chances.append((text, chance))
+    return _least_likely(chances)
 
 
 def leaning(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[str, float]]:
@@ -106,8 +106,8 @@ def leaning(bands: Bands, judged: BoolArray, standard: Standard) -> list[tuple[s
 
 def _least_likely(found: list[tuple[str, float]]) -> list[tuple[str, float]]:
     """Return the least likely of what was found, if that is not likely."""
-    least = min(found, key=lambda pair: pair[1], default=None)
-    return [least] if least and least[1] < DOUBT else []
+    rarest = min(found, key=lambda pair: pair[1], default=None)
+    return [rarest] if rarest and rarest[1] < DOUBT else []
 
 
 def too_wide(standard: Standard) -> list[str]:
@@ -152,6 +152,6 @@ def missed(bands: Bands, judged: BoolArray, extent: float) -> list[str]:
     return [f"NRMSE {percent(rms / extent)} on the training readings"]
 
 
-def percent(part: float) -> str:
+def percent(share: float) -> str:
     """Return a part in percent."""
-    return f"{100 * part:.3g}%"
+    return f"{100 * share:.3g}%"

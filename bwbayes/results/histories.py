@@ -104,8 +104,8 @@ class States:
         self.ordered = np.stack([low, high])
         if alone:
             ranges = narrower(actuator.span, further=(1.0,))
-            left = [operator.left(column, voltage, swept) for swept in ranges]
-            self.ordered = np.sort(np.concatenate(left), axis=0)
+            states = [operator.left(column, voltage, swept) for swept in ranges]
+            self.ordered = np.sort(np.concatenate(states), axis=0)
             self.ordered[0] = np.minimum(self.ordered[0], low)
             self.ordered[-1] = np.maximum(self.ordered[-1], high)
 

@@ -165,9 +165,9 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
         low, high = parameter.limits(prior.seen(columns, parameter.record))
         if parameter.name not in names or not (np.isfinite(low) & np.isfinite(high)).all():
             continue
-        place = (columns[parameter.name] - low) / (high - low)
+        fraction = (columns[parameter.name] - low) / (high - low)
         # What may be anything between its bounds has a sd of 0.29 of their distance.
-        if np.std(place) > ANYWHERE:
+        if np.std(fraction) > ANYWHERE:
             assert parameter.declared is not None
             return f"only {parameter.declared.stated_bounds} bounds {parameter.name}"
     swayed = sway(prior, draws, names)
@@ -190,9 +190,9 @@ def _decider(prior: JointPrior, draws: FloatArray, names: Sequence[str]) -> str:
 def _advice(posterior: Posterior, draws: FloatArray, names: Sequence[str]) -> str:
     """Say what to measure instead."""
     swings, half = [], 0.0
-    for one in posterior.datasets:
-        for window in one.training:
-            voltage = one.voltage[window]
+    for dataset in posterior.datasets:
+        for window in dataset.training:
+            voltage = dataset.voltage[window]
             half = max(half, float(np.ptp(voltage)) / 2)
             swings += np.abs(np.diff(voltage[turning_points(voltage)])).tolist()
     first = posterior.datasets[0]
@@ -227,12 +227,12 @@ def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatAr
     """
     columns = _columns(posterior, posterior.table.physical)
     steps = _steps(posterior, point.mode, columns)
-    told = sum(_information(posterior, point, one, steps) for one in posterior.datasets)
-    left = linalg.inv(np.eye(len(columns)) + told)
+    told = sum(_information(posterior, point, dataset, steps) for dataset in posterior.datasets)
+    remaining = linalg.inv(np.eye(len(columns)) + told)
     loop = [
         i for i, column in enumerate(columns) if posterior.names[column] in posterior.table.loop
     ]
-    variance, directions = linalg.eigh(left[np.ix_(loop, loop)])
+    variance, directions = linalg.eigh(remaining[np.ix_(loop, loop)])
     return np.sqrt(variance[::-1]), directions[:, ::-1]
 
 
@@ -258,10 +258,10 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
     """Return a parameter's prior sd around its value in ``values``."""
     assert parameter.prior is not None
     others = {name: np.array([value]) for name, value in values.items()}
-    least, most = parameter.limits(prior.seen(others, parameter.record))
-    if np.isfinite(least).all() and np.isfinite(most).all():
+    lowest, most = parameter.limits(prior.seen(others, parameter.record))
+    if np.isfinite(lowest).all() and np.isfinite(most).all():
         # What the bounds leave to a parameter of which nothing else is known.
-        return float(np.max(most) - np.min(least)) / float(np.sqrt(12))
+        return float(np.max(most) - np.min(lowest)) / float(np.sqrt(12))
     # Half of the central 68 % stands for the sd: some distributions have none.
     low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
     if parameter.positive:
@@ -270,21 +270,21 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
 
 
 def _information(
-    posterior: Posterior, point: PointFit, one: Dataset, steps: tuple[FloatArray, FloatArray]
+    posterior: Posterior, point: PointFit, dataset: Dataset, steps: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
     """Fisher information (physical, physical) of a record, each distinct stretch counted once."""
-    rows = np.concatenate([np.arange(w.start, w.stop) for w in one.training])
+    rows = np.concatenate([np.arange(w.start, w.stop) for w in dataset.training])
     # Change of the displacement per prior sd of each parameter, (physical, samples), um.
-    plus, minus = np.split(posterior.simulate(np.concatenate(steps), record=one.name), 2)
+    plus, minus = np.split(posterior.simulate(np.concatenate(steps), record=dataset.name), 2)
     slopes = (plus - minus) / (2 * STEP)
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
-    sds = one.noise.marginal_sd(one.table.noise(posterior.table.of(theta, one.name)))
-    weights, duration = stretches_once(one.voltage, rows)
+    sds = dataset.noise.marginal_sd(dataset.table.noise(posterior.table.of(theta, dataset.name)))
+    weights, duration = stretches_once(dataset.voltage, rows)
     # A discrepancy that belongs to the path changes over about half a stretch.
     noise = DiscrepancyNoise(1.0)
-    values = np.array([[sds[1][0], DISCREPANCY * one.extent, duration / 2]])
+    values = np.array([[sds[1][0], DISCREPANCY * dataset.extent, duration / 2]])
     total = np.zeros((slopes.shape[0], slopes.shape[0]))
-    for window in one.training:
+    for window in dataset.training:
         (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])
         total += (white * weights[window]) @ white.T
     return total
@@ -303,9 +303,9 @@ def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, flo
     samples = np.array([np.sum(used[s.first + 1 : s.last + 1]) for s in stretches])
     longest = np.zeros(kind.max() + 1)
     np.maximum.at(longest, kind, samples)
-    part = np.maximum(longest, 1) / np.maximum(np.bincount(kind, samples), 1)
+    share = np.maximum(longest, 1) / np.maximum(np.bincount(kind, samples), 1)
     weights = np.empty(voltage.size)
-    for stretch, weight in zip(stretches, part[kind], strict=True):
+    for stretch, weight in zip(stretches, share[kind], strict=True):
         weights[stretch.first : stretch.last + 1] = weight
     return weights, voltage.size / len(stretches)
 

@@ -120,8 +120,8 @@ class Innovations:
             "voltage": (self.voltage, ("low", "middle", "high")),
         }[what]
         edges = np.quantile(values, np.linspace(0, 1, GROUPS + 1)[1:-1])
-        place = np.searchsorted(edges, values)
-        return tuple((name, self.white[place == i]) for i, name in enumerate(names))
+        bins = np.searchsorted(edges, values)
+        return tuple((name, self.white[bins == i]) for i, name in enumerate(names))
 
 
 def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> Innovations:

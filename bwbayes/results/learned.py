@@ -182,12 +182,12 @@ def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -
     variances, directions = linalg.eigh(posterior, prior)
     said: list[Combination] = []
     for i in range(len(variances) - 1, -1, -1):
-        left = float(np.sqrt(max(variances[i], 0.0)))
-        if left < LEFT_OPEN or len(said) == COMBINATIONS:
+        sd = float(np.sqrt(max(variances[i], 0.0)))
+        if sd < LEFT_OPEN or len(said) == COMBINATIONS:
             break
         # How the scores move together along it, and not what picks it out.
         move = posterior @ directions[:, i]
-        said.append(Combination(combined(move, names), left))
+        said.append(Combination(combined(move, names), sd))
     return said
 
 

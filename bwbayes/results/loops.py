@@ -176,16 +176,16 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
         A voltage that does not change, or an even number of points.
     """
     _, alone, its = next(posterior.each(draws))
-    one = alone.only
-    actuator = one.actuator.within(one.voltage)
-    column = one.table.columns(alone.prior.theta(its))
+    dataset = alone.only
+    actuator = dataset.actuator.within(dataset.voltage)
+    column = dataset.table.columns(alone.prior.theta(its))
     every = [record.voltage for record in posterior.datasets]
     span = Span(min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every))
-    middle, half = span.middle, span.half
+    center, half = span.middle, span.half
     voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
     return Loops(
         _loop(steady_loop(actuator, column, span.low, span.high, points)),
-        _loop(steady_loop(actuator, column, middle - half / 2, middle + half / 2, points)),
+        _loop(steady_loop(actuator, column, center - half / 2, center + half / 2, points)),
         voltage,
         Curve.of(curve),
     )
@@ -280,13 +280,13 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
     """
     voltage, rising, falling = traced.voltage, traced.rising, traced.falling
     top, bottom = rising[:, -1], falling[:, 0]
-    middle = (top + bottom) / 2
+    mean_path = (top + bottom) / 2
     gap = falling - rising
     size = top - bottom
     # A displacement may fall with the voltage.
     sign = np.where(size < 0, -1.0, 1.0)
     passed = [
-        _crossing(voltage, sign[:, np.newaxis] * (branch - middle[:, np.newaxis]))
+        _crossing(voltage, sign[:, np.newaxis] * (branch - mean_path[:, np.newaxis]))
         for branch in (rising, falling)
     ]
     through_zero = bool(voltage[0] < 0 < voltage[-1])
@@ -294,7 +294,7 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         "range_um": size,
         "opening_um": _at_zero(voltage, gap) if through_zero else None,
         "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
-        "remanence_um": _at_zero(voltage, falling) - middle if through_zero else None,
+        "remanence_um": _at_zero(voltage, falling) - mean_path if through_zero else None,
         "coercive_V": (passed[0] - passed[1]) / 2,
         "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),
     }
@@ -302,28 +302,28 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
 
 def numbers(loops: Loops) -> dict[str, object]:
     """Return the loops as ``summary.json`` holds them, the initial curve at some voltages."""
-    some, curve = slice(None, None, EVERY), loops.initial
+    thinned, curve = slice(None, None, EVERY), loops.initial
     return {
         "major": _numbers(loops.major),
         "minor": _numbers(loops.minor),
         "initial_curve": {
-            "voltage_V": loops.initial_voltage[some].tolist(),
-            "mean_um": curve.mean[some].tolist(),
-            "lower_95_um": curve.lower[some].tolist(),
-            "upper_95_um": curve.upper[some].tolist(),
+            "voltage_V": loops.initial_voltage[thinned].tolist(),
+            "mean_um": curve.mean[thinned].tolist(),
+            "lower_95_um": curve.lower[thinned].tolist(),
+            "upper_95_um": curve.upper[thinned].tolist(),
         },
     }
 
 
 def _numbers(loop: Loop) -> dict[str, object]:
-    known: dict[str, object] = {
+    numbers: dict[str, object] = {
         "from_V": float(loop.voltage[0]),
         "to_V": float(loop.voltage[-1]),
         "amplitude_V": loop.amplitude,
         "closed": loop.closed,
     }
     estimates = {n: None if e is None else e.summary() for n, e in loop.estimates.items()}
-    return known | estimates
+    return numbers | estimates
 
 
 def _loop(traced: Traced) -> Loop:
@@ -362,8 +362,8 @@ def _gain(actuator: Actuator, column: Values, voltage: FloatArray) -> FloatArray
 def _at_zero(voltage: FloatArray, branch: FloatArray) -> FloatArray:
     """Return a branch (models, points) at zero volts, (models,)."""
     after = int(np.searchsorted(voltage, 0.0))
-    part = voltage[after] / (voltage[after] - voltage[after - 1])
-    between: FloatArray = part * branch[:, after - 1] + (1 - part) * branch[:, after]
+    fraction = voltage[after] / (voltage[after] - voltage[after - 1])
+    between: FloatArray = fraction * branch[:, after - 1] + (1 - fraction) * branch[:, after]
     return between
 
 

@@ -65,9 +65,9 @@ def quantile(ranked: Floating, probability: float) -> Floating:
     The i-th of N values is the quantile of (i + 1/2) / N, with straight lines in between.
     """
     count = ranked.shape[1]
-    place = min(max(probability * count - 0.5, 0.0), count - 1.0)
-    below, above = ranked[:, math.floor(place)], ranked[:, math.ceil(place)]
-    line: Floating = below + (place % 1) * (above - below)
+    rank = min(max(probability * count - 0.5, 0.0), count - 1.0)
+    below, above = ranked[:, math.floor(rank)], ranked[:, math.ceil(rank)]
+    line: Floating = below + (rank % 1) * (above - below)
     return line
 
 

@@ -107,11 +107,11 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
     """
     temporary = path.with_suffix(".partial")
     with temporary.open("w", encoding="utf-8") as file:
-        for number, one in enumerate(bands):
-            names, columns = zip(*one.columns(), strict=True)
+        for number, predicted in enumerate(bands):
+            names, columns = zip(*predicted.columns(), strict=True)
             if number == 0:
                 file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
-            prefix = f"{one.name}," if len(bands) > 1 else ""
+            prefix = f"{predicted.name}," if len(bands) > 1 else ""
             row = prefix + ",".join(_format(n, c) for n, c in zip(names, columns, strict=True))
             row += "\n"
             file.writelines(row % values for values in zip(*columns, strict=True))

@@ -36,7 +36,7 @@ def crossings(path: FloatArray) -> Crossings:
 def passed(displacement: FloatArray, path: FloatArray, at: IntArray, level: float) -> FloatArray:
     """Displacement (models,) where a path passes a level, the mean over all passages, um."""
     before, after = path[at], path[at + 1]
-    part = (level - before) / (after - before)
-    passed = displacement[:, at] * (1 - part) + displacement[:, at + 1] * part
+    fraction = (level - before) / (after - before)
+    passed = displacement[:, at] * (1 - fraction) + displacement[:, at + 1] * fraction
     mean: FloatArray = np.mean(passed, axis=1)
     return mean

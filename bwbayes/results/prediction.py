@@ -100,7 +100,7 @@ def predict_windows(
     theta = posterior.prior.theta(draws)
     mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
-    edges = [(part.start, part.stop) for parts in several.values() for part in parts]
+    edges = [(window.start, window.stop) for parts in several.values() for window in parts]
     first = min(start for start, _ in edges)
     whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)), watch)
     bands = []
@@ -108,7 +108,7 @@ def predict_windows(
         training = any(
             w.start < p.stop and p.start < w.stop for w in posterior.only.training for p in parts
         )
-        moved = [slice(part.start - first, part.stop - first) for part in parts]
+        moved = [slice(window.start - first, window.stop - first) for window in parts]
         bands.append(replace(whole.within(moved), name=name, training=training))
     return bands
 
@@ -151,9 +151,9 @@ def forecast(
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
-    begun = fitted(posterior, theta, generator)
-    begun = going_on(begun, posterior.likelihood, theta, generator)
-    return _bands(name, _draws(posterior, theta, begun), longer, after)
+    start_states = fitted(posterior, theta, generator)
+    start_states = going_on(start_states, posterior.likelihood, theta, generator)
+    return _bands(name, _draws(posterior, theta, start_states), longer, after)
 
 
 def predict_record(
@@ -191,14 +191,14 @@ def predict_record(
     InputError
         A lead-in or window that does not fit into the record.
     """
-    part = slice(0, record.samples) if window is None else record.window_slice(*window)
+    predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
-    begun = started(posterior, theta, record, start, generator)
-    if part.stop <= begun.judged_from:
+    start_states = started(posterior, theta, record, start, generator)
+    if predicted_window.stop <= start_states.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, _draws(posterior, theta, begun), record, part, watch)
-    scored_from = max(begun.judged_from - part.start, 0)
-    return replace(bands, scored_from=scored_from, lead_in=begun.lead_in, separate=True)
+    bands = _bands(name, _draws(posterior, theta, start_states), record, predicted_window, watch)
+    scored_from = max(start_states.judged_from - predicted_window.start, 0)
+    return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
@@ -222,8 +222,8 @@ def _bands(
     pending: deque[tuple[int, Future[dict[str, Floating]]]] = deque()
 
     def put() -> None:
-        first, part = pending.popleft()
-        for key, values in part.result().items():
+        first, piece = pending.popleft()
+        for key, values in piece.result().items():
             joined[key][first : first + values.size] = values
         watch(values.size)
 

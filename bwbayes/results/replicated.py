@@ -102,7 +102,7 @@ def replicated(
     theta = posterior.prior.theta(chosen)
     rows = dataset.readings.rows
     noise = dataset.table.noise(posterior.table.of(theta, dataset.name))
-    middle, spread = _moments(posterior.simulations(theta, rows, record))
+    mean, spread = _moments(posterior.simulations(theta, rows, record))
     variance = np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0)
     sd = np.sqrt(np.mean(variance) + spread)
     voltage, samples = dataset.voltage[rows], int(rows[-1]) + 1
@@ -110,7 +110,7 @@ def replicated(
     neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
 
     def looked_at(readings: FloatArray) -> FloatArray:
-        return _statistics(readings, voltage, middle, sd, neighbors)
+        return _statistics(readings, voltage, mean, sd, neighbors)
 
     pieces, noises_left = [], iter(noise)
     # Once more, rather than to keep them all.
@@ -174,13 +174,13 @@ def _statistics(
     lag = np.sum(centered[:, at] * centered[:, at + 1], axis=1)
     frequency, power = scipy.signal.periodogram(residual, detrend="constant")
     whole = np.sum(power, axis=1)
-    place = frequency / frequency[-1]
-    slow, fast = (np.sum(power[:, part], axis=1) for part in (place <= SLOW, place > MIDDLE))
+    relative = frequency / frequency[-1]
+    slow, fast = (np.sum(power[:, band], axis=1) for band in (relative <= SLOW, relative > MIDDLE))
     pit = ndtr(residual / sd)
     # ∮ y du, by trapezes; turns of either direction count with their sign.
     area = np.sum(0.5 * (readings[:, 1:] + readings[:, :-1]) * np.diff(voltage), axis=1)
 
-    def part(of: FloatArray, all_of: FloatArray) -> FloatArray:
+    def ratio(of: FloatArray, all_of: FloatArray) -> FloatArray:
         return np.divide(of, all_of, out=np.zeros_like(of), where=all_of > 0)
 
     return np.stack(
@@ -188,9 +188,9 @@ def _statistics(
             np.ptp(readings, axis=1),
             np.abs(area),
             np.std(residual, axis=1),
-            part(lag, total),
-            part(slow, whole),
-            part(fast, whole),
+            ratio(lag, total),
+            ratio(slow, whole),
+            ratio(fast, whole),
             np.mean(pit, axis=1),
             np.mean(np.abs(pit - 0.5) > 0.45, axis=1),
         ],

@@ -130,13 +130,14 @@ class Experiment:
         ("NAME sensor 95").
         """
         names = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
-        own = names if self.held_out else []
-        return (*own, *(f"{other} {name}" for other in self.others for name in names))
+        fitted_names = names if self.held_out else []
+        return (*fitted_names, *(f"{other} {name}" for other in self.others for name in names))
 
     @cached_property
     def _paths(self) -> dict[str, FloatArray]:
         """The voltage of each record up to its last training sample."""
-        return {one.name: one.voltage[: one.training[-1].stop] for one in self.posterior.datasets}
+        datasets = self.posterior.datasets
+        return {data.name: data.voltage[: data.training[-1].stop] for data in datasets}
 
     @cached_property
     def looped(self) -> str:
@@ -263,8 +264,9 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     """
     generator = np.random.default_rng([seed, number])
     simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
-    theta, made = _simulated(experiment, simulating)
-    posterior = _with_readings(experiment.posterior, made)
+    theta, simulated = _simulated(experiment, simulating)
+    readings = {name: record.reading for name, record in simulated.items()}
+    posterior = experiment.posterior.with_readings(readings)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     truth = _statistics(experiment, posterior, true)[0]
     names = experiment.statistics
@@ -280,9 +282,9 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     if len(free) < RANKED:
         return Replicate(number, *ended, names, truth, nothing, {})
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting, MIXED)
-    inside = _held_out(experiment, posterior, flat, made, predicting)
+    inside = _held_out(experiment, posterior, flat, simulated, predicting)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
-    inside |= _others(experiment, posterior, flat, theta, made, others)
+    inside |= _others(experiment, posterior, flat, theta, simulated, others)
     return Replicate(number, *ended, names, truth, drawn, inside)
 
 
@@ -294,29 +296,24 @@ def _simulated(
     theta = source.prior.theta(source.prior.draw(generator, 1))
     column = source.table.columns(theta)
     made = {}
-    for fitted, one, likelihood in zip(
+    for fitted, dataset, likelihood in zip(
         experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
     ):
-        mine = source.table.of(theta, one.name)
+        mine = source.table.of(theta, dataset.name)
         sd = likelihood.start_sd(mine)
         model = likelihood.actuator.advance(
-            one.table.actuator(mine),
-            one.voltage,
+            dataset.table.actuator(mine),
+            dataset.voltage,
             unrest=sd * generator.standard_normal(sd.shape),
-            from_rest=one.from_rest,
+            from_rest=dataset.from_rest,
         )[0][0]
-        discrepancy, sensor = one.noise.draw(one.table.noise(mine), model.size, generator)
+        discrepancy, sensor = dataset.noise.draw(dataset.table.noise(mine), model.size, generator)
         truth = model + discrepancy
         reading = truth + sensor
         reading[np.isnan(fitted.displacement)] = np.nan
-        record = Record(one.voltage, reading, one.actuator.interval, truth=truth)
-        made[one.name] = Simulated(record, model)
+        record = Record(dataset.voltage, reading, dataset.actuator.interval, truth=truth)
+        made[dataset.name] = Simulated(record, model)
     return column, made
-
-
-def _with_readings(posterior: Posterior, made: Mapping[str, Simulated]) -> Posterior:
-    """Return a posterior with the readings of simulated records."""
-    return posterior.with_readings({name: one.reading for name, one in made.items()})
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
@@ -352,8 +349,8 @@ def _independent(
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
     apart = math.ceil(time) if math.isfinite(time) else 1
     spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
-    left = chained[::-spacing].reshape(-1, free)
-    return spacing, thinned(left, generator, RANKED)
+    spaced = chained[::-spacing].reshape(-1, free)
+    return spacing, thinned(spaced, generator, RANKED)
 
 
 def _held_out(
@@ -375,7 +372,8 @@ def _held_out(
         if windows:
             bands = predict_windows(alone, its, made[name].record, windows, generator)
             parts += [
-                (one, made[name], part) for one, part in zip(bands, windows.values(), strict=True)
+                (predicted, made[name], part)
+                for predicted, part in zip(bands, windows.values(), strict=True)
             ]
     return {f"{kind} {level}": part for kind, level, part in covered(parts)} if parts else {}
 
@@ -389,14 +387,14 @@ def _others(
     generator: np.random.Generator,
 ) -> dict[str, float]:
     """Make the other records with the same truth; part of their samples inside each band."""
-    source = _with_readings(experiment.truth, records)
+    source = experiment.truth.with_readings({name: r.reading for name, r in records.items()})
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     inside = {}
     for name, other in experiment.others.items():
         like = other.like or posterior.table.records[0]
-        made = other.simulated(source.alone(like), source.table.of(true, like), generator)
+        simulated = other.simulated(source.alone(like), source.table.of(true, like), generator)
         alone, its = posterior.alone(like), posterior.its(draws, like)
-        bands, part = other.predicted(alone, its, made.record, generator)
-        for kind, level, covering in covered([(bands, made, part)]):
+        bands, part = other.predicted(alone, its, simulated.record, generator)
+        for kind, level, covering in covered([(bands, simulated, part)]):
             inside[f"{name} {kind} {level}"] = covering
     return inside

@@ -127,7 +127,7 @@ def summary(result: Result) -> dict[str, object]:
     converged; ``agreement`` is there for several records alone.
     """
     outcome = result.outcome
-    known: dict[str, object] = {
+    numbers: dict[str, object] = {
         "converged": outcome.converged,
         "stop_reason": outcome.stop_reason,
         "steps": outcome.check.steps,
@@ -150,8 +150,8 @@ def summary(result: Result) -> dict[str, object]:
         "explanations": None,
     }
     if outcome.converged:
-        known["parameters"] = _parameters(result)
-        known["validation"] = {
+        numbers["parameters"] = _parameters(result)
+        numbers["validation"] = {
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
@@ -160,22 +160,24 @@ def summary(result: Result) -> dict[str, object]:
         }
         if whitened:
             # Those of one record stand alone, those of several by their names.
-            known["innovations"] = whitened if len(whitened) > 1 else next(iter(whitened.values()))
+            numbers["innovations"] = (
+                whitened if len(whitened) > 1 else next(iter(whitened.values()))
+            )
         if result.agreement:
-            known["agreement"] = agreement.numbers(result.agreement)
+            numbers["agreement"] = agreement.numbers(result.agreement)
         if result.loops is not None:
-            known["loops"] = loops.numbers(result.loops)
+            numbers["loops"] = loops.numbers(result.loops)
         if result.learned is not None:
-            known["identifiability"] = learned.numbers(result.learned)
-        known["replicated"] = {
+            numbers["identifiability"] = learned.numbers(result.learned)
+        numbers["replicated"] = {
             name: replicated.numbers(checks) for name, checks in result.replicated.items()
         } or None
-        known["explanations"] = {
-            name: [explanation.numbers for explanation in found]
-            for name, found in result.explanations.items()
+        numbers["explanations"] = {
+            name: [explanation.numbers for explanation in explained]
+            for name, explained in result.explanations.items()
         }
-        known["step_responses"] = steps.numbers(result.steps)
-    return known
+        numbers["step_responses"] = steps.numbers(result.steps)
+    return numbers
 
 
 def _parameters(result: Result) -> dict[str, dict[str, object]]:

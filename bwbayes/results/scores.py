@@ -118,11 +118,11 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
         if values is None:
             coverage[kind] = error[kind] = None
             continue
-        known = np.isfinite(values)
-        known[: bands.scored_from] = False
-        hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
+        finite = np.isfinite(values)
+        finite[: bands.scored_from] = False
+        hits = {level: bands.covers(kind, level, values)[finite] for level in LEVELS}
         coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
-        block = block_length((values - bands.mean)[known])
+        block = block_length((values - bands.mean)[finite])
         error[kind] = _coverage_errors(hits, block, generator)
     seconds = {
         level: _worst(
@@ -153,7 +153,9 @@ def as_summary(scores: Scores) -> dict[str, object]:
         return {str(level): value for level, value in values.items()}
 
     def by_kind(values: dict[str, dict[int, float] | None]) -> dict[str, dict[str, float] | None]:
-        return {kind: None if some is None else by_level(some) for kind, some in values.items()}
+        return {
+            kind: None if levels is None else by_level(levels) for kind, levels in values.items()
+        }
 
     return {
         "nrmse": scores.nrmse if np.isfinite(scores.nrmse) else None,
@@ -248,11 +250,11 @@ def _coverage_errors(
     """
     errors = {level: block_bootstrap_error(hit, block, generator) for level, hit in hits.items()}
     covered = {level: float(hit.mean()) for level, hit in hits.items()}
-    middle = min(covered, key=lambda level: abs(covered[level] - 0.5))
-    p = covered[middle]
-    worth = hits[middle].size / block
-    if errors[middle] > 0:
-        worth = p * (1 - p) / errors[middle] ** 2
+    nearest = min(covered, key=lambda level: abs(covered[level] - 0.5))
+    p = covered[nearest]
+    worth = hits[nearest].size / block
+    if errors[nearest] > 0:
+        worth = p * (1 - p) / errors[nearest] ** 2
     for level, p in covered.items():
         estimate = (worth * p + 0.5) / (worth + 1)
         errors[level] = max(errors[level], float(np.sqrt(estimate * (1 - estimate) / worth)))
@@ -281,7 +283,9 @@ def _worst(hits: BoolArray, judged: BoolArray, interval: float) -> float:
     left out.
     """
     block = max(1, min(round(1 / interval), hits.size))
-    covered, readings = (np.concatenate([[0], np.cumsum(some)]) for some in (hits & judged, judged))
+    covered, readings = (
+        np.concatenate([[0], np.cumsum(flags)]) for flags in (hits & judged, judged)
+    )
     counts = readings[block:] - readings[:-block]
     telling = 2 * counts >= counts.max()
     return float(((covered[block:] - covered[:-block])[telling] / counts[telling]).min())

@@ -68,8 +68,8 @@ class OtherRecord:
         voltage and offset.
         """
         planned = replace(self.record, displacement=None, truth=None)
-        begun = started(posterior, theta, planned, self.start, generator)
-        model = begun.advance(planned.voltage)[0][0]
+        start_states = started(posterior, theta, planned, self.start, generator)
+        model = start_states.advance(planned.voltage)[0][0]
         if self.start.own_offset and self.record.displacement is not None:
             model = model + posterior.only.extent * generator.standard_normal()
         noise = posterior.only.noise.at(planned.interval)
@@ -91,10 +91,10 @@ class OtherRecord:
         if self.record.displacement is None:
             record = replace(record, displacement=None)
         bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
-        part = slice(0, record.samples)
+        judged_window = slice(0, record.samples)
         if self.window is not None:
-            part = record.window_slice(*self.window)
-        return bands, slice(part.start + bands.scored_from, part.stop)
+            judged_window = record.window_slice(*self.window)
+        return bands, slice(judged_window.start + bands.scored_from, judged_window.stop)
 
 
 def covered(
@@ -109,8 +109,8 @@ def covered(
     for kind in KINDS:
         for level in LEVELS:
             inside = [
-                _inside(bands, (kind, level), _target(kind, made)[window])
-                for bands, made, window in every
+                _inside(bands, (kind, level), _target(kind, simulated)[window])
+                for bands, simulated, window in every
             ]
             yield kind, level, float(np.mean(np.concatenate(inside)))
 
@@ -128,7 +128,7 @@ def _target(kind: Kind, made: Simulated) -> FloatArray:
 
 def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
     """Tell which of the values (samples,) that there are lie inside the end of a band."""
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
-    inside: FloatArray = ((low <= values) & (values <= high))[known].astype(np.float64)
+    inside: FloatArray = ((low <= values) & (values <= high))[finite].astype(np.float64)
     return inside

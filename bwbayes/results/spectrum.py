@@ -113,20 +113,20 @@ def residual_spectrum(
     """
     rows = np.rint((time - time[0]) / interval).astype(np.int64)
     grid = _TimeGrid(rows, interval)
-    found: list[float] = []
+    frequencies: list[float] = []
     left, level = white - np.mean(white), None
     for _ in range(MOST_LINES):
         power = grid.power(left)
         if level is None:
             size = FINER * NEIGHBORS + 1
             level = scipy.ndimage.median_filter(power, size, mode="reflect") / math.log(2)
-        frequency = _strongest(grid, power / level, found)
+        frequency = _strongest(grid, power / level, frequencies)
         if frequency is None:
             break
         shape = _oscillation(time, left, frequency)
         if np.sum(shape**2) < LEAST_PART * np.sum(white**2):
             break
-        found.append(frequency)
+        frequencies.append(frequency)
         left = left - shape
     drive = _Drive.of(grid, time, voltage)
     lines = [
@@ -135,7 +135,7 @@ def residual_spectrum(
             math.sqrt(2 * float(np.mean(_oscillation(time, residual, frequency) ** 2))),
             *_source(grid, drive, frequency),
         )
-        for frequency in found
+        for frequency in frequencies
     ]
     lines.sort(key=lambda line: -line.amplitude)
     length = min(max(grid.samples // SEGMENTS, 1), LONGEST)

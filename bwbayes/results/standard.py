@@ -94,9 +94,9 @@ def standardized(bands: Bands, judged: BoolArray, memory: float, unsure: float) 
         return p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * alone
 
     mean = p + q * once + (1 - p - q) * alone
-    left = (p - common) + q * (1 - once) + (1 - p - q) * (1 - alone)
-    varying = (z - np.mean(z)) / np.sqrt(left)
-    rest = correlated(min((p - common) / left, 1.0), min(q * (1 - once) / left, 1.0))
+    shared = (p - common) + q * (1 - once) + (1 - p - q) * (1 - alone)
+    varying = (z - np.mean(z)) / np.sqrt(shared)
+    rest = correlated(min((p - common) / shared, 1.0), min(q * (1 - once) / shared, 1.0))
     worth = 1 / correlated(p, q), unsure, varying, 1 / rest, common
     return Standard(z, 1 / mean, *worth)
 

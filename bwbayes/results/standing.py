@@ -39,7 +39,7 @@ class Standing:
     def read(cls, summary: Mapping[str, Any]) -> Self:
         """Return what a converged run's ``summary.json`` says."""
         every = (summary.get("validation") or {}).items()
-        return cls._of((one["holds"], one.get("verdict", name)) for name, one in every)
+        return cls._of((entry["holds"], entry.get("verdict", name)) for name, entry in every)
 
     @classmethod
     def _of(cls, answers: Iterable[tuple[bool | None, str]]) -> Self:

@@ -180,12 +180,12 @@ class Started:
             rows = np.flatnonzero(self.which == number)
             if not rows.size:
                 continue
-            begun = walk(
+            walked = walk(
                 actuator, self.model[rows], voltage, self.unrest[rows], from_rest=self.from_rest
             )
-            if begun is None:
+            if walked is None:
                 return None
-            walks.append((rows, begun))
+            walks.append((rows, walked))
         return walks
 
     def advance(
@@ -351,10 +351,10 @@ def _informed(
         # Given the unrest the offset is normal still.
         pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
         shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
-        left = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
+        variance = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
         level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
         begun = likelihood.table.replaced(theta, "offset", level)
-        sd = np.sqrt(np.maximum(left, 0.0))
+        sd = np.sqrt(np.maximum(variance, 0.0))
     lead_in = LeadIn(
         float(record.time[window.start]),
         float(record.time[window.stop]),
@@ -378,8 +378,8 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
     p = scipy.stats.chi2.sf(squares, readings.size)
     if readings.size > MANY:
         few = slice(None, None, -(-len(theta) // TESTED))
-        place = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
-        shapes = np.polynomial.legendre.legvander(place, SLOW).T[1:]
+        relative_time = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
+        shapes = np.polynomial.legendre.legvander(relative_time, SLOW).T[1:]
         tested = replace(histories, which=histories.which[few])
         (taken,) = tested.each(
             theta[few], lambda likelihood, rows: (likelihood.score(rows, shapes).together,)

@@ -126,11 +126,11 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
         The step.
     """
     _, alone, its = next(posterior.each(draws))
-    one = alone.only
-    column = one.table.columns(alone.prior.theta(its))
+    dataset = alone.only
+    column = dataset.table.columns(alone.prior.theta(its))
     nothing = np.zeros(len(draws))
     column |= {"initial": nothing, "offset": nothing}
-    actuator = replace(one.actuator.within(one.voltage), hold="zero")
+    actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")
     held = max(step.held, 10 * FIRST)
     time = np.geomspace(FIRST, held, round(PER_DECADE * np.log10(held / FIRST)) + 1)
     settled, without, creep = _responses(actuator, column, step.height, time)
@@ -138,18 +138,18 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
     estimates["level_um"] = Estimate.of(settled)
     if actuator.filter.parameters:
-        part = without / settled[:, np.newaxis]
-        rise = _passes(time, part, 0.9) - _passes(time, part, 0.1)
+        fractionent = without / settled[:, np.newaxis]
+        rise = _passes(time, fractionent, 0.9) - _passes(time, fractionent, 0.1)
         estimates["rise_s"] = Estimate.of(rise)
         estimates["overshoot_percent"] = Estimate.of(
-            100 * np.maximum(np.max(part, axis=1) - 1, 0.0)
+            100 * np.maximum(np.max(fractionent, axis=1) - 1, 0.0)
         )
     crept = None
     if actuator.creep is not None and held >= 10 * CREEP_FROM:
-        begun = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
-        grown = creep - begun[:, np.newaxis]
-        part = 100 * grown[:, -1] / (settled + begun)
-        estimates["creep_percent"] = Estimate.of(part / np.log10(held / CREEP_FROM))
+        first_creep = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
+        grown = creep - first_creep[:, np.newaxis]
+        fractionent = 100 * grown[:, -1] / (settled + first_creep)
+        estimates["creep_percent"] = Estimate.of(fractionent / np.log10(held / CREEP_FROM))
         crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
     return StepResponse(step, time, Curve.of(response), crept, estimates)
 
@@ -157,9 +157,9 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
 def numbers(responses: Mapping[str, StepResponse]) -> dict[str, object]:
     """Return step responses as ``summary.json`` holds them."""
     return {
-        name: {"height_V": one.step.height, "held_s": one.step.held}
-        | {n: None if e is None else e.summary() for n, e in one.estimates.items()}
-        for name, one in responses.items()
+        name: {"height_V": response.step.height, "held_s": response.step.held}
+        | {n: None if e is None else e.summary() for n, e in response.estimates.items()}
+        for name, response in responses.items()
     }
 
 
@@ -184,31 +184,31 @@ def _responses(
     for i, t in enumerate(time.tolist()):
         sections = replace(actuator, interval=t).sections(column)
         moved = [
-            gain * _after_a_sample(one) * by
-            for one, gain, by in zip(sections.recursions, sections.gains, steps, strict=True)
+            gain * _after_a_sample(recursion) * by
+            for recursion, gain, by in zip(sections.recursions, sections.gains, steps, strict=True)
         ]
         parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))
     return settled, parts[0], parts[1]
 
 
-def _after_a_sample(one: Recursion) -> FloatArray:
+def _after_a_sample(recursion: Recursion) -> FloatArray:
     """Return what a recursion makes of a unit that has been held for one sample, (models,)."""
-    now, before = one.numerator[:, 0], one.numerator[:, 1]
-    passed: FloatArray = now + before - one.denominator[:, 1] * now
+    now, before = recursion.numerator[:, 0], recursion.numerator[:, 1]
+    passed: FloatArray = now + before - recursion.denominator[:, 1] * now
     return passed
 
 
-def _passes(time: FloatArray, part: FloatArray, level: float) -> FloatArray:
+def _passes(time: FloatArray, fraction: FloatArray, level: float) -> FloatArray:
     """Return the times (models,) at which responses (models, times) first pass a level.
 
     On straight lines over the log of the time; before the first of the times, that; beyond the
     last, nan.
     """
-    passed = part >= level
+    passed = fraction >= level
     after = np.argmax(passed, axis=1)
     rows = np.arange(after.size)
     before = np.maximum(after - 1, 0)
-    low, high = part[rows, before], part[rows, after]
+    low, high = fraction[rows, before], fraction[rows, after]
     share = np.where(after > 0, (level - low) / np.where(high > low, high - low, 1.0), 0.0)
     logs = np.log(time)
     at = np.exp(logs[before] + share * (logs[after] - logs[before]))

@@ -248,8 +248,10 @@ def _offset_advice(bands: Bands, judged: BoolArray, standard: Standard) -> str:
         return ""
     # The variance of a mean of correlated readings falls with their time.
     length = (lead.stop - lead.start) * standard.common / SETTLED
-    left = float(np.ptp(bands.time[judged])) / 2
-    longer = f"lead_in = {length:.2g}" if length < left else f"a record of {3 * length:.2g} s"
+    half_duration = float(np.ptp(bands.time[judged])) / 2
+    longer = (
+        f"lead_in = {length:.2g}" if length < half_duration else f"a record of {3 * length:.2g} s"
+    )
     return (
         f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
         f"{percent(standard.common)} of the band's variance; use {longer} for {percent(SETTLED)}"

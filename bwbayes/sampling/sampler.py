@@ -127,9 +127,9 @@ def sample(
     elif chain.refitted and chain.refit is None:
         chain.refit = _refit(chain, chain.refitted)  # that of a file
     while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        made = len(chain.history("sampling"))
-        early = made * plan.block <= REFITTING * plan.most_steps
-        chain.fall_back(made, _refit(chain, made) if early else None)
+        blocks = len(chain.history("sampling"))
+        early = blocks * plan.block <= REFITTING * plan.most_steps
+        chain.fall_back(blocks, _refit(chain, blocks) if early else None)
     return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
 
 
@@ -195,10 +195,10 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
 
 def _refit(chain: Chain, blocks: int) -> StudentMixture | None:
     """Fit a proposal to the first blocks of the sampling, whether they count or not."""
-    made = Chain(chain.starts)
+    fitted_to = Chain(chain.starts)
     for block in chain.history("sampling")[:blocks]:
-        made.append("sampling", block)
-    return _fitted(made, "sampling", slice(None), thinning(made.draws("sampling")))
+        fitted_to.append("sampling", block)
+    return _fitted(fitted_to, "sampling", slice(None), thinning(fitted_to.draws("sampling")))
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:

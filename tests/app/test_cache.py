@@ -17,6 +17,7 @@ import bwbayes as bw
 from bwbayes.app.fit import fitted
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.cache import load, save
+from bwbayes.sampling import sampler
 
 
 def assert_same(first: Any, second: Any) -> None:
@@ -47,7 +48,7 @@ def test_an_opened_run_works_nothing_out(run: Path, monkeypatch: pytest.MonkeyPa
     expected = bw.open_run(run)
     worked_out = assemble(expected.problem, expected.chain, expected.outcome)
     monkeypatch.setattr(fitted, "assemble", refuse)
-    monkeypatch.setattr(fitted, "sample", refuse)
+    monkeypatch.setattr(sampler, "sample", refuse)
     opened = bw.open_run(run)
     assert opened.converged
     for name in ("bands", "scores", "verdicts", "loops", "innovations", "explanations", "learned"):

@@ -72,8 +72,8 @@ class Fit:
     Notes
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
-    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them. Whatever
-    is worked out of them is worked out when it is first asked for.
+    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them. What
+    follows from them is worked out when it is first asked for.
     """
 
     problem: Problem
@@ -215,11 +215,10 @@ class Fit:
         NotConvergedError
             The sampling has not converged.
         """
-        result = self._converged()
-        scores, verdicts = result.scores, result.verdicts
+        scores, verdicts = self._converged().scores, self.result.verdicts
         return {
             bands.name: Prediction.of(bands, scores.get(bands.name), verdicts.get(bands.name))
-            for bands in result.bands
+            for bands in self.result.bands
         }
 
     @property
@@ -283,13 +282,12 @@ class Fit:
             A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
         """
         self.require_converged()
+        name = name or ("prediction" if isinstance(record, Record) else Path(record).stem)
         if not isinstance(record, Record):
-            name = name or Path(record).stem
             record = read_record(record, need_displacement=False)
         hold = self.problem.config.model.hold
         interpolation = None if hold == "auto" else hold
         start = Start(from_rest, own_offset, lead_in, lead_in_from, interpolation, after)
-        name = name or "prediction"
         prediction = predict_another(self.problem, self.flat_draws, record, start, name, window, of)
         standing = Standing.of([prediction.verdict] if prediction.verdict else [])
         warn([*(f"{name}: {remark}" for remark in prediction.remarks), *standing.said], 3)
@@ -383,8 +381,9 @@ class Fit:
 
     @property
     def _title(self) -> str:
-        origins = [record.origin for record in self.problem.records.values()]
-        name = self.problem.config.name or ", ".join(origins)
+        name = self.problem.config.name or ", ".join(
+            r.origin for r in self.problem.records.values()
+        )
         if self.converged:
             return f"{name}: converged, validation {self.standing.status}"
         return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"

@@ -165,8 +165,8 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     """Sample a model to its end, from wherever it stands, and say what it is worth."""
     fit = finished(folder) if folder.summary.is_file() else draw(folder)
     with executor_of(1, fit.problem.posterior.engine) as pool:
-        made = candidate(name, fit, pool, future=future)
-    return replace(made, standing=folder.standing()) if folder.summary.is_file() else made
+        result = candidate(name, fit, pool, future=future)
+    return replace(result, standing=folder.standing()) if folder.summary.is_file() else result
 
 
 def _standing(folder: RunFolder, files: bool) -> Standing:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -34,6 +34,7 @@ from bwbayes.app.problem.records import (
     other_record,
     require_different,
     sampled_waveform,
+    set_aside,
     start_of,
     training_records,
     unlike,
@@ -60,9 +61,6 @@ from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
-
-# Times of outliers that a remark lists.
-MOST_TIMES = 10
 
 # What may be so of one of several records: the others make up for it.
 MADE_UP_FOR = ("one amplitude", "few readings")
@@ -123,7 +121,7 @@ class Problem:
         ]
         remarks += [text for name, other in self.others.items() for text in unlike(name, other)]
         remarks += [
-            (f"{name}: " if len(self.records) > 1 else "") + _set_aside(source.outliers, record)
+            (f"{name}: " if len(self.records) > 1 else "") + set_aside(source.outliers, record)
             for (name, source), record in zip(sources.items(), self.records.values(), strict=True)
             if source.outliers is not None
         ]
@@ -343,16 +341,6 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         least_pilot_steps=100 if places > 1 else 50,
         places=places,
     )
-
-
-def _set_aside(times: Sequence[float], record: Record) -> str:
-    """Say which readings were set aside as outliers."""
-    if not times:
-        return "no reading is an isolated outlier: none was set aside"
-    first = ", ".join(record.clock(time) for time in times[:MOST_TIMES])
-    more = f" and {len(times) - MOST_TIMES} more" if len(times) > MOST_TIMES else ""
-    plural = "s" if len(times) > 1 else ""
-    return f"{len(times)} reading{plural} set aside as isolated outliers, at {first} s{more}"
 
 
 def _explicit(

@@ -43,12 +43,16 @@ __all__ = [
     "other_record",
     "require_different",
     "sampled_waveform",
+    "set_aside",
     "start_of",
     "training_records",
     "unlike",
     "whole",
     "windows_of",
 ]
+
+# Times of outliers that a remark lists.
+MOST_TIMES = 10
 
 
 @dataclass(frozen=True)
@@ -292,3 +296,13 @@ def unlike(name: str, record: Record) -> Iterator[str]:
             finding = replace(finding, fix=fix)  # noqa: PLW2901  # nothing here is fitted
         if finding.kind not in ("one amplitude", "few readings"):
             yield f"{name}: {finding}"
+
+
+def set_aside(times: Sequence[float], record: Record) -> str:
+    """Say which readings were set aside as outliers."""
+    if not times:
+        return "no reading is an isolated outlier: none was set aside"
+    first = ", ".join(record.clock(time) for time in times[:MOST_TIMES])
+    more = f" and {len(times) - MOST_TIMES} more" if len(times) > MOST_TIMES else ""
+    plural = "s" if len(times) > 1 else ""
+    return f"{len(times)} reading{plural} set aside as isolated outliers, at {first} s{more}"

@@ -53,10 +53,12 @@ def improve_model(
         parts = likely_causes([cause for cause in found if cause.changes])
         if followed_causes(found) or not parts:
             break
-        part = parts[0]
-        notes.append(f"model improved: {part.text} ({part.worth}); {part.fix}")
-        console.print(f"added: {part.text} ({part.worth})", highlight=False, soft_wrap=True)
-        config = problem.changed(config, part.changes, part.parameters)
+        explanation = parts[0]
+        notes.append(f"model improved: {explanation.text} ({explanation.worth}); {explanation.fix}")
+        console.print(
+            f"added: {explanation.text} ({explanation.worth})", highlight=False, soft_wrap=True
+        )
+        config = problem.changed(config, explanation.changes, explanation.parameters)
     record = config.records[name]
     noted = record.model_copy(update={"remarks": [*(record.remarks or []), *notes]})
     return config.model_copy(update={"record": noted}) if notes else config

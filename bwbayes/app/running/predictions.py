@@ -215,7 +215,7 @@ def _reaching(
     what the training did not show.
     """
     posterior = problem.posterior
-    if any(one.kind in ("slow", "duration") for one in beyond):
+    if any(finding.kind in ("slow", "duration") for finding in beyond):
         source = generator(problem.config.seed, f"creep {record.sha256}")
         posterior, draws = with_creep(posterior, draws, record.duration, source)
     return posterior.alone(of), posterior.its(draws, of)

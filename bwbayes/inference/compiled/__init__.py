@@ -61,13 +61,13 @@ def moments(
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
-    record, known = (voltage, displacement, skipped), parts(actuator, voltage)
+    record, prepared = (voltage, displacement, skipped), parts(actuator, voltage)
     for rows, stage in _staged(actuator, column, theta, voltage, from_rest=from_rest):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
         models = _models(actuator, column, equilibrium, steady, voltage)[rows]
         drive = stage.kind, stage.group, stage.plan
-        sums[:, rows] = kernels.sums(*record, models, *drive, *known, *unknowns)
+        sums[:, rows] = kernels.sums(*record, models, *drive, *prepared, *unknowns)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):

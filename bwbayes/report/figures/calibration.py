@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures.style import COLORS, axis_label, hide_unused, share_legend
 from bwbayes.results.bands import KINDS, LEVELS
-from bwbayes.results.calibration import LIMIT, LIMITS, Calibration
+from bwbayes.results.calibration import LIMIT, Calibration
 from bwbayes.results.replicates import EXTRA
 
 __all__ = ["draw_coverage", "draw_ecdf", "draw_histograms"]
@@ -36,7 +36,7 @@ def draw_histograms(calibration: Calibration) -> Figure:
     """
     labels = _labels(calibration)
     count = calibration.positions.shape[0]
-    low, high = scipy.stats.binom.interval(LIMITS, count, 1 / RANK_BINS)
+    low, high = scipy.stats.binom.interval(0.99, count, 1 / RANK_BINS)
     figure, panels = _grid(labels, "rank among the draws (%)", "replicates\n(expected: 1)")
     for panel, column in zip(panels, calibration.positions.T, strict=True):
         heights, edges = np.histogram(column, RANK_BINS, range=(0, 1))
