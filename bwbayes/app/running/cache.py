@@ -1,8 +1,8 @@
 """What was worked out of a chain, kept with the run: to open a run is to read files.
 
-A file holds arrays and a text that says how dataclasses are made of them. Nothing in it is run:
-only dataclasses of this package come out of it. It belongs to one state of the run; what belongs to
-another one, or is damaged, is worked out again.
+A file holds arrays and a text that says how dataclasses are made of them, after a digest of both.
+Nothing in it is run: only dataclasses of this package come out of it. It belongs to one state of
+the run; what belongs to another one, or is damaged, is worked out again.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,32 +45,27 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
     """Write what was worked out of a run in that state."""
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps({"state": state, "values": _text_of(values, arrays)})
+    content = BytesIO()
+    np.savez(content, allow_pickle=False, text=np.array(text), **arrays)
     draft = path.with_suffix(".partial")
-    with draft.open("wb") as file:
-        np.savez(file, allow_pickle=False, text=np.array(text), **arrays)
+    draft.write_bytes(sha256(content.getbuffer()).digest() + content.getbuffer())
     draft.replace(path)
 
 
 def load(path: Path, state: str) -> dict[str, Any] | None:
     """Return what was kept of a run in that state; None if there is none, or it is damaged."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            content = json.loads(str(arrays["text"]))
-            if content["state"] != state:
-                return None
-            values: dict[str, Any] = _object_of(content["values"], arrays)
-            return values
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        ImportError,
-        BadZipFile,
-        EOFError,
-    ):
+        digest, content = (whole := path.read_bytes())[:32], whole[32:]
+    except OSError:
         return None
+    if sha256(content).digest() != digest:
+        return None
+    with np.load(BytesIO(content), allow_pickle=False) as arrays:
+        text = json.loads(str(arrays["text"]))
+        if text["state"] != state:
+            return None
+        values: dict[str, Any] = _object_of(text["values"], arrays)
+        return values
 
 
 def _text_of(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -108,10 +103,10 @@ def _object_of(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return items
     module, _, name = value["class"].partition(":")
     if not module.startswith(PACKAGE):
-        raise ValueError("is no class of this package")
+        raise ValueError(f"{value['class']} is no class of this package")
     made = getattr(import_module(module), name)
     if not isinstance(made, type) or _names_of(made) is None:
-        raise ValueError("is no dataclass")
+        raise ValueError(f"{value['class']} is no dataclass")
     return made(**items)
 
 
