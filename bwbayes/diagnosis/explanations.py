@@ -40,6 +40,7 @@ CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     model.dynamics,
     model.hold,
     model.operator,
+    model.smooth,
 )
 
 # Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's

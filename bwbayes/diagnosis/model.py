@@ -12,8 +12,9 @@ import numpy as np
 
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import pointfit
+from bwbayes.inference.noise import DiscrepancyNoise
 
-__all__ = ["creep", "dynamics", "hold", "nonlinearity", "operator"]
+__all__ = ["creep", "dynamics", "hold", "nonlinearity", "operator", "smooth"]
 
 # Operators that are tried: compiled ones, each of another family.
 OPERATORS = ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "duhem")
@@ -74,6 +75,12 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         fit = scene.climbed(posterior, pointfit.fit(posterior, scene.generator).optima)
         text = f"another operator, {name}"
         yield scene.explained(f"operator {name}", text, _lines(changes), fit, changes=changes)
+
+
+def smooth(scene: Scene) -> Iterator[Explanation]:
+    """Try a discrepancy without corners, in place of a rough one."""
+    if isinstance(scene.posterior.only.noise, DiscrepancyNoise):
+        yield from _changed(scene, "a smooth discrepancy", {"noise": "smooth"})
 
 
 def _changed(

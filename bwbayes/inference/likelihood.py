@@ -234,7 +234,7 @@ class Likelihood:
         model, noise = self.table.actuator(theta), self.table.noise(theta)
         if displacement is None:
             displacement = self._simulated(model)[:, readings.where]
-        responses = self._responses(model, spaced.steady_state(noise).log_decay)
+        responses = self._responses(model, spaced.log_decay(noise))
         audible = responses.shape[2]
         series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
         series[:, 0] = readings.values - displacement
@@ -313,7 +313,7 @@ class Likelihood:
         simulated = self._simulated(model)
         residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
         spaced = self.spaced
-        responses = self._responses(model, spaced.steady_state(noise).log_decay)
+        responses = self._responses(model, spaced.log_decay(noise))
         skipped, audible = readings.skipped, responses.shape[2]
         parts = []
         # A few models at a time: what is whitened then stays in the cache.

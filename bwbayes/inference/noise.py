@@ -12,7 +12,6 @@ missing. Its log density is theirs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -21,9 +20,17 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, lognormal
-from bwbayes.model.registry import made
 
-__all__ = ["NOISES", "DiscrepancyNoise", "Noise", "SteadyState", "WhiteNoise", "noise_model"]
+__all__ = [
+    "DISCREPANCY_SD",
+    "DISCREPANCY_TIME",
+    "SENSOR_SD",
+    "DiscrepancyNoise",
+    "Noise",
+    "SteadyState",
+    "WhiteNoise",
+    "log_density",
+]
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
@@ -70,14 +77,27 @@ class Noise(Protocol):
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
 
-    def steady_state(self, theta: FloatArray) -> SteadyState:
-        """Return the filter that turns residuals into independent innovations in the long run."""
-
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Correlation time of the discrepancy (models,), s; zero without one."""
+
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return F, what is left of the discrepancy after so many readings.
+
+        It is the first of two states, both of the discrepancy's sd, and independent at one time.
+        (models, 2, 2) after one number of readings, (models, numbers, 2, 2) after some (numbers,).
+        """
+
+    def log_decay(self, theta: FloatArray) -> FloatArray:
+        """Return the logarithm of what the filter keeps over a reading, at most, (models,)."""
+
+    def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
+        """One-sided amplitude spectral density (frequencies,), um/√Hz, at one θ (1, parameters)."""
+
+    def coefficients(self, theta: FloatArray) -> dict[str, FloatArray]:
+        """Return the compiled filter's parameters (models,), by their names there."""
 
     def draw(
         self, theta: FloatArray, samples: int, generator: np.random.Generator
@@ -86,22 +106,6 @@ class Noise(Protocol):
 
     def at(self, interval: float) -> Noise:
         """Return the same noise for readings ``interval`` seconds apart."""
-
-
-def noise_model(kind: str, interval: float) -> Noise:
-    """Return the noise of that name (or import path) for readings ``interval`` seconds apart.
-
-    Raises
-    ------
-    InputError
-        No noise goes by that name.
-
-    Examples
-    --------
-    >>> [declared.name for declared in noise_model("discrepancy", 1e-3).declarations]
-    ['sensor_sd', 'discrepancy_sd', 'discrepancy_time']
-    """
-    return made("noise", kind, NOISES, {"interval": interval}, Noise)
 
 
 SENSOR_SD = Declaration(
@@ -134,7 +138,7 @@ DISCREPANCY_TIME = Declaration(
 )
 
 
-def _log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
+def log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
     """Log density (models,) of what was whitened (models, 1, readings)."""
     readings = white.shape[2]
     squares = np.sum(white[:, 0] ** 2, axis=1)
@@ -166,12 +170,23 @@ class WhiteNoise:
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Return Σ log N(r; 0, s²); shapes as in :class:`Noise`."""
-        return _log_density(*self.whiten(theta, residual[:, np.newaxis]))
+        return log_density(*self.whiten(theta, residual[:, np.newaxis]))
 
-    def steady_state(self, theta: FloatArray) -> SteadyState:
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Nothing is left."""
+        return np.zeros((len(theta), *np.shape(readings), 2, 2))
+
+    def log_decay(self, theta: FloatArray) -> FloatArray:
+        """Nothing is kept."""
+        return np.full(len(theta), -np.inf)
+
+    def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
+        """Return √(2 Δ) s at all frequencies."""
+        return np.full(frequency.size, np.sqrt(2 * self.interval) * theta[0, 0])
+
+    def coefficients(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Nothing is remembered: innovations are the residuals."""
-        none = np.zeros(theta.shape[0])
-        return SteadyState(none, none, theta[:, 0] ** 2, none, none - np.inf, none)
+        return {"variance": theta[:, 0] ** 2}
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """No discrepancy; sd of the sensor."""
@@ -254,7 +269,7 @@ class DiscrepancyNoise:
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Return the exact log density; shapes as in :class:`Noise`."""
-        return _log_density(*self.whiten(theta, residual[:, np.newaxis]))
+        return log_density(*self.whiten(theta, residual[:, np.newaxis]))
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy; sd of the sensor."""
@@ -281,8 +296,40 @@ class DiscrepancyNoise:
         """Return the same noise for readings ``interval`` seconds apart."""
         return replace(self, interval=interval)
 
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return φ to the power of the readings; the second state is not needed."""
+        kept = np.zeros((len(theta), *np.shape(readings), 2, 2))
+        kept[..., 0, 0] = np.exp(-np.multiply.outer(self.interval / theta[:, 2], readings))
+        return kept
+
+    def log_decay(self, theta: FloatArray) -> FloatArray:
+        """Return log a."""
+        return self.steady_state(theta).log_decay
+
+    def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
+        """Return that of white innovations of variance S that pass (1 − a z⁻¹)/(1 − φ z⁻¹)."""
+        kept, _, variance, _, log_decay, _ = self.steady_state(theta)
+        later = np.exp(-2j * np.pi * frequency * self.interval)
+        passed = np.abs((1 - np.exp(log_decay) * later) / (1 - kept * later))
+        density: FloatArray = np.sqrt(2 * self.interval * variance) * passed
+        return density
+
+    def coefficients(self, theta: FloatArray) -> dict[str, FloatArray]:
+        """Return the steady state, and what an innovation adds to the next prediction, φ − a."""
+        steady = self.steady_state(theta)
+        return {
+            "kept": steady.kept,
+            "decay": np.exp(steady.log_decay),
+            # Without the cancellation.
+            "gain": steady.kept * steady.predicted / steady.variance,
+            "predicted": steady.predicted,
+            "variance": steady.variance,
+            "surplus": steady.surplus,
+            "rate": steady.rate,
+        }
+
     def steady_state(self, theta: FloatArray) -> SteadyState:
-        """Return the filter without cancellation at either extreme."""
+        """Return the filter in the long run, without cancellation at either extreme."""
         sensor, process = theta[:, 0] ** 2, theta[:, 1] ** 2
         rate = self.interval / theta[:, 2]
         fresh = -np.expm1(-2 * rate)
@@ -294,12 +341,6 @@ class DiscrepancyNoise:
             log_a = np.minimum(-rate - np.log1p(predicted / sensor), -1e-300)
         surplus = np.maximum(process - predicted, 0.0)
         return SteadyState(np.exp(-rate), predicted, predicted + sensor, surplus, log_a, rate)
-
-
-NOISES: Mapping[str, Callable[..., Noise]] = {
-    "discrepancy": DiscrepancyNoise,
-    "white": WhiteNoise,
-}
 
 
 @dataclass

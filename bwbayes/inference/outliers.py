@@ -14,7 +14,6 @@ repeated until it does not change.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -23,7 +22,6 @@ from scipy.special import ndtri
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
-from bwbayes.inference.noise import SteadyState
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 
@@ -115,48 +113,63 @@ def surprise(
     """Return how far each reading of a record is from what all others predict, in sds, (readings,).
 
     At the coordinates ``position`` (free,). ``readings`` may have some that the posterior has not;
-    these predict no other. With the discrepancy's mean and variance (m, P) from the readings
-    before, and from those after, both joined over its own variance σ²:
+    these predict no other. With the mean and covariance (m, P) of the discrepancy's state from the
+    readings before, and from those after, both joined over its own covariance σ²:
 
-        1/Q = 1/P₁ + 1/P₂ − 1/σ²,   x̂ = Q (m₁/P₁ + m₂/P₂),   (r − x̂) / √(Q + s²).
+        Q⁻¹ = P₁⁻¹ + P₂⁻¹ − σ⁻²,   x̂ = Q (P₁⁻¹ m₁ + P₂⁻¹ m₂),   (r − x̂) / √(Q + s²).
     """
     theta = posterior.prior.theta(posterior.prior.constrain(position[np.newaxis])[0])
     dataset, readings = posterior.only, readings or posterior.only.readings
     simulated = posterior.simulate(theta, readings.rows)[0]
     residual = readings.values - simulated
     noise = dataset.noise.at(dataset.actuator.interval * readings.stride)
-    steady = noise.steady_state(dataset.table.noise(theta))
-    prior_variance = float(steady.predicted[0] + steady.surplus[0])
-    sensor = float(steady.variance[0] - steady.predicted[0])
-    if prior_variance <= 0:
+    parameters = dataset.table.noise(theta)
+    process, sensor = (float(sd[0]) ** 2 for sd in noise.marginal_sd(parameters))
+    if process <= 0:
         return np.asarray(residual / np.sqrt(sensor))
     fitted = np.isin(readings.rows, dataset.readings.rows)
-    before = _predicted(residual, readings.skipped, fitted, steady)
+    steps = {
+        missing: noise.transition(parameters, 1 + missing)[0]
+        for missing in set(readings.skipped.tolist())
+    }
     backward = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    after = (series[::-1] for series in _predicted(residual[::-1], backward, fitted[::-1], steady))
-    (m_1, p_1), (m_2, p_2) = before, after
-    joined = 1 / (1 / p_1 + 1 / p_2 - 1 / prior_variance)
-    expected = joined * (m_1 / p_1 + m_2 / p_2)
-    distance: FloatArray = (residual - expected) / np.sqrt(joined + sensor)
+    m_1, p_1 = _predicted(residual, readings.skipped, fitted, steps, process, sensor)
+    after = _predicted(residual[::-1], backward, fitted[::-1], steps, process, sensor)
+    # Backwards in time the second state has the other sign.
+    turned = np.array([1.0, -1.0])
+    m_2, p_2 = after[0][::-1] * turned, after[1][::-1] * np.outer(turned, turned)
+    one, other = np.linalg.inv(p_1), np.linalg.inv(p_2)
+    joined = np.linalg.inv(one + other - np.eye(2) / process)
+    pull = np.einsum("tij,tj->ti", one, m_1) + np.einsum("tij,tj->ti", other, m_2)
+    expected = np.einsum("tj,tj->t", joined[:, 0], pull)
+    distance: FloatArray = (residual - expected) / np.sqrt(joined[:, 0, 0] + sensor)
     return distance
 
 
 def _predicted(
-    residual: FloatArray, skipped: FloatArray, fitted: BoolArray, steady: SteadyState
+    residual: FloatArray,
+    skipped: FloatArray,
+    fitted: BoolArray,
+    steps: Mapping[float, FloatArray],
+    process: float,
+    sensor: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict the discrepancy at each reading from known ones before: mean, variance (each)."""
-    predicted, variance = float(steady.predicted[0]), float(steady.variance[0])
-    prior_variance = predicted + float(steady.surplus[0])
-    rate, sensor = float(steady.rate[0]), variance - predicted
-    means, variances = np.empty_like(residual), np.empty_like(residual)
-    mean, unsure = 0.0, prior_variance
+    """Predict the discrepancy's state at each reading from known ones before.
+
+    ``steps`` are F (2, 2) by the readings that are missing. Returns means (readings, 2) and
+    covariances (readings, 2, 2).
+    """
+    means, gains = np.empty((residual.size, 2)), np.empty((residual.size, 2, 2))
+    mean, gained = np.zeros(2), np.zeros((2, 2))
     series = zip(residual.tolist(), skipped.tolist(), fitted.tolist(), strict=True)
     for t, (reading, missing, is_known) in enumerate(series):
         if t:
-            decay = math.exp(-(1 + missing) * rate)
-            mean, unsure = decay * mean, decay**2 * unsure + (1 - decay**2) * prior_variance
-        means[t], variances[t] = mean, unsure
+            kept = steps[missing]
+            mean, gained = kept @ mean, kept @ gained @ kept.T
+        means[t], gains[t] = mean, gained
         if is_known:
-            gain = unsure / (unsure + sensor)
-            mean, unsure = mean + gain * (reading - mean), gain * sensor
-    return means, variances
+            told = np.array([process - gained[0, 0], -gained[1, 0]])
+            gain = told / (told[0] + sensor)
+            mean = mean + gain * (reading - mean[0])
+            gained = gained + np.outer(gain, told)
+    return means, process * np.eye(2) - gains

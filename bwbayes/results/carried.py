@@ -1,14 +1,13 @@
 """The discrepancy that readings leave behind, carried on to what comes after them.
 
-Where readings end, a part of the model discrepancy x is known: by the filter of the noise its mean
-is m and its variance P, given a draw. A process of sd σ and correlation time τ goes on from there:
-a time t later, with k = exp(−t/τ), it is normal with
+Where readings end, a part of the model discrepancy is known: by the filter of the noise its state
+(:meth:`~bwbayes.inference.noise.Noise.transition`) has the mean m and the covariance P, given a
+draw. A process of sd σ goes on from there: a time t later it is normal with
 
-    mean k m,   variance σ² − k² (σ² − P).
+    mean F(t) m,   covariance σ² − F(t) (σ² − P) F(t)ᵀ.
 
 So a forecast is narrower than any other prediction at first, and after a few correlation times as
-wide as ever. (An Ornstein-Uhlenbeck process; the filter is that of
-:class:`~bwbayes.inference.noise.DiscrepancyNoise`.)
+wide as ever.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.noise import Noise
 
 __all__ = ["Carried", "carried"]
 
@@ -32,52 +32,58 @@ class Carried:
     last
         Sample of the last reading.
     mean, gained
-        (draws,) its mean there, um, and by how much its variance is less than σ², um².
-    rate
-        (draws,) 1/τ per sample.
+        Of its state there: the mean (draws, 2), um, and by how much the covariance (draws, 2, 2) is
+        less than σ², um².
+    noise, parameters
+        The noise for the interval between samples, and its θ (draws, parameters).
     """
 
     last: int
     mean: FloatArray
     gained: FloatArray
-    rate: FloatArray
+    noise: Noise
+    parameters: FloatArray
 
     def means(self, first: int, samples: int) -> FloatArray:
         """Mean (draws, samples) from a sample on, um; before the last reading that there."""
-        known: FloatArray = self.mean[:, np.newaxis] * self._kept(first, samples)
+        known: FloatArray = np.einsum("dtj,dj->dt", self._kept(first, samples), self.mean)
         return known
 
     def less(self, first: int, samples: int) -> FloatArray:
         """By how much the variance (draws, samples) is less than σ², um²."""
-        known: FloatArray = self.gained[:, np.newaxis] * self._kept(first, samples) ** 2
+        kept = self._kept(first, samples)
+        known: FloatArray = np.einsum("dtj,djk,dtk->dt", kept, self.gained, kept)
         return known
 
     def _kept(self, first: int, samples: int) -> FloatArray:
-        """Return k (draws, samples)."""
-        after = np.maximum(first + np.arange(samples) - self.last, 0)
-        return np.exp(-np.outer(self.rate, after))
+        """Return F's first row (draws, samples, 2)."""
+        after = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
+        return self.noise.transition(self.parameters, after)[:, :, 0]
 
 
 def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) -> Carried:
     """Return what the readings of a record leave at θ (draws, parameters).
 
-    ``simulated`` (draws, readings), um, is the model's displacement at the readings. The filter
-    goes through them, with the discrepancy's mean m̂ and variance V before each and the gain
-    g = V/(V + s²) of the sensor's sd s: m̂ + g (r − m̂) and V s²/(V + s²) are those after it.
+    ``simulated`` (draws, readings), um, is the model's displacement at the readings.
     """
-    readings, steady = (
-        likelihood.readings,
-        likelihood.spaced.steady_state(likelihood.table.noise(theta)),
-    )
-    discrepancy, sensor = steady.predicted + steady.surplus, steady.variance - steady.predicted
-    mean, unsure = np.zeros(len(theta)), discrepancy.copy()
+    readings, noise = likelihood.readings, likelihood.spaced
+    parameters = likelihood.table.noise(theta)
+    discrepancy, sensor = (sd**2 for sd in noise.marginal_sd(parameters))
+    always = discrepancy[:, np.newaxis, np.newaxis] * np.eye(2)
+    mean, gained = np.zeros((len(theta), 2)), np.zeros((len(theta), 2, 2))
     residual = readings.values - simulated
+    steps = {missing: noise.transition(parameters, 1 + missing) for missing in readings.skipped}
     for t, missing in enumerate(readings.skipped.tolist()):
         if t:
-            kept = np.exp(-(1 + missing) * steady.rate)
-            mean, unsure = kept * mean, discrepancy - kept**2 * (discrepancy - unsure)
-        total = unsure + sensor
-        gain = np.divide(unsure, total, out=np.zeros_like(total), where=total > 0)
-        mean, unsure = mean + gain * (residual[:, t] - mean), gain * sensor
+            kept = steps[missing]
+            mean = np.einsum("dij,dj->di", kept, mean)
+            gained = kept @ gained @ np.swapaxes(kept, 1, 2)
+        unsure = always - gained
+        # What a reading says: the state's covariance with it, over the variance of both.
+        told = unsure[:, :, 0]
+        total = (told[:, 0] + sensor)[:, np.newaxis]
+        gain = np.divide(told, total, out=np.zeros_like(told), where=total > 0)
+        mean = mean + gain * (residual[:, t] - mean[:, 0])[:, np.newaxis]
+        gained = gained + gain[:, :, np.newaxis] * told[:, np.newaxis]
     last = int(readings.rows[-1])
-    return Carried(last, mean, np.maximum(discrepancy - unsure, 0.0), steady.rate / readings.stride)
+    return Carried(last, mean, gained, likelihood.noise, parameters)

@@ -12,14 +12,14 @@ describes this happens to fewer than one in a hundred.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.inference.noise import SteadyState
+from bwbayes.inference.noise import Noise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.drive import rate
 from bwbayes.results.spectrum import (
@@ -64,7 +64,7 @@ class Innovations:
 
     All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
     ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
-    the noise model's filter, of one model.
+    the noise model for that interval, and ``parameters`` (parameters,) are its own.
     """
 
     __repr__ = brief
@@ -75,21 +75,17 @@ class Innovations:
     rate: FloatArray
     residual: FloatArray
     interval: float
-    noise: SteadyState | None = None
+    noise: Noise | None = None
+    parameters: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def noise_density(self, frequency: FloatArray) -> FloatArray | None:
         """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided.
 
-        It is that of white innovations of variance S that pass (1 − a z⁻¹)/(1 − φ z⁻¹), in the
-        names of :class:`~bwbayes.inference.noise.DiscrepancyNoise`. None if it is not known.
+        None if it is not known.
         """
         if self.noise is None:
             return None
-        kept, _, variance, _, log_decay, _ = self.noise
-        later = np.exp(-2j * np.pi * frequency * self.interval)
-        passed = np.abs((1 - np.exp(log_decay) * later) / (1 - kept * later))
-        density: FloatArray = np.sqrt(2 * self.interval * variance) * passed
-        return density
+        return self.noise.density(self.parameters[np.newaxis], frequency)
 
     def spectrum(self) -> ResidualSpectrum:
         """Return the residual's spectrum, with its lines."""
@@ -133,15 +129,16 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     theta = posterior.prior.theta(free[np.newaxis])
     simulated = posterior.simulate(theta, readings.rows)
     residual = readings.values - simulated
-    noise = posterior.only.table.noise(theta)
-    white, _ = posterior.only.noise.whiten(noise, residual[:, np.newaxis], readings.skipped)
+    parameters = posterior.only.table.noise(theta)
+    noise = posterior.likelihood.spaced
+    white, _ = noise.whiten(parameters, residual[:, np.newaxis], readings.skipped)
     interval = posterior.only.actuator.interval
     changes = rate(posterior.only.voltage, interval)[readings.rows]
     time = begin + interval * readings.rows.astype(np.float64)
     voltage = posterior.only.voltage[readings.rows]
     apart = interval * readings.stride
-    steady = posterior.only.noise.steady_state(noise)
-    return Innovations(time, white[0, 0], voltage, changes, residual[0], apart, steady)
+    series = time, white[0, 0], voltage, changes, residual[0]
+    return Innovations(*series, apart, noise, parameters[0])
 
 
 def departures(series: Innovations) -> tuple[Finding, ...]:

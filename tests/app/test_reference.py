@@ -26,7 +26,7 @@ from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.inference.defaults import ranges_of
-from bwbayes.inference.noise import NOISES
+from bwbayes.inference.noises import NOISES
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 
 EVERY = {key.path: key for key in keys(Config)}

@@ -169,13 +169,14 @@ def test_density_of_the_noise_model_is_that_of_its_covariance(
     frequency = np.array([0.3, 2.0, 17.0, 50.0])
     angles = 2 * np.pi * interval * frequency
     sums = [sensor**2 + sd**2 + 2 * np.sum(covariance * np.cos(a * lags)) for a in angles]
-    steady = DiscrepancyNoise(interval).steady_state(np.array([theta]))
     empty = np.empty(0)
-    series = Innovations(empty, empty, empty, empty, empty, interval, steady)
+    series = Innovations(
+        empty, empty, empty, empty, empty, interval, DiscrepancyNoise(interval), np.array(theta)
+    )
     density = series.noise_density(frequency)
     assert density is not None
     np.testing.assert_allclose(density, np.sqrt(2 * interval * np.array(sums)), rtol=1e-6)
-    white = WhiteNoise(interval).steady_state(np.array([[sensor]]))
-    level = dataclasses.replace(series, noise=white).noise_density(frequency)
+    white = dataclasses.replace(series, noise=WhiteNoise(interval), parameters=np.array([sensor]))
+    level = white.noise_density(frequency)
     assert level is not None
     np.testing.assert_allclose(level, sensor * np.sqrt(2 * interval))

@@ -8,14 +8,14 @@ others the drive comes from NumPy, and the rest of the work is compiled still.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes
 from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
-from bwbayes.inference.noise import Noise, SteadyState
+from bwbayes.inference.noise import Noise
 from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
@@ -57,7 +57,9 @@ def moments(
     """
     table = ParameterTable(actuator, noise)
     column = table.columns(theta)
-    steady = noise.steady_state(table.noise(theta))
+    coefficients = noise.coefficients(table.noise(theta))
+    # What is None is left out when it is compiled.
+    second = True if "kept_12" in coefficients else None
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
@@ -65,16 +67,16 @@ def moments(
     for rows, stage in _staged(actuator, column, theta, voltage, from_rest=from_rest):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
-        models = _models(actuator, column, equilibrium, steady, voltage)[rows]
+        models = _models(actuator, column, equilibrium, coefficients, voltage)[rows]
         drive = stage.kind, stage.group, stage.plan
-        sums[:, rows] = kernels.sums(*record, models, *drive, *prepared, *unknowns)
+        sums[:, rows] = kernels.sums(*record, models, second, *drive, *prepared, *unknowns)
     size = 1 + offset + free
     products = np.empty((len(theta), size, size))
     for i in range(size):
         for j in range(i + 1):
             products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
     readings = np.count_nonzero(skipped >= 0)
-    log_determinant = readings * np.log(steady.variance) + sums[lanes.LOG_RATIO]
+    log_determinant = readings * np.log(coefficients["variance"]) + sums[lanes.LOG_RATIO]
     return products, log_determinant
 
 
@@ -149,21 +151,12 @@ def _models(
     actuator: Actuator,
     column: Values,
     equilibrium: FloatArray,
-    steady: SteadyState,
+    noise: Mapping[str, FloatArray],
     voltage: FloatArray,
 ) -> FloatArray:
     """Return the kernel's parameters (models, parameters); ``equilibrium`` as in `physics`."""
     rows = physics(actuator, column, equilibrium, voltage)
-    rows |= {
-        "kept": steady.kept,
-        "decay": np.exp(steady.log_decay),
-        # φ − a, without its cancellation.
-        "gain": steady.kept * steady.predicted / steady.variance,
-        "predicted": steady.predicted,
-        "variance": steady.variance,
-        "surplus": steady.surplus,
-        "rate": steady.rate,
-    }
+    rows |= noise
     free = actuator.sections(column).recursions[0].free
     for unknown in range(free.shape[1]):
         for part in range(free.shape[2]):

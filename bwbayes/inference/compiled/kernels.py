@@ -29,12 +29,14 @@ from bwbayes.arrays import FloatArray, IntArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    A1, A2, B0, B1, B2, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2, KEPT,
-    LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO, SQUARES,
-    STATE, STRENGTH, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, VALUE, VARIANCE, X1, X2,
+    A1, A2, B0, B1, B2, CHANGE, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2,
+    KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO,
+    SQUARES, STATE, STRENGTH, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, UNSURE_22, VALUE,
+    VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
+from bwbayes.inference.compiled import smooth
 from bwbayes.inference.compiled.parts import creep, polynomial
 from bwbayes.inference.compiled.responses import is_tracked, tracked_by
 from bwbayes.inference.compiled.stages import Kind, drive_of
@@ -53,13 +55,21 @@ FORGOTTEN = 1e-18
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
 def _settled(
-    state: FloatArray, displacement: FloatArray, first: int, last: int, drive: FloatArray
+    state: FloatArray,
+    second: bool | None,
+    displacement: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
 ) -> None:
     """Let the dynamics follow the drive, and the noise's filter what the measurement has beyond.
 
     Every sample has a reading and the filter is in its steady state. One loop for both, which
     writes to the state alone: so the compiler can use vectors.
     """
+    if second is not None:
+        smooth.settled(state, displacement, first, last, drive)
+        return
     for t in range(first, last):
         y = displacement[t]
         row = (t - first) * LANES
@@ -78,6 +88,7 @@ def _settled(
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _exact(
     state: FloatArray,
+    second: bool | None,
     displacement: FloatArray,
     skipped: FloatArray,
     first: int,
@@ -94,7 +105,6 @@ def _exact(
     responses that are followed.
     """
     first_slow = 1 + offset + free
-    series = first_slow + slow
     for t in range(first, last):
         row = (t - first) * LANES
         for i in range(LANES):
@@ -116,40 +126,59 @@ def _exact(
             for i in range(LANES):
                 state[VALUE + at + i] = state[KEEP_1 + at + i]
                 state[KEEP_1 + at + i] *= decay
-        if skipped[t] < 0.0:
-            continue
-        _skip(state, skipped[t], series)
+        if skipped[t] >= 0.0:
+            _filtered(state, second, skipped[t], first_slow + slow)
+    _take_logs(state)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _filtered(state: FloatArray, second: bool | None, missing: float, series: int) -> None:
+    """Let the filter take a reading of each series, after some that are missing."""
+    if missing > 0.0:
+        _take_logs(state)
+        if second is None:
+            _skip(state, missing, series)
+        else:
+            smooth.skip(state, missing, series)
+    if second is None:
+        _unsure(state)
+    else:
+        smooth.unsure(state)
+    pair = PRODUCTS
+    for k in range(series):
+        at = k * LANES
         for i in range(LANES):
-            ratio = state[UNSURE + i] / state[VARIANCE + i]
-            inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
-            state[RATIO + i] *= 1.0 + ratio
-            state[TRUST + i] = (state[PREDICTED + i] + state[UNSURE + i]) * inverse
-            state[UNSURE + i] *= state[DECAY + i] * state[DECAY + i] * state[VARIANCE + i] * inverse
-            state[INVERSE + i] = inverse
-        pair = PRODUCTS
-        for k in range(series):
-            at = k * LANES
-            for i in range(LANES):
+            if second is None:
                 estimate = state[ESTIMATE + at + i]
                 innovation = state[VALUE + at + i] - estimate
                 estimate += state[TRUST + i] * innovation
                 state[ESTIMATE + at + i] = state[KEPT + i] * estimate
-                state[INNOVATION + at + i] = innovation
-            for j in range(k + 1):
-                other = j * LANES
-                for i in range(LANES):
-                    product = state[INNOVATION + at + i] * state[INNOVATION + other + i]
-                    state[pair + i] += product * state[INVERSE + i]
-                pair += LANES
-    _take_logs(state)
+            else:
+                innovation = smooth.advance(state, i, at)
+            state[INNOVATION + at + i] = innovation
+        for j in range(k + 1):
+            other = j * LANES
+            for i in range(LANES):
+                product = state[INNOVATION + at + i] * state[INNOVATION + other + i]
+                state[pair + i] += product * state[INVERSE + i]
+            pair += LANES
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _unsure(state: FloatArray) -> None:
+    """Take what the filter does not know yet to the next reading."""
+    for i in range(LANES):
+        ratio = state[UNSURE + i] / state[VARIANCE + i]
+        inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
+        state[RATIO + i] *= 1.0 + ratio
+        state[TRUST + i] = (state[PREDICTED + i] + state[UNSURE + i]) * inverse
+        state[UNSURE + i] *= state[DECAY + i] * state[DECAY + i] * state[VARIANCE + i] * inverse
+        state[INVERSE + i] = inverse
 
 
 @njit(nogil=True, cache=True)
 def _skip(state: FloatArray, readings: float, series: int) -> None:
-    """Let the filter pass over missing readings; before one, the product of variances is logged."""
-    if readings == 0.0:
-        return
-    _take_logs(state)
+    """Let the filter pass over missing readings."""
     for i in range(LANES):
         decay = math.exp(-readings * state[RATE + i])
         fresh = -math.expm1(-2.0 * readings * state[RATE + i])
@@ -167,8 +196,19 @@ def _take_logs(state: FloatArray) -> None:
 
 
 @njit(nogil=True, cache=True)
-def _is_settled(state: FloatArray) -> bool:
+def _gather(state: FloatArray, readings: int) -> None:
+    """Add what readings with one variance brought to the sums."""
+    for i in range(LANES):
+        state[PRODUCTS + i] += state[SQUARES + i] * state[INVERSE + i]
+        state[SQUARES + i] = 0.0
+        state[LOG + i] -= readings * math.log(state[INVERSE + i] * state[VARIANCE + i])
+
+
+@njit(nogil=True, cache=True)
+def _is_settled(state: FloatArray, second: bool | None) -> bool:
     """Tell whether all models' filters are in their steady state."""
+    if second is not None:
+        return smooth.is_settled(state)
     settled = True
     for i in range(LANES):
         settled &= state[UNSURE + i] <= FORGOTTEN * state[VARIANCE + i]
@@ -183,6 +223,15 @@ def _is_heard(state: FloatArray, series: int) -> bool:
         if largest > FORGOTTEN:
             return True
     return False
+
+
+@njit(nogil=True, cache=True)
+def _is_audible(state: FloatArray, offset: int, free: int) -> bool:
+    """Tell whether any model's filter still hears of the start of the dynamics."""
+    audible = False
+    for k in range(1 + offset, 1 + offset + free):
+        audible = audible or _is_heard(state, k)
+    return audible
 
 
 @njit(nogil=True, cache=True)
@@ -213,7 +262,8 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
         state[i] = 0.0
     for i in range(LANES):
         state[RATIO + i] = 1.0
-        state[UNSURE + i] = state[SURPLUS + i]
+        state[UNSURE + i] = state[UNSURE_22 + i] = state[SURPLUS + i]
+        state[CHANGE + i] = 1.0
         if offset > 0:
             state[VALUE + LANES + i] = 1.0
             state[KEEP_1 + LANES + i] = 1.0
@@ -228,6 +278,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _group(
+    second: bool | None,
     kind: Kind,
     group: FloatArray,
     plan: FloatArray,
@@ -266,19 +317,20 @@ def _group(
         if lags.size > 0:
             creep(state, lags, growth, now, last, drive)
         if plain and staying == 0:
-            _settled(state, displacement, now, last, drive)
+            _settled(state, second, displacement, now, last, drive)
         elif plain:
             followed = decays[:staying], series[:staying]
             tracked_by(state, displacement, now, last, drive, *followed)
         else:
-            _exact(state, displacement, skipped, now, last, drive, lags, offset, free, slow)
-            settled = _is_settled(state)
-            audible = False
-            for k in range(1 + offset, 1 + offset + free):
-                audible = audible or _is_heard(state, k)
+            _exact(state, second, displacement, skipped, now, last, drive, lags, offset, free, slow)
+            settled = _is_settled(state, second)
+            audible = _is_audible(state, offset, free)
             staying = _stay(state, lags, offset, free, decays, series)
             tracked = settled and not audible
-            tracked = tracked and is_tracked(state, decays[:staying], series[:staying])
+            if second is None:
+                tracked = tracked and is_tracked(state, decays[:staying], series[:staying])
+            else:
+                tracked = tracked and staying == 0
         now = last
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] / state[VARIANCE + i]
@@ -301,6 +353,7 @@ def sums(
     displacement: FloatArray,
     skipped: FloatArray,
     models: FloatArray,
+    second: bool | None,
     kind: Kind,
     group: FloatArray,
     plan: FloatArray,
@@ -325,6 +378,8 @@ def sums(
         (samples,) how many readings are missing just before one, −1 where there is none.
     models
         (models, parameters), the columns as in ``PARAMETERS``.
+    second
+        None unless the noise has two states.
     kind, group, plan
         The stage that makes the drive, what each model is in it (models, rows), and what it knows
         of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
@@ -343,8 +398,8 @@ def sums(
             for row in range(group.shape[1]):
                 lane_group[row * LANES + i] = group[model, row]
         _group(
-            kind, lane_group, plan, curve, lags, growth, state, voltage, displacement, skipped,
-            offset, free, slow, results,
+            second, kind, lane_group, plan, curve, lags, growth, state, voltage, displacement,
+            skipped, offset, free, slow, results,
         )  # fmt: skip
         for row in range(SUMS):
             for i in range(min(LANES, count - first)):

@@ -1,0 +1,209 @@
+"""A smooth discrepancy is that of a driven oscillator, by whatever way it is worked out.
+
+The oracle is the oscillator's covariance from a matrix exponential of its equation of motion, and a
+dense Gaussian of that covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.outliers import surprise
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.smooth import SmoothNoise
+from bwbayes.results.carried import carried
+from bwbayes.results.innovations import Innovations
+from tests.inference.problems import INTERVAL, short_posterior
+
+QUALITIES = st.one_of(st.floats(0.02, 5.0), st.sampled_from([0.5, 0.5 + 1e-9, 0.5 - 1e-9]))
+
+
+def covariance(theta: FloatArray, time: FloatArray) -> FloatArray:
+    """Covariance (times,) of the discrepancy over times, s: σ² times a matrix exponential."""
+    _, process, memory, quality = theta
+    frequency = 1 / (memory * quality)
+    motion = np.array([[0.0, frequency], [-frequency, -frequency / quality]])
+    kept = [scipy.linalg.expm(motion * one)[0, 0] for one in time.ravel()]
+    return process**2 * np.reshape(kept, time.shape)
+
+
+def dense(theta: FloatArray, rows: IntArray, interval: float) -> FloatArray:
+    """Covariance of readings at those rows."""
+    lags = covariance(theta, interval * np.arange(rows[-1] - rows[0] + 1.0))
+    apart: FloatArray = lags[np.abs(np.subtract.outer(rows, rows))]
+    return apart + theta[0] ** 2 * np.eye(rows.size)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(1e-3, 3.0),
+    QUALITIES,
+    st.lists(st.integers(0, 300), min_size=1, max_size=60, unique=True),
+)
+@settings(deadline=None, max_examples=60)
+def test_readings_are_a_multivariate_normal(
+    seed: int, time: float, quality: float, rows: list[int]
+) -> None:
+    """Whatever readings there are, evenly spaced or not."""
+    generator = np.random.default_rng(seed)
+    theta = np.array([np.exp(generator.normal(-2, 1)), 1.3, time, quality])
+    at = np.sort(np.array(rows))
+    full = dense(theta, at, INTERVAL)
+    residual = np.linalg.cholesky(full) @ generator.standard_normal(at.size)
+    expected = scipy.stats.multivariate_normal(np.zeros(at.size), full).logpdf(residual)
+    skipped = np.concatenate([[0.0], np.diff(at) - 1.0])
+    white, log_determinant = SmoothNoise(INTERVAL).whiten(
+        theta[np.newaxis], residual[np.newaxis, np.newaxis], skipped
+    )
+    got = -0.5 * (np.sum(white**2) + log_determinant[0] + at.size * np.log(2 * np.pi))
+    assert abs(expected - got) < 1e-8 * (at.size + abs(expected))
+
+
+@pytest.mark.parametrize("quality", [0.05, 0.5, 2.0])
+def test_a_filter_that_has_settled_goes_on_as_one_that_has_not(quality: float) -> None:
+    """Through thousands of readings with two gaps, against the dense Gaussian."""
+    theta = np.array([0.1, 1.3, 0.2, quality])
+    rows = np.concatenate([np.arange(700), np.arange(730, 1300), np.arange(1310, 1600)])
+    generator = np.random.default_rng(1)
+    full = dense(theta, rows, INTERVAL)
+    residual = np.linalg.cholesky(full) @ generator.standard_normal(rows.size)
+    expected = scipy.stats.multivariate_normal(np.zeros(rows.size), full).logpdf(residual)
+    skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
+    one = theta[np.newaxis], residual[np.newaxis, np.newaxis], skipped
+    white, log_determinant = SmoothNoise(INTERVAL).whiten(*one)
+    got = -0.5 * (np.sum(white**2) + log_determinant[0] + rows.size * np.log(2 * np.pi))
+    assert abs(expected - got) < 1e-8 * rows.size
+
+
+def test_without_quality_it_is_an_ornstein_uhlenbeck_process() -> None:
+    """The difference falls with Q², and at Q = 1/2 the covariance is that of Matérn 3/2."""
+    residual = np.random.default_rng(2).standard_normal((1, 200))
+    theta = np.array([[0.5, 0.8, 0.2, 1.0]])
+    rough = DiscrepancyNoise(INTERVAL).log_density(theta[:, :3], residual)[0]
+    gaps = []
+    for quality in (1e-2, 1e-3):
+        theta[0, 3] = quality
+        gaps.append(abs(SmoothNoise(INTERVAL).log_density(theta, residual)[0] - rough))
+    assert gaps[1] < 0.02 * gaps[0] < 0.02
+    time = np.linspace(0, 2, 50)
+    theta[0, 3] = 0.5
+    kept = SmoothNoise(INTERVAL).transition(theta, time / INTERVAL)[0, :, 0, 0]
+    np.testing.assert_allclose(kept, (1 + 10 * time) * np.exp(-10 * time), atol=1e-12)
+
+
+@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+def test_the_time_is_the_integral_of_the_correlation(quality: float) -> None:
+    theta = np.array([[0.1, 1.3, 0.2, quality]])
+    time = np.linspace(0, 40, 400_001)
+    kept = SmoothNoise(1.0).transition(theta, time)[0, :, 0, 0]
+    assert scipy.integrate.simpson(kept, x=time) == pytest.approx(0.2, rel=1e-6)
+
+
+@pytest.mark.parametrize("quality", [0.02, 0.5, 3.0])
+def test_draws_have_the_covariance(quality: float) -> None:
+    """800 draws of 40 samples: a variance is known to 5 %, so 20 % too much is seen (4 sds)."""
+    theta = np.array([[0.3, 1.3, 0.1, quality]])
+    generator = np.random.default_rng(3)
+    pairs = [SmoothNoise(INTERVAL).draw(theta, 40, generator) for _ in range(800)]
+    total = np.array([sum(pair) for pair in pairs])
+    factor = np.linalg.cholesky(dense(theta[0], np.arange(40), INTERVAL))
+    white = scipy.linalg.solve_triangular(factor, total.T, lower=True)
+    # Of independent standard normals: each mean square by itself, and the first with the others.
+    squares = np.mean(white**2, axis=1) - 1
+    assert np.abs(squares).max() * np.sqrt(800 / 2) < 4.5
+    across = np.mean(white[0] * white[1:], axis=1)
+    assert np.abs(across).max() * np.sqrt(800) < 4.5
+
+
+def altered(quality: float, **changes: object) -> tuple[Posterior, FloatArray]:
+    """Return a posterior and a place in it (free,) of that quality."""
+    posterior = short_posterior("smooth", 120, **changes)  # type: ignore[arg-type]
+    free = posterior.prior.draw(np.random.default_rng(7), 1)
+    free[0, posterior.names.index("discrepancy_quality")] = quality
+    free[0, posterior.names.index("discrepancy_time")] = 0.2
+    return posterior, posterior.prior.unconstrain(free)[0]
+
+
+@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: float) -> None:
+    posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
+    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
+    rows = posterior.only.readings.rows
+    full = dense(posterior.only.table.noise(theta)[0], rows, INTERVAL)
+    residual = posterior.only.readings.values - posterior.simulate(theta, rows)[0]
+    inverse = np.linalg.inv(full)
+    expected = inverse @ residual / np.sqrt(np.diag(inverse))
+    np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float) -> None:
+    """Mean and variance of the discrepancy at any later sample, given all readings."""
+    posterior, place = altered(quality)
+    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
+    rows = posterior.only.readings.rows
+    simulated = posterior.simulate(theta, rows)
+    left = carried(posterior.likelihood, theta, simulated)
+    noise = posterior.only.table.noise(theta)[0]
+    later = rows[-1] + np.array([0, 3, 50])
+    across = covariance(noise, INTERVAL * np.abs(np.subtract.outer(later, rows)))
+    gain = np.linalg.solve(dense(noise, rows, INTERVAL), across.T).T
+    expected = gain @ (posterior.only.readings.values - simulated[0])
+    known = np.sum(gain * across, axis=1)
+    first = int(later[0])
+    np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, atol=1e-7)
+    np.testing.assert_allclose(left.less(first, 51)[0][later - first], known, atol=1e-7)
+
+
+GAPS = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 400), slice(440, 700))
+
+
+@pytest.mark.parametrize("training", [None, GAPS])
+@pytest.mark.parametrize("dynamics", ["none", "lag"])
+def test_engines_agree(dynamics: str, training: tuple[slice, ...] | None) -> None:
+    pytest.importorskip("numba")
+    posterior = short_posterior("smooth", 700, dynamics, {}, training=training)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(4), 100))
+    slow, fast = (
+        replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
+    )
+    np.testing.assert_allclose(fast, slow, atol=1e-10 * 700, rtol=1e-10)
+
+
+@pytest.mark.parametrize("stride", [1, 3, 20])
+def test_engines_agree_on_an_offset_and_any_stride(stride: int) -> None:
+    pytest.importorskip("numba")
+    posterior = short_posterior("smooth", 700, "lag", {})
+    reading = posterior.only.displacement.copy()
+    reading[np.arange(700) % stride != 0] = np.nan
+    posterior = posterior.altered(displacement=reading, from_rest=False)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
+    likelihood = replace(posterior.likelihood, offset_sd=3.0)
+    slow, fast = (
+        replace(likelihood, engine=engine).log_density(theta) for engine in ("numpy", "numba")
+    )
+    np.testing.assert_allclose(fast, slow, atol=1e-9 * 700, rtol=1e-9)
+
+
+def test_density_of_the_noise_model_is_that_of_its_covariance() -> None:
+    """Against the sum over all lags, at frequencies that sampling does not fold."""
+    theta, interval = np.array([0.01, 1.4, 0.3, 0.7]), 0.005
+    lags = np.arange(1, 4000)
+    along = SmoothNoise(interval).transition(theta[np.newaxis], lags.astype(float))[0, :, 0, 0]
+    frequency = np.array([0.05, 0.3, 1.0])
+    sums = [1.4**2 * (1 + 2 * along @ np.cos(2 * np.pi * f * interval * lags)) for f in frequency]
+    empty = np.empty(0)
+    noise = SmoothNoise(interval)
+    series = Innovations(empty, empty, empty, empty, empty, interval, noise, theta)
+    density = series.noise_density(frequency)
+    assert density is not None
+    expected = np.sqrt(2 * interval * (np.array(sums) + 0.01**2))
+    np.testing.assert_allclose(density, expected, rtol=1e-3)
