@@ -12,6 +12,7 @@ missing. Its log density is theirs.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -79,6 +80,19 @@ class Noise(Protocol):
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
+
+    def band_sd(
+        self,
+        theta: FloatArray,
+        missed: Callable[[], float],
+        readings: int,
+        generator: np.random.Generator,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Sd of the discrepancy and of the sensor that a band of new readings has, (models,), um.
+
+        ``missed`` returns the mean square, um², of what the models' mean misses of so many
+        fitted readings.
+        """
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Correlation time of the discrepancy (models,), s; zero without one."""
@@ -192,6 +206,16 @@ class WhiteNoise:
         """No discrepancy; sd of the sensor."""
         return np.zeros(theta.shape[0]), theta[:, 0]
 
+    def band_sd(
+        self,
+        theta: FloatArray,
+        missed: Callable[[], float],  # noqa: ARG002
+        readings: int,  # noqa: ARG002
+        generator: np.random.Generator,  # noqa: ARG002
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the marginal ones."""
+        return self.marginal_sd(theta)
+
     def memory(self, theta: FloatArray) -> FloatArray:
         """No memory."""
         return np.zeros(theta.shape[0])
@@ -274,6 +298,16 @@ class DiscrepancyNoise:
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
+
+    def band_sd(
+        self,
+        theta: FloatArray,
+        missed: Callable[[], float],  # noqa: ARG002
+        readings: int,  # noqa: ARG002
+        generator: np.random.Generator,  # noqa: ARG002
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the marginal ones."""
+        return self.marginal_sd(theta)
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Return the correlation time."""

@@ -12,6 +12,7 @@ same σ and τ, and beyond 1/2 it swings. With its velocity it is a Markov proce
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,8 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DISCREPANCY_SD, DISCREPANCY_TIME, SENSOR_SD, log_density
-from bwbayes.model.declaration import Declaration, lognormal
+from bwbayes.model.declaration import Declaration
+from bwbayes.model.distributions import Distribution
 
 __all__ = ["SmoothNoise"]
 
@@ -30,12 +32,13 @@ SHORT = 1.0
 # A covariance that changes by less of itself from reading to reading stays as it is.
 SETTLED = 2e-15
 
+# What swings knows hardly anything at low frequencies: it takes a slow misfit for the parameters'.
 DISCREPANCY_QUALITY = Declaration(
     "discrepancy_quality",
     "",
     "Q",
-    "quality of the model discrepancy: 0.5 is Matérn 3/2, less is rougher, more swings",
-    lambda _: lognormal(0.5, 1.0),
+    "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
+    lambda _: Distribution("uniform", {"lower": 0.0, "upper": 0.5}),
     floor=0.0,
 )
 
@@ -114,6 +117,25 @@ class SmoothNoise:
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
+
+    def band_sd(
+        self,
+        theta: FloatArray,
+        missed: Callable[[], float],
+        readings: int,
+        generator: np.random.Generator,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take the discrepancy's size from the residuals, not from the kernel.
+
+        Readings fix how the process moves at high frequencies, σ²/τ³; what σ adds at low ones is an
+        extrapolation, often of several times what was seen. So a draw's variance is the mean
+        square of the residuals less the sensor's, times ν/χ²(ν): over a time T they are worth
+        ν = T/∫ρ² = T/(τ (1 + Q²)) independent ones, or two at least.
+        """
+        _, _, time, quality = theta.T
+        worth = np.maximum(readings * self.interval / (time * (1 + quality**2)), 2.0)
+        seen = np.maximum(missed() - theta[:, 0] ** 2, 0.0)
+        return np.sqrt(seen * worth / generator.chisquare(worth)), theta[:, 0]
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Return the correlation time τ."""

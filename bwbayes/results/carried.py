@@ -49,11 +49,13 @@ class Carried:
         known: FloatArray = np.einsum("dtj,dj->dt", self._kept(first, samples), self.mean)
         return known
 
-    def less(self, first: int, samples: int) -> FloatArray:
-        """By how much the variance (draws, samples) is less than σ², um²."""
+    def told(self, first: int, samples: int) -> FloatArray:
+        """Return the part (draws, samples) of the variance σ² that is known."""
         kept = self._kept(first, samples)
-        known: FloatArray = np.einsum("dtj,djk,dtk->dt", kept, self.gained, kept)
-        return known
+        known = np.einsum("dtj,djk,dtk->dt", kept, self.gained, kept)
+        always = self.noise.marginal_sd(self.parameters)[0][:, np.newaxis] ** 2
+        part: FloatArray = np.divide(known, always, out=np.zeros_like(known), where=always > 0)
+        return np.minimum(part, 1.0)
 
     def _kept(self, first: int, samples: int) -> FloatArray:
         """Return F's first row (draws, samples, 2)."""

@@ -57,9 +57,10 @@ class _Draws:
         """Sd of a band's quantity given a draw, um: (draws, samples), (draws, 1) if all alike."""
         variance = self.start.offset_sd[:, np.newaxis] ** 2
         if kind != "parameter":
-            variance = variance + self.discrepancy[:, np.newaxis] ** 2
+            discrepancy = self.discrepancy[:, np.newaxis] ** 2
             if self.start.carried is not None:
-                variance = np.maximum(variance - self.start.carried.less(first, samples), 0.0)
+                discrepancy = discrepancy * (1 - self.start.carried.told(first, samples))
+            variance = variance + discrepancy
         if kind == "sensor":
             variance = variance + self.sensor[:, np.newaxis] ** 2
         return np.sqrt(variance)
@@ -202,10 +203,19 @@ def predict_record(
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    sds = posterior.only.noise.marginal_sd(posterior.only.table.noise(theta))
+    readings, noise = posterior.only.readings, posterior.likelihood.spaced
+
+    def missed() -> float:
+        total = np.zeros(readings.rows.size)
+        for simulated in posterior.simulations(theta, readings.rows):
+            total += simulated.sum(axis=0)
+        return float(np.mean((readings.values - total / len(theta)) ** 2))
+
     # The same for all predictions: bands differ by what is predicted, not by chance.
-    scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
-    return _Draws(start, *sds, scores)
+    generator = np.random.default_rng(len(theta))
+    scores = mixture.stratified_scores(len(theta), generator)
+    parameters, count = posterior.only.table.noise(theta), readings.rows.size
+    return _Draws(start, *noise.band_sd(parameters, missed, count, generator), scores)
 
 
 def _bands(

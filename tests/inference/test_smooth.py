@@ -32,14 +32,16 @@ def covariance(theta: FloatArray, time: FloatArray) -> FloatArray:
     frequency = 1 / (memory * quality)
     motion = np.array([[0.0, frequency], [-frequency, -frequency / quality]])
     kept = [scipy.linalg.expm(motion * one)[0, 0] for one in time.ravel()]
-    return process**2 * np.reshape(kept, time.shape)
+    values: FloatArray = process**2 * np.reshape(kept, time.shape)
+    return values
 
 
 def dense(theta: FloatArray, rows: IntArray, interval: float) -> FloatArray:
     """Covariance of readings at those rows."""
     lags = covariance(theta, interval * np.arange(rows[-1] - rows[0] + 1.0))
-    apart: FloatArray = lags[np.abs(np.subtract.outer(rows, rows))]
-    return apart + theta[0] ** 2 * np.eye(rows.size)
+    full: FloatArray = lags[np.abs(np.subtract.outer(rows, rows))]
+    full += theta[0] ** 2 * np.eye(rows.size)
+    return full
 
 
 @given(
@@ -57,13 +59,14 @@ def test_readings_are_a_multivariate_normal(
     theta = np.array([np.exp(generator.normal(-2, 1)), 1.3, time, quality])
     at = np.sort(np.array(rows))
     full = dense(theta, at, INTERVAL)
-    residual = np.linalg.cholesky(full) @ generator.standard_normal(at.size)
+    residual: FloatArray = np.linalg.cholesky(full) @ generator.standard_normal(at.size)
     expected = scipy.stats.multivariate_normal(np.zeros(at.size), full).logpdf(residual)
     skipped = np.concatenate([[0.0], np.diff(at) - 1.0])
     white, log_determinant = SmoothNoise(INTERVAL).whiten(
         theta[np.newaxis], residual[np.newaxis, np.newaxis], skipped
     )
-    got = -0.5 * (np.sum(white**2) + log_determinant[0] + at.size * np.log(2 * np.pi))
+    squares = float(np.sum(white**2) + log_determinant[0])
+    got = -0.5 * (squares + at.size * np.log(2 * np.pi))
     assert abs(expected - got) < 1e-8 * (at.size + abs(expected))
 
 
@@ -113,7 +116,7 @@ def test_draws_have_the_covariance(quality: float) -> None:
     theta = np.array([[0.3, 1.3, 0.1, quality]])
     generator = np.random.default_rng(3)
     pairs = [SmoothNoise(INTERVAL).draw(theta, 40, generator) for _ in range(800)]
-    total = np.array([sum(pair) for pair in pairs])
+    total: FloatArray = np.sum(pairs, axis=1)
     factor = np.linalg.cholesky(dense(theta[0], np.arange(40), INTERVAL))
     white = scipy.linalg.solve_triangular(factor, total.T, lower=True)
     # Of independent standard normals: each mean square by itself, and the first with the others.
@@ -132,7 +135,7 @@ def altered(quality: float, **changes: object) -> tuple[Posterior, FloatArray]:
     return posterior, posterior.prior.unconstrain(free)[0]
 
 
-@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+@pytest.mark.parametrize("quality", [0.1, 0.45])
 def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: float) -> None:
     posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
@@ -144,7 +147,7 @@ def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: flo
     np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+@pytest.mark.parametrize("quality", [0.1, 0.45])
 def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float) -> None:
     """Mean and variance of the discrepancy at any later sample, given all readings."""
     posterior, place = altered(quality)
@@ -157,10 +160,10 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float) -> No
     across = covariance(noise, INTERVAL * np.abs(np.subtract.outer(later, rows)))
     gain = np.linalg.solve(dense(noise, rows, INTERVAL), across.T).T
     expected = gain @ (posterior.only.readings.values - simulated[0])
-    known = np.sum(gain * across, axis=1)
+    known = np.sum(gain * across, axis=1) / noise[1] ** 2
     first = int(later[0])
     np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, atol=1e-7)
-    np.testing.assert_allclose(left.less(first, 51)[0][later - first], known, atol=1e-7)
+    np.testing.assert_allclose(left.told(first, 51)[0][later - first], known, atol=1e-7)
 
 
 GAPS = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 400), slice(440, 700))

@@ -49,7 +49,7 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(missing: tuple[int, .
     variance = SD**2 - np.sum(gain * covariance(later, rows), axis=1)
     first = int(later[0])
     np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, rtol=1e-9)
-    known = SD**2 - left.less(first, 51)[0][later - first]
+    known = SD**2 * (1 - left.told(first, 51)[0][later - first])
     np.testing.assert_allclose(known, variance, rtol=1e-9)
 
 

@@ -53,7 +53,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "hysteresis": (*HYSTERESIS, IMPORTED),
     "gain": tuple(TERMS),
     "dynamics": (*DYNAMICS, IMPORTED),
-    "noise": (*NOISES, IMPORTED),
+    "noise": ("auto", *NOISES, IMPORTED),
     "prior": (*(f"{n}({', '.join(a)})" for n, a in FAMILIAR.items()), "or one of scipy.stats"),
     "signal": signal_names(),
 }

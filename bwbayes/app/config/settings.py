@@ -182,14 +182,19 @@ class ModelConfig(ActuatorConfig):
     """What the voltage does between samples: straight lines (first), held (zero), or held if it is
     a command (auto).
     """
-    noise: str = key("discrepancy", example='"white"')
-    """The model of the residual."""
+    noise: str = key("auto", example='"smooth"')
+    """The model of the residual; auto: the one that a single record has evidence for."""
     per_record: Texts = key([], example='["sensor_sd"]')
     """Parameters that each of several records has of its own, besides initial and offset."""
     shared: Texts = key([], example='["offset"]')
     """Of initial and offset, what all of several records share."""
     outliers: bool = key(False, example="true")
     """Whether readings far from what their neighbors predict are set aside."""
+
+    @property
+    def noise_until_chosen(self) -> str:
+        """Its noise; of what is to be chosen the one that claims least."""
+        return "discrepancy" if self.noise == "auto" else self.noise
 
 
 class StandModelConfig(ActuatorConfig):

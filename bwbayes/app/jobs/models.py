@@ -180,7 +180,9 @@ def _standing(folder: RunFolder, files: bool) -> Standing:
 def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
     """Return the config with another model, and of what it says of parameters what that has."""
     actuator = actuator_of(model, records[0], records)
-    names = ParameterTable(actuator, noise_model(model.noise, records[0].interval)).names
+    names = ParameterTable(
+        actuator, noise_model(model.noise_until_chosen, records[0].interval)
+    ).names
     # A parameter of one record is called name[record].
     applicable = {
         key: {p: value for p, value in getattr(config, key).items() if p.partition("[")[0] in names}

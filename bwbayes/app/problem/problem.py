@@ -187,10 +187,9 @@ class Problem:
         options = dict.fromkeys(OPTIONS if "hysteresis" in changes else ())
         model = config.model.model_copy(update={**options, **changes})
         actuator = actuator_of(model, self.record, list(self.records.values()))
-        units = {
-            declared.name: declared.unit
-            for declared in ParameterTable(actuator, self.posterior.datasets[0].noise).declarations
-        }
+        noise = noise_model(model.noise_until_chosen, actuator.interval)
+        table = ParameterTable(actuator, noise)
+        units = {declared.name: declared.unit for declared in table.declarations}
         added = {name: ParameterConfig(**stated) for name, stated in parameters.items()}
         stated = {**added, **config.parameters}
         shared = {n: p for n, p in stated.items() if n in units and p.unit in (None, units[n])}
@@ -290,7 +289,7 @@ def _posterior(
                 readings_of(record),
                 windows[name].training,
                 actuator,
-                noise_model(config.model.noise, record.interval),
+                noise_model(config.model.noise_until_chosen, record.interval),
                 config.records[name].from_rest,
                 name,
             )

@@ -24,6 +24,7 @@ from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.assembling import assemble, save_result
+from bwbayes.app.running.choosing import chosen_noise
 from bwbayes.app.running.drawing import Beside, beside
 from bwbayes.app.running.fingerprint import fingerprint, require_its_own, versions
 from bwbayes.app.running.folder import RunFolder
@@ -65,8 +66,8 @@ def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
         The folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem = folder.problem()
-        with _chain(folder, problem, Console(quiet=True), None) as chain:
+        problem, chain = _chain(folder, Console(quiet=True))
+        with chain:
             return problem, chain.point
 
 
@@ -79,11 +80,8 @@ def draw(folder: RunFolder) -> Fit:
         The folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem = folder.problem()
-        with (
-            _chain(folder, problem, Console(quiet=True), None) as chain,
-            executor(1, problem.posterior.engine) as pool,
-        ):
+        problem, chain = _chain(folder, Console(quiet=True))
+        with chain, executor(1, problem.posterior.engine) as pool:
             outcome = sample(problem.posterior, problem.plan, chain, pool)
         return Fit(problem, chain, folder).knowing(outcome=outcome)
 
@@ -138,11 +136,11 @@ def resume(
     with beside(workers, enabled=background and files) as artist, folder.locked(), one_thread():
         targets = {"ess": ess, "steps": steps, "engine": engine}
         _retarget(folder, {name: value for name, value in targets.items() if value is not None})
-        problem = folder.problem()
         if show is not None:
-            show(problem)
+            show(folder.problem())
+        problem, chain = _chain(folder, console, engine)
         with (
-            _chain(folder, problem, console, engine) as chain,
+            chain,
             executor(workers, problem.posterior.engine, backend) as pool,
             Progress(console, problem.plan) as progress,
         ):
@@ -181,24 +179,38 @@ def redraw(folder: RunFolder) -> Fit:
 
 
 def _chain(
-    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None
-) -> ChainFile:
-    """Open the run's chain where it stands, or start it with a point fit."""
-    posterior, config = problem.posterior, problem.config
-    if folder.chain.exists():
-        chain = ChainFile.resume(folder.chain, partial(require_its_own, folder.chain, problem))
-        first_engine, now = chain.attributes()["engine"], posterior.engine
-        if first_engine != now:
-            if requested is None:
-                chain.close()
-                raise InputError(
-                    f"{folder.chain}: was sampled with the {first_engine} engine, not {now}; set "
-                    f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
-                )
-            console.print(f"resuming with the {now} engine a chain begun with {first_engine}")
-        return chain
+    folder: RunFolder, console: Console, requested: Engine | None = None
+) -> tuple[Problem, ChainFile]:
+    """Open the run's chain where it stands, or start it with a point fit; its problem first."""
+    problem = folder.problem()
+    if not folder.chain.exists():
+        return _begun(folder, problem, console)
+    chain = ChainFile.resume(folder.chain, partial(require_its_own, folder.chain, problem))
+    first_engine, now = chain.attributes()["engine"], problem.posterior.engine
+    if first_engine != now:
+        if requested is None:
+            chain.close()
+            raise InputError(
+                f"{folder.chain}: was sampled with the {first_engine} engine, not {now}; set "
+                f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
+            )
+        console.print(f"resuming with the {now} engine a chain begun with {first_engine}")
+    return problem, chain
+
+
+def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Problem, ChainFile]:
+    """Start a chain with a point fit, and with the noise that it shows."""
     console.print("computing the MAP estimate ...", highlight=False)
-    point = pointfit.fit(posterior, generator(config.seed, "point fit"))
+    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+    if problem.config.model.noise == "auto":
+        noise, why = chosen_noise(problem, point)
+        console.print(why, highlight=False, soft_wrap=True)
+        changed = noise != problem.config.model.noise_until_chosen
+        _rewrite(folder, problem.changed(problem.config, {"noise": noise}, {}))
+        problem = folder.problem()
+        if changed:
+            point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+    posterior, config = problem.posterior, problem.config
     attributes: dict[str, str | int] = {
         "config": dump(config),
         "data_sha256": problem.sha256,
@@ -210,7 +222,8 @@ def _chain(
         "parameters": json.dumps(posterior.names),
     }
     first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
-    return ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+    chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+    return problem, chain
 
 
 def _effort(problem: Problem, chain: ChainFile, outcome: Outcome) -> str:
@@ -229,7 +242,12 @@ def _retarget(folder: RunFolder, targets: Mapping[str, object]) -> None:
         return
     config = load(folder.config)
     sampling = config.sampling.model_copy(update=targets)
-    text = dump(config.model_copy(update={"sampling": sampling}))
+    _rewrite(folder, config.model_copy(update={"sampling": sampling}))
+
+
+def _rewrite(folder: RunFolder, config: Config) -> None:
+    """Write another config into a run's folder."""
+    text = dump(config)
     parse(text, "resume")  # refuses what a config cannot say
     draft = folder.config.with_suffix(".partial")
     draft.write_text(text, encoding="utf-8")

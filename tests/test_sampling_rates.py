@@ -1,0 +1,134 @@
+"""One answer at any sampling rate, where the model cannot follow: ten plants of forty plays.
+
+Bouc-Wen hysteresis with a smooth discrepancy is fitted to 4 s of each plant at 5 kHz, with every
+reading, every 5th, 25th and 100th (the drive stays whole), and predicts another record of it. What
+the model misses is smooth and the same at all rates, so that fewer readings must not tell more: a
+rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy
+
+from bwbayes.arrays import FloatArray
+from bwbayes.data import Record, write_record
+from bwbayes.results.prediction import predict_record
+from bwbayes.results.start import Start
+from tests.diagnosis.plants import play
+from tests.measured import keep
+from tests.results.runs import KEPT, covered, problem_of, weighted_draws
+
+RATE, SECONDS = 5000.0, 4.0
+EVERY = (1, 5, 25, 100)
+SENSOR = 0.05
+PLANTS = 10
+SHAPE = ("d", "alpha", "beta")
+
+
+class Answer(NamedTuple):
+    """Means and sds (parameters,) of :data:`SHAPE`, the sensor's sd, and of another record.
+
+    ``error`` is the mean's root mean square, um; ``coverage`` the 95 % sensor band's.
+    """
+
+    mean: FloatArray
+    sd: FloatArray
+    sensor: float
+    error: float
+    coverage: float
+
+
+def drive(rng: np.random.Generator) -> FloatArray:
+    """Return a voltage from rest (samples,): two sines, the amplitude changing."""
+    time = np.arange(round(SECONDS * RATE)) / RATE
+    swing = 1 - rng.uniform(0.4, 0.6) * time / SECONDS
+    quick = 75 * swing * np.sin(2 * np.pi * rng.uniform(1.0, 2.0) * time)
+    voltage: FloatArray = quick + 25 * np.sin(2 * np.pi * rng.uniform(0.3, 0.6) * time)
+    return voltage
+
+
+def records(seed: int) -> tuple[Record, Record]:
+    """Return two records of a plant, of other drives: plays, a quadratic gain, a lag."""
+    rng = np.random.default_rng([81, seed])
+    thresholds = np.linspace(2, 80, 40)
+    weights = rng.gamma(2.0, 1.0, 40) * np.exp(-thresholds / rng.uniform(20, 60))
+    weights *= rng.uniform(0.3, 0.5) / np.sum(weights)
+    quadratic, lag = rng.uniform(1e-4, 6e-4), rng.uniform(0.003, 0.008)
+    made: list[Record] = []
+    for _ in range(2):
+        voltage = drive(rng)
+        if made:
+            # Inside what was fitted: bands beyond it are called an extrapolation.
+            voltage *= 0.95 * min(
+                made[0].voltage.max() / voltage.max(), made[0].voltage.min() / voltage.min()
+            )
+        moved = 0.5 * voltage + quadratic * voltage**2
+        for threshold, weight in zip(thresholds, weights, strict=True):
+            moved = moved + weight * play(voltage, threshold)
+        kept = np.exp(-1 / RATE / lag)
+        moved = scipy.signal.lfilter([1 - kept], [1.0, -kept], moved)
+        reading = moved + SENSOR * rng.standard_normal(voltage.size)
+        made.append(Record(voltage, reading, 1 / RATE))
+    return made[0], made[1]
+
+
+def answer(fitted: Record, other: Record, every: int, noise: str, folder: Path) -> Answer:
+    """Fit every so manieth reading, and predict the other record."""
+    assert fitted.displacement is not None
+    reading = fitted.displacement.copy()
+    reading[np.arange(reading.size) % every != 0] = np.nan
+    write_record(replace(fitted, displacement=reading), folder / "record.h5")
+    lines = '[record]\nfile = "record.h5"\ntrain = [[0.0, 4.0]]\nfrom_rest = true\n'
+    problem = problem_of(f'{lines}[model]\nnoise = "{noise}"\n', folder)
+    source = np.random.default_rng([82, every])
+    draws, weights = weighted_draws(problem.posterior, source)
+    chosen = draws[source.choice(len(draws), KEPT, p=weights)]
+    start = Start(from_rest=True, own_offset=False)
+    bands = predict_record(problem.posterior, chosen, other, start, source)
+    assert bands.measured is not None
+    columns = [problem.posterior.names.index(name) for name in SHAPE]
+    mean = weights @ draws[:, columns]
+    sd = np.sqrt(weights @ (draws[:, columns] - mean) ** 2)
+    sensor = float(weights @ draws[:, problem.posterior.names.index("sensor_sd")])
+    error = float(np.sqrt(np.mean((bands.measured - bands.mean) ** 2)))
+    return Answer(mean, sd, sensor, error, covered(bands))
+
+
+def judged(plants: int, noise: str, folder: Path) -> dict[str, object]:
+    """Return how far answers at all rates are one."""
+    apart, ratios, sensors, errors = [], [], [], []
+    coverage: dict[str, list[float]] = {f"{RATE / every:g}": [] for every in EVERY}
+    for seed in range(plants):
+        fitted, other = records(seed)
+        answers = [answer(fitted, other, every, noise, folder) for every in EVERY]
+        for one, two in combinations(answers, 2):
+            apart += list(np.abs(one.mean - two.mean) / np.maximum(one.sd, two.sd))
+            ratios += list(np.exp(np.abs(np.log(one.sd / two.sd))))
+        sensors.append([one.sensor / SENSOR for one in answers])
+        # At 5 kHz over that at 200 Hz.
+        errors.append(answers[0].error / answers[2].error)
+        for values, one in zip(coverage.values(), answers, strict=True):
+            values.append(one.coverage)
+    return {
+        "plants": plants,
+        "within one sd": float(np.mean(np.array(apart) < 1)),
+        "sds within 1.5": float(np.mean(np.array(ratios) < 1.5)),
+        "largest ratio of sds": float(np.max(ratios)),
+        "sensor": [[float(np.min(s)), float(np.max(s))] for s in np.transpose(sensors)],
+        "error ratio": [float(np.median(errors)), float(np.max(errors))],
+        "coverage": {rate: [float(np.mean(v)), float(np.min(v))] for rate, v in coverage.items()},
+    }
+
+
+@pytest.mark.slow
+def test_one_answer_at_any_rate(tmp_path: Path) -> None:
+    result = judged(PLANTS, "smooth", tmp_path)
+    keep("one answer at any rate", result)
+    print(result)
