@@ -31,9 +31,10 @@ from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.noise import DiscrepancyNoise, SteadyState, WhiteNoise
+from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.rough import DiscrepancyNoise, SteadyState
 from bwbayes.results.calibration import LIMIT, Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.measured import keep

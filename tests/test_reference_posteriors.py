@@ -25,7 +25,7 @@ from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.monitor import Outcome
 from tests.reference.make import digest, from_cube

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from bwbayes.inference.noise import DiscrepancyNoise, Noise, WhiteNoise
+from bwbayes.inference.noise import Noise, WhiteNoise
+from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.inference.smooth import SmoothNoise
 from bwbayes.model.registry import made
 

@@ -13,8 +13,9 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.noises import noise_model
+from bwbayes.inference.rough import DiscrepancyNoise
 from tests.inference.problems import INTERVAL, short_posterior
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")

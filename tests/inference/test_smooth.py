@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.inference.smooth import SmoothNoise
 from bwbayes.results.carried import carried
 from bwbayes.results.innovations import Innovations
@@ -65,9 +65,9 @@ def test_readings_are_a_multivariate_normal(
     white, log_determinant = SmoothNoise(INTERVAL).whiten(
         theta[np.newaxis], residual[np.newaxis, np.newaxis], skipped
     )
-    squares = float(np.sum(white**2) + log_determinant[0])
-    got = -0.5 * (squares + at.size * np.log(2 * np.pi))
-    assert abs(expected - got) < 1e-8 * (at.size + abs(expected))
+    squares = float(np.sum(white**2)) + float(log_determinant[0])
+    got = -0.5 * (squares + len(rows) * float(np.log(2 * np.pi)))
+    assert abs(expected - got) < 1e-8 * (len(rows) + abs(float(expected)))
 
 
 @pytest.mark.parametrize("quality", [0.05, 0.5, 2.0])

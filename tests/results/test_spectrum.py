@@ -14,7 +14,8 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import pointfit
-from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.inference.noise import WhiteNoise
+from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.results.innovations import Innovations, departures, innovations, numbers
 from bwbayes.results.spectrum import ResidualSpectrum, residual_spectrum, without_lines
 from tests.inference.problems import INTERVAL, short_posterior

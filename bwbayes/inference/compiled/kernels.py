@@ -30,13 +30,13 @@ from bwbayes.arrays import FloatArray, IntArray
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
     A1, A2, B0, B1, B2, CHANGE, DECAY, ESTIMATE, FREE, GAIN, INNOVATION, INVERSE, KEEP_1, KEEP_2,
-    KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PREDICTED, PRODUCTS, RATE, RATIO,
+    KEPT, LANES, LEVEL, LOG, LOG_RATIO, PAIRS, PARAMETERS, PRODUCTS, RATIO,
     SQUARES, STATE, STRENGTH, SUMS, SURPLUS, TRUE_A1, TRUE_A2, TRUST, UNSURE, UNSURE_22, VALUE,
     VARIANCE, X1, X2,
 )
 # fmt: on
 # isort: on
-from bwbayes.inference.compiled import smooth
+from bwbayes.inference.compiled import rough, smooth
 from bwbayes.inference.compiled.parts import creep, polynomial
 from bwbayes.inference.compiled.responses import is_tracked, tracked_by
 from bwbayes.inference.compiled.stages import Kind, drive_of
@@ -137,11 +137,11 @@ def _filtered(state: FloatArray, second: bool | None, missing: float, series: in
     if missing > 0.0:
         _take_logs(state)
         if second is None:
-            _skip(state, missing, series)
+            rough.skip(state, missing, series)
         else:
             smooth.skip(state, missing, series)
     if second is None:
-        _unsure(state)
+        rough.unsure(state)
     else:
         smooth.unsure(state)
     pair = PRODUCTS
@@ -164,29 +164,6 @@ def _filtered(state: FloatArray, second: bool | None, missing: float, series: in
             pair += LANES
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _unsure(state: FloatArray) -> None:
-    """Take what the filter does not know yet to the next reading."""
-    for i in range(LANES):
-        ratio = state[UNSURE + i] / state[VARIANCE + i]
-        inverse = 1.0 / (state[VARIANCE + i] + state[UNSURE + i])
-        state[RATIO + i] *= 1.0 + ratio
-        state[TRUST + i] = (state[PREDICTED + i] + state[UNSURE + i]) * inverse
-        state[UNSURE + i] *= state[DECAY + i] * state[DECAY + i] * state[VARIANCE + i] * inverse
-        state[INVERSE + i] = inverse
-
-
-@njit(nogil=True, cache=True)
-def _skip(state: FloatArray, readings: float, series: int) -> None:
-    """Let the filter pass over missing readings."""
-    for i in range(LANES):
-        decay = math.exp(-readings * state[RATE + i])
-        fresh = -math.expm1(-2.0 * readings * state[RATE + i])
-        state[UNSURE + i] = decay * decay * state[UNSURE + i] + fresh * state[SURPLUS + i]
-        for k in range(series):
-            state[ESTIMATE + k * LANES + i] *= decay
-
-
 @njit(nogil=True, cache=True)
 def _take_logs(state: FloatArray) -> None:
     """Move the product of variances to the sum of logs, before it gets too large."""
@@ -202,17 +179,6 @@ def _gather(state: FloatArray, readings: int) -> None:
         state[PRODUCTS + i] += state[SQUARES + i] * state[INVERSE + i]
         state[SQUARES + i] = 0.0
         state[LOG + i] -= readings * math.log(state[INVERSE + i] * state[VARIANCE + i])
-
-
-@njit(nogil=True, cache=True)
-def _is_settled(state: FloatArray, second: bool | None) -> bool:
-    """Tell whether all models' filters are in their steady state."""
-    if second is not None:
-        return smooth.is_settled(state)
-    settled = True
-    for i in range(LANES):
-        settled &= state[UNSURE + i] <= FORGOTTEN * state[VARIANCE + i]
-    return settled
 
 
 @njit(nogil=True, cache=True)
@@ -323,7 +289,7 @@ def _group(
             tracked_by(state, displacement, now, last, drive, *followed)
         else:
             _exact(state, second, displacement, skipped, now, last, drive, lags, offset, free, slow)
-            settled = _is_settled(state, second)
+            settled = rough.is_settled(state) if second is None else smooth.is_settled(state)
             audible = _is_audible(state, offset, free)
             staying = _stay(state, lags, offset, free, decays, series)
             tracked = settled and not audible
