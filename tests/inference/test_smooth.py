@@ -60,14 +60,15 @@ def test_readings_are_a_multivariate_normal(
     at = np.sort(np.array(rows))
     full = dense(theta, at, INTERVAL)
     residual: FloatArray = np.linalg.cholesky(full) @ generator.standard_normal(at.size)
-    expected = scipy.stats.multivariate_normal(np.zeros(at.size), full).logpdf(residual)
+    normal = scipy.stats.multivariate_normal(np.zeros(at.size), full)
+    expected = float(normal.logpdf(residual))
     skipped = np.concatenate([[0.0], np.diff(at) - 1.0])
     white, log_determinant = SmoothNoise(INTERVAL).whiten(
         theta[np.newaxis], residual[np.newaxis, np.newaxis], skipped
     )
     squares = float(np.sum(white**2)) + float(log_determinant[0])
     got = -0.5 * (squares + len(rows) * float(np.log(2 * np.pi)))
-    assert abs(expected - got) < 1e-8 * (len(rows) + abs(float(expected)))
+    assert abs(expected - got) < 1e-8 * (len(rows) + abs(expected))
 
 
 @pytest.mark.parametrize("quality", [0.05, 0.5, 2.0])
