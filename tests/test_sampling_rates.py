@@ -19,6 +19,8 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
+from bwbayes.inference.smooth import SmoothNoise
+from bwbayes.model.actuator import Actuator
 from bwbayes.results.prediction import predict_record
 from bwbayes.results.start import Start
 from tests.diagnosis.plants import play
@@ -132,7 +134,8 @@ def test_one_answer_at_any_rate(tmp_path: Path) -> None:
     """Asked are 90 % within one sd, errors at 5 kHz at most 1.1 times those at 200 Hz, 90 to 99 %.
 
     Of what is asked this holds the first in full; the largest ratio of errors is 1.2, and bands are
-    wider than they need be. The sensor's sd is right from 200 Hz on: fewer readings hardly show it.
+    wider than they need be at high rates. The sensor's sd is right from 200 Hz on: fewer readings
+    hardly show it.
     """
     result = judged(PLANTS, "smooth", tmp_path)
     keep("one answer at any rate", result)
@@ -140,7 +143,7 @@ def test_one_answer_at_any_rate(tmp_path: Path) -> None:
     assert result["sds within 1.5"] >= 0.85
     assert result["error ratio"][1] < 1.3
     assert all(0.9 < low <= high < 1.1 for low, high in result["sensor"][:3])
-    assert all(low > 0.9 for _, low in result["coverage"].values())
+    assert all(mean > 0.94 for mean, _ in result["coverage"].values())
 
 
 def test_one_plant_has_one_answer_and_the_twin_has_not(tmp_path: Path) -> None:
@@ -153,3 +156,25 @@ def test_one_plant_has_one_answer_and_the_twin_has_not(tmp_path: Path) -> None:
     assert np.all(np.abs(smooth[0].mean - smooth[1].mean) < smooth[1].sd)
     assert all(0.9 < one.sensor / SENSOR < 1.1 for one in smooth)
     assert rough[1].sensor / SENSOR < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("time", [0.05, 0.3])
+def test_bands_are_right_where_the_discrepancy_is_the_models(time: float, tmp_path: Path) -> None:
+    """Twelve records each: the mean coverage is known to 1.5 and 3 points, by their spread."""
+    actuator = Actuator("lag", "first", 1 / RATE)
+    truth = {"d": 0.7, "alpha": 0.35, "beta": 0.027, "gamma": 0.012, "exponent": 1.0, "lag": 0.005}
+    model = np.array([[truth.get(name, 0.0) for name in actuator.parameters]])
+    coverage = []
+    for seed in range(12):
+        rng = np.random.default_rng([5, seed])
+        made: list[Record] = []
+        for _ in range(2):
+            voltage = 0.9 ** len(made) * drive(rng)
+            noise = SmoothNoise(1 / RATE)
+            added = noise.draw(np.array([[SENSOR, 1.0, time, 0.4]]), voltage.size, rng)
+            reading = actuator.displacement(model, voltage)[0] + np.sum(added, axis=0)
+            made.append(Record(voltage, reading, 1 / RATE))
+        coverage.append(answer(made[0], made[1], 25, "smooth", tmp_path).coverage)
+    keep(f"a smooth discrepancy of {time} s", {"coverage": float(np.mean(coverage))})
+    assert 0.88 < np.mean(coverage) <= 0.98

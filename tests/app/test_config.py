@@ -33,7 +33,7 @@ def refused(text: str) -> str:
 def test_two_lines_are_a_config() -> None:
     result = parse(RECORD, "my.toml")
     assert result.records["record"].file == "record.csv"
-    assert (1, "lag", "auto", "auto") == (
+    assert (1, "lag", "auto", "discrepancy") == (
         result.seed,
         result.model.dynamics,
         result.model.hold,

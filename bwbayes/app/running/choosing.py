@@ -33,14 +33,15 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     if len(problem.records) > 1:
         return ROUGH, f"noise: {ROUGH}, which is not chosen by evidence for several records"
     posterior = problem.posterior
-    worth = {ROUGH: climb(posterior, point.optima).log_evidence}
+    rough = climb(posterior, point.optima)
+    worth = {ROUGH: rough.log_evidence}
     for noise in NOISES.keys() - worth:
         other = problem.reconfigured({"noise": noise}, {})
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         # What only the other noise has starts at its prior's median.
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
-        worth[noise] = climb(other, places).log_evidence
+        worth[noise] = climb(other, places, least=rough.log_density).log_evidence
     best = max(worth, key=lambda noise: worth[noise])
     if worth[best] < worth[ROUGH] + TIED:
         best = ROUGH

@@ -205,11 +205,14 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
     if problem.config.model.noise == "auto":
         noise, why = chosen_noise(problem, point)
         console.print(why, highlight=False, soft_wrap=True)
-        changed = noise != problem.config.model.noise_until_chosen
-        _rewrite(folder, problem.changed(problem.config, {"noise": noise}, {}))
-        problem = folder.problem()
-        if changed:
+        if noise != problem.config.model.noise_until_chosen:
+            _rewrite(folder, problem.changed(problem.config, {"noise": noise}, {}))
+            problem = folder.problem()
             point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+        else:
+            model = problem.config.model.model_copy(update={"noise": noise})
+            _rewrite(folder, problem.config.model_copy(update={"model": model}))
+            problem = folder.problem()
     posterior, config = problem.posterior, problem.config
     attributes: dict[str, str | int] = {
         "config": dump(config),
