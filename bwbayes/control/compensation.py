@@ -116,7 +116,8 @@ class _Task:
             self.posterior, self.draws, self.record(voltage), self.start, self.generator()
         )
         record = self.posterior.only
-        theta = record.table.noise(self.posterior.prior.theta(self.draws))
+        theta = self.posterior.prior.theta(self.draws)
+        theta = self.posterior.noise_of_new(theta, np.random.default_rng(len(theta)))
         noise, generator = record.noise.at(self.reference.interval), self.generator()
         rms, largest = np.empty((2, 2, len(theta)))
         squares = np.zeros(2)

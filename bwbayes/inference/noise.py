@@ -60,14 +60,14 @@ class Noise(Protocol):
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sd of the discrepancy and of the sensor, each (models,), um."""
 
-    def band_sd(
+    def sized(
         self,
         theta: FloatArray,
         missed: Callable[[], float],
         readings: int,
         generator: np.random.Generator,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Sd of the discrepancy and of the sensor that a band of new readings has, (models,), um.
+    ) -> FloatArray:
+        """Return θ (models, parameters) with the discrepancy's size where nothing was fitted.
 
         ``missed`` returns the mean square, um², of what the models' mean misses of so many
         fitted readings.
@@ -185,15 +185,15 @@ class WhiteNoise:
         """No discrepancy; sd of the sensor."""
         return np.zeros(theta.shape[0]), theta[:, 0]
 
-    def band_sd(
+    def sized(
         self,
         theta: FloatArray,
         missed: Callable[[], float],  # noqa: ARG002
         readings: int,  # noqa: ARG002
         generator: np.random.Generator,  # noqa: ARG002
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the marginal ones."""
-        return self.marginal_sd(theta)
+    ) -> FloatArray:
+        """Return θ as it is."""
+        return theta
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """No memory."""

@@ -235,6 +235,22 @@ class Posterior:
             moving = None if unrest is None else unrest[batch]
             yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
+    def noise_of_new(self, theta: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return the noise's parameters (models, its own) for readings that were not fitted.
+
+        Of a posterior of one record; ``theta`` (models, parameters) are draws from it.
+        """
+        readings = self.only.readings
+
+        def missed() -> float:
+            total = np.zeros(readings.rows.size)
+            for simulated in self.simulations(theta, readings.rows):
+                total += simulated.sum(axis=0)
+            return float(np.mean((readings.values - total / len(theta)) ** 2))
+
+        parameters = self.only.table.noise(theta)
+        return self.likelihood.spaced.sized(parameters, missed, readings.rows.size, generator)
+
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""
         return replace(self, datasets=(replace(self.only, **fields),))

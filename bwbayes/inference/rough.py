@@ -107,15 +107,15 @@ class DiscrepancyNoise:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
 
-    def band_sd(
+    def sized(
         self,
         theta: FloatArray,
         missed: Callable[[], float],  # noqa: ARG002
         readings: int,  # noqa: ARG002
         generator: np.random.Generator,  # noqa: ARG002
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the marginal ones."""
-        return self.marginal_sd(theta)
+    ) -> FloatArray:
+        """Return θ as it is."""
+        return theta
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Return the correlation time."""

@@ -118,13 +118,13 @@ class SmoothNoise:
         """Stationary sd of the discrepancy; sd of the sensor."""
         return theta[:, 1], theta[:, 0]
 
-    def band_sd(
+    def sized(
         self,
         theta: FloatArray,
         missed: Callable[[], float],
         readings: int,
         generator: np.random.Generator,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> FloatArray:
         """Take the discrepancy's size from the residuals, not from the kernel.
 
         Readings fix how the process moves at high frequencies, σ²/τ³; what σ adds at low ones is an
@@ -135,7 +135,9 @@ class SmoothNoise:
         _, _, time, quality = theta.T
         worth = np.maximum(readings * self.interval / (time * (1 + quality**2)), 2.0)
         seen = np.maximum(missed() - theta[:, 0] ** 2, 0.0)
-        return np.sqrt(seen * worth / generator.chisquare(worth)), theta[:, 0]
+        sized = theta.copy()
+        sized[:, 1] = np.sqrt(seen * worth / generator.chisquare(worth))
+        return sized
 
     def memory(self, theta: FloatArray) -> FloatArray:
         """Return the correlation time τ."""

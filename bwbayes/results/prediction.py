@@ -203,19 +203,11 @@ def predict_record(
 
 
 def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    readings, noise = posterior.only.readings, posterior.likelihood.spaced
-
-    def missed() -> float:
-        total = np.zeros(readings.rows.size)
-        for simulated in posterior.simulations(theta, readings.rows):
-            total += simulated.sum(axis=0)
-        return float(np.mean((readings.values - total / len(theta)) ** 2))
-
     # The same for all predictions: bands differ by what is predicted, not by chance.
     generator = np.random.default_rng(len(theta))
     scores = mixture.stratified_scores(len(theta), generator)
-    parameters, count = posterior.only.table.noise(theta), readings.rows.size
-    return _Draws(start, *noise.band_sd(parameters, missed, count, generator), scores)
+    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta, generator))
+    return _Draws(start, *sds, scores)
 
 
 def _bands(

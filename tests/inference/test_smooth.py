@@ -211,3 +211,25 @@ def test_density_of_the_noise_model_is_that_of_its_covariance() -> None:
     assert density is not None
     expected = np.sqrt(2 * interval * (np.array(sums) + 0.01**2))
     np.testing.assert_allclose(density, expected, rtol=1e-3)
+
+
+def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:
+    """Whatever the kernel says of it; a rough discrepancy's size is the kernel's."""
+    sizes = {}
+    for noise in ("smooth", "discrepancy"):
+        posterior = short_posterior(noise, 400)
+        free = np.repeat(posterior.prior.draw(np.random.default_rng(7), 1), 2000, axis=0)
+        known = {"discrepancy_sd": 50.0, "discrepancy_time": 0.02, "sensor_sd": 1e-3}
+        for name, value in known.items():
+            free[:, posterior.names.index(name)] = value
+        theta = posterior.prior.theta(free)
+        sized = posterior.noise_of_new(theta, np.random.default_rng(8))
+        rows = posterior.only.readings.rows
+        residual = posterior.only.readings.values - posterior.simulate(theta[:1], rows)[0]
+        sizes[noise] = float(np.mean(sized[:, 1] ** 2) / np.mean(residual**2))
+        assert np.array_equal(sized[:, 0], posterior.only.table.noise(theta)[:, 0])
+        if noise == "discrepancy":
+            assert np.array_equal(sized, posterior.only.table.noise(theta))
+    # ν/(ν − 2) of 4 s over at most 1.25 times 0.02 s; the mean of 2,000 is known to 0.3 %.
+    assert 1.005 < sizes["smooth"] < 1.025
+    assert abs(sizes["discrepancy"] - 1) > 0.1

@@ -1,8 +1,7 @@
 """A fit as Python users have it: one object with the posterior, its bands, figures and remarks.
 
-A :class:`Fit` is a run's folder with the run in memory; ``bwbayes run`` makes the same folder by
-the same functions. Without a folder of one's own it lives in a temporary one, as long as the fit
-does.
+A :class:`Fit` is a run's folder with the run in memory; ``bwbayes run`` makes the same one by the
+same functions. Without a folder of one's own it lives in a temporary one, as long as the fit does.
 """
 
 from __future__ import annotations
@@ -138,8 +137,7 @@ class Fit:
     def notes(self) -> tuple[str, ...]:
         """The remarks, what does not hold, and a sampling that has not converged."""
         unconverged = f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
-        lines = (*self.remarks, *self.standing.said)
-        return lines if self.converged else (*lines, unconverged)
+        return (*self.remarks, *self.standing.said, *[unconverged] * (not self.converged))
 
     @cached_property
     def result(self) -> Result:

@@ -82,11 +82,12 @@ def track(
     thinned_draws = thinned(fit.flat_draws, generator(seed, "draws"))
     theta = posterior.table.of(posterior.prior.theta(thinned_draws), dataset.name)
     simulated = theta[:draws]
-    column = dataset.table.columns(simulated)
-    # A white noise has no discrepancy.
-    sensor = column["sensor_sd"]
-    discrepancy = column.get("discrepancy_sd", np.zeros_like(sensor))
-    noise = LoopNoise(sensor, discrepancy, column.get("discrepancy_time", np.ones_like(sensor)))
+    alone = posterior.alone(dataset.name)
+    parameters = alone.noise_of_new(simulated, generator(seed, "noise"))
+    discrepancy, sensor = dataset.noise.marginal_sd(parameters)
+    memory = dataset.noise.memory(parameters)
+    # A white noise has no discrepancy, so that any time will do.
+    noise = LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0))
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(simulated),
