@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtr
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.plainmap import PlainMap
-from bwbayes.model.closed import Scored
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.distributions import Distribution, Scored
 from bwbayes.shown import brief
 
 __all__ = ["COORDINATES", "Constraint", "JointPrior", "Parameter"]
@@ -136,7 +136,7 @@ class Parameter:
     def mass_between(self) -> tuple[float, float]:
         """The prior's cumulative probability at both ends of the support."""
         assert self.prior is not None
-        ends = self.prior.form.cdf(np.array(self.support))
+        ends = ndtr(self.prior.form.score(np.array(self.support)))
         return float(ends[0]), float(ends[1])
 
 

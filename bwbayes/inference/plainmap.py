@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.model.closed import Scored
+from bwbayes.model.distributions import Scored
 
 __all__ = ["PlainMap"]
 

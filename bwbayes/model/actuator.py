@@ -22,7 +22,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.creep import Creep
-from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.declaration import Declaration, Values, check, normal
 from bwbayes.model.filters import Filter
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold, Sections
@@ -250,10 +250,7 @@ class Actuator:
             self.gain.check(column)
         if self.creep is not None:
             self.creep.check(column)
-        if not np.isfinite(column["offset"]).all():
-            row = int(np.argmin(np.isfinite(column["offset"])))
-            value = column["offset"][row]
-            raise InputError(f"offset: {value:.6g} in model {row}; must be finite")
+        check((OFFSET,), column)
 
     def sections(self, column: Values) -> Sections:
         """Return dynamics and creep of models given by the columns (models,) of θ."""

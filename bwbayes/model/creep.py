@@ -22,7 +22,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.declaration import Declaration, Values, check, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag
 from bwbayes.model.operator import UNIT, Span
@@ -118,16 +118,8 @@ class Creep:
         return normal(PER_DECADE * decades, PER_DECADE_SD * decades)
 
     def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is negative or not finite."""
-        for declared in self.parameters:
-            values = column[declared.name]
-            allowed = np.isfinite(values) & (values >= declared.floor)
-            if not allowed.all():
-                row = int(np.argmin(allowed))
-                raise InputError(
-                    f"{declared.name}: {values[row]:.6g} in model {row}; must be finite and not "
-                    "negative"
-                )
+        """Raise an InputError where a parameter is not finite, or the growth negative."""
+        check(self.parameters, column, ("creep_growth",))
 
     def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""

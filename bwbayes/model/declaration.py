@@ -11,11 +11,14 @@ states of other parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from bwbayes.arrays import ArrayLike, FloatArray
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
+from bwbayes.errors import InputError
 from bwbayes.model.distributions import Distribution
 from bwbayes.shown import brief
 
@@ -25,8 +28,10 @@ __all__ = [
     "Ranges",
     "Scope",
     "Values",
+    "check",
     "lognormal",
     "normal",
+    "refuse",
     "rounded",
 ]
 
@@ -137,6 +142,31 @@ class Declaration:
     def unit_in(self, stated: Mapping[str, float | Distribution]) -> str:
         """Return its unit, given what is stated of other parameters by name."""
         return self.unit if self.unit_given is None else self.unit_given(stated)
+
+
+def check(
+    declared: Iterable[Declaration], column: Values, may_be_zero: Container[str] = ()
+) -> None:
+    """Raise an InputError where a column (models,) is not finite or below its floor.
+
+    Those that ``may_be_zero`` may be on a floor that others lie above: the model has that limit.
+    """
+    for parameter in declared:
+        values, floor = column[parameter.name], parameter.floor
+        refuse(parameter.name, ~np.isfinite(values), values, "must be finite")
+        if parameter.reaches_floor or parameter.name in may_be_zero:
+            least = "must not be negative" if floor == 0 else f"must be at least {floor:g}"
+            refuse(parameter.name, values < floor, values, least)
+        else:
+            least = "must be positive" if floor == 0 else f"must be above {floor:g}"
+            refuse(parameter.name, values <= floor, values, least)
+
+
+def refuse(name: str, wrong: BoolArray, values: FloatArray, demand: str) -> None:
+    """Raise an InputError that names the first model (models,) whose parameter is ``wrong``."""
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
 
 
 def lognormal(median: float, sigma: float) -> Distribution:

@@ -3,25 +3,28 @@
 ``normal``, ``lognormal``, ``uniform``, ``halfnormal`` and ``beta`` take the arguments one would
 write on paper; any other continuous distribution of ``scipy.stats`` goes by scipy's name, with
 scipy's shape arguments and ``loc`` and ``scale``.
+
+scipy's frozen distributions check and broadcast their arguments at every call, which costs more
+than the likelihood of a short record: those that priors mostly are have closed forms here.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import ndtr, ndtri
+from scipy.special import erf, erfc, erfcinv, erfinv, ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.closed import Form, Frozen, Scored, closed
 
-__all__ = ["Distribution"]
+__all__ = ["Distribution", "Scored"]
 
 FAMILIAR = {
     "normal": ("mean", "sd"),
@@ -30,6 +33,53 @@ FAMILIAR = {
     "halfnormal": ("scale",),
     "beta": ("a", "b"),
 }
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Normal, x = c + s z, or lognormal, x = c exp(s z), of a standard normal z."""
+
+    center: float
+    scale: float
+    logarithmic: bool
+
+    def score(self, x: FloatArray) -> FloatArray:
+        """Return z of values x."""
+        if not self.logarithmic:
+            return (x - self.center) / self.scale
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(np.maximum(x, 0.0) / self.center) / self.scale)
+
+    def value(self, score: FloatArray) -> FloatArray:
+        """Return x of scores z."""
+        if not self.logarithmic:
+            return self.center + self.scale * score
+        return np.asarray(self.center * np.exp(self.scale * score))
+
+
+@dataclass(frozen=True)
+class Tails:
+    """Any distribution, by F, 1 − F and their inverses: z = Φ⁻¹(F(x)), exact in both tails."""
+
+    cdf: Callable[[FloatArray], FloatArray]
+    sf: Callable[[FloatArray], FloatArray]
+    ppf: Callable[[FloatArray], FloatArray]
+    isf: Callable[[FloatArray], FloatArray]
+
+    def score(self, x: FloatArray) -> FloatArray:
+        """Return z of values x."""
+        below, above = self.cdf(x), self.sf(x)
+        return np.where(below < above, ndtri(below), -ndtri(above))
+
+    def value(self, score: FloatArray) -> FloatArray:
+        """Return x of scores z."""
+        return np.where(score < 0, self.ppf(ndtr(score)), self.isf(ndtr(-score)))
+
+
+def _mass(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the probability between two normal scores, from the tail in which they lie."""
+    between = np.where(low < 0, ndtr(high) - ndtr(low), ndtr(-low) - ndtr(-high))
+    return np.maximum(between, 0.0)
 
 
 @dataclass(frozen=True)
@@ -61,9 +111,12 @@ class Distribution:
             if not np.isfinite(value):
                 raise InputError(f"{self.name}: {key} is {value}; give a finite number")
         with np.errstate(invalid="ignore"):
-            quantiles = self.form.ppf(np.array([0.1, 0.5, 0.9]))
-        if not np.isfinite(quantiles).all() or not quantiles[0] < quantiles[2]:
+            low, high = self.form.value(np.array([-1.0, 1.0])).tolist()
+        if not -math.inf < low < high < math.inf:
             raise InputError(f"{self}: no proper distribution; check its arguments")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Distribution, (self.name, self.arguments)  # without what is worked out from them
 
     def __str__(self) -> str:
         inside = ", ".join(f"{key} = {value:.6g}" for key, value in self.arguments.items())
@@ -75,11 +128,11 @@ class Distribution:
         z = Φ⁻¹((F(x) − F(lower)) / (F(upper) − F(lower))), from whichever tail is nearer, so that
         it keeps its precision in both. All arrays are (models,) or scalar.
         """
-        below, above = self._between(lower, x), self._between(x, upper)
+        low, score, high = (self.form.score(values) for values in (lower, x, upper))
+        below, above = _mass(low, score), _mass(score, high)
         with np.errstate(divide="ignore", invalid="ignore"):
             near = np.minimum(below, above) / (below + above)
-        score: FloatArray = np.where(below <= above, 1, -1) * ndtri(np.clip(near, 0, 1))
-        return score
+        return np.asarray(np.where(below <= above, 1, -1) * ndtri(np.clip(near, 0, 1)))
 
     def from_normal(
         self, z: FloatArray, lower: FloatArray, upper: FloatArray
@@ -90,53 +143,48 @@ class Distribution:
         """
         scalar = np.ndim(lower) == np.ndim(upper) == 0
         if scalar and self.support == (float(lower), float(upper)):  # the bounds cut nothing
-            return self._uncut(z), np.ones_like(z)
-        if isinstance(self.form, Scored):
-            return self._cut_score(self.form, z, lower, upper)
-        mass = np.maximum(self._between(lower, upper), 0.0)
-        below = self.form.cdf(lower) + ndtr(z) * mass
-        above = self.form.sf(upper) + ndtr(-z) * mass
+            return self.form.value(z), np.ones_like(z)
+        low, high = self.form.score(lower), self.form.score(upper)
+        mass = _mass(low, high)
+        below, above = ndtr(low) + ndtr(z) * mass, ndtr(-high) + ndtr(-z) * mass
         # The smaller probability is the one that keeps its precision.
-        x = np.where(below < above, self.form.ppf(below), self.form.isf(above))
-        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
-
-    @staticmethod
-    def _cut_score(
-        form: Scored, z: FloatArray, lower: FloatArray, upper: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Do the same for what a formula maps to a standard normal, whose tails are alike."""
-        low, high = form.score(lower), form.score(upper)
-        start, end = ndtr(low), ndtr(-high)
-        mass = np.where(start < 0.5, ndtr(high) - start, ndtr(-low) - end)
-        mass = np.maximum(mass, 0.0)
-        below, above = start + ndtr(z) * mass, end + ndtr(-z) * mass
         score = ndtri(np.minimum(below, above))
-        x = form.value(np.where(below < above, score, -score))
+        x = self.form.value(np.where(below < above, score, -score))
         return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
-
-    def _between(self, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Probability between two values, from the tail in which they lie."""
-        start = self.form.cdf(low)
-        rising = self.form.cdf(high) - start
-        falling = self.form.sf(low) - self.form.sf(high)
-        return np.where(start < 0.5, rising, falling)
-
-    def _uncut(self, z: FloatArray) -> FloatArray:
-        """Return the values of normal scores, without bounds."""
-        if isinstance(self.form, Scored):
-            return self.form.value(z)
-        return np.where(z < 0, self.form.ppf(ndtr(z)), self.form.isf(ndtr(-z)))
 
     @cached_property
-    def form(self) -> Form:
-        """Distribution functions, in closed form if there is one."""
+    def form(self) -> Scored | Tails:
+        """The map to a standard normal, in closed form if there is one."""
         self._require_arguments()
-        return closed(self.name, self.arguments) or Frozen(self.frozen)
+        get = self.arguments.__getitem__
+        match self.name:
+            case "normal":
+                return Scored(get("mean"), get("sd"), logarithmic=False)
+            case "lognormal":
+                return Scored(get("median"), get("sigma"), logarithmic=True)
+            case "uniform":
+                lower, upper = get("lower"), get("upper")
+                width = upper - lower
+                return Tails(
+                    lambda x: np.clip((x - lower) / width, 0.0, 1.0),
+                    lambda x: np.clip((upper - x) / width, 0.0, 1.0),
+                    lambda p: lower + p * width,
+                    lambda p: upper - p * width,
+                )
+            case "halfnormal":
+                scale = math.sqrt(2) * get("scale")
+                return Tails(
+                    lambda x: erf(np.maximum(x, 0.0) / scale),
+                    lambda x: erfc(np.maximum(x, 0.0) / scale),
+                    lambda p: scale * erfinv(p),
+                    lambda p: scale * erfcinv(p),
+                )
+        return Tails(self.frozen.cdf, self.frozen.sf, self.frozen.ppf, self.frozen.isf)
 
     @cached_property
     def support(self) -> tuple[float, float]:
         """The least and the largest value."""
-        low, high = self.form.ppf(np.array([0.0, 1.0]))
+        low, high = self.form.value(np.array([-np.inf, np.inf]))
         return float(low), float(high)
 
     @cached_property
@@ -178,14 +226,8 @@ class Distribution:
     def _by_scipy_name(self, arguments: dict[str, float]) -> Any:
         family = getattr(scipy.stats, self.name, None)
         if not isinstance(family, scipy.stats.rv_continuous):
-            names = [
-                *FAMILIAR,
-                *(
-                    n
-                    for n, f in vars(scipy.stats).items()
-                    if isinstance(f, scipy.stats.rv_continuous)
-                ),
-            ]
+            scipys = vars(scipy.stats).items()
+            names = [n for n, f in scipys if isinstance(f, scipy.stats.rv_continuous)] + [*FAMILIAR]
             near = difflib.get_close_matches(self.name, names, n=1)
             familiar = f"use one of {', '.join(FAMILIAR)}"
             hint = f"did you mean {near[0]}? Else {familiar}" if near else familiar

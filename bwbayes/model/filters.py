@@ -10,11 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-
-from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
-from bwbayes.model.declaration import Context, Declaration, Values, lognormal
+from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
 
@@ -43,20 +39,9 @@ class Filter(ABC):
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain.
 
-        A positive parameter may be zero here, where the recursion has that limit.
+        A time constant or a damping may be zero: the recursion has that limit.
         """
-        for declaration in self.parameters:
-            values = column[declaration.name]
-            allowed, demand = np.isfinite(values), "must be finite"
-            if declaration.positive:
-                allowed, demand = allowed & (values >= 0), "must be finite and not negative"
-            _refuse(declaration.name, values, allowed, demand)
-
-
-def _refuse(name: str, values: FloatArray, allowed: np.ndarray, demand: str) -> None:
-    if not allowed.all():
-        row = int(np.argmin(allowed))
-        raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
+        check(self.parameters, column, ("lag", "damping"))
 
 
 @dataclass(frozen=True)
@@ -147,13 +132,6 @@ class SecondOrder(Filter):
             without_default=RATIOS,
         ),
     )
-
-    def check(self, column: Values) -> None:
-        """Refuse, too, a mass or a stiffness of zero."""
-        for name in ("mass", "stiffness"):
-            allowed = np.isfinite(column[name]) & (column[name] > 0)
-            _refuse(name, column[name], allowed, "must be positive and finite")
-        super().check(column)
 
     def unknowns(self, hold: Hold) -> int:  # noqa: ARG002  # with either
         """Two: how far the displacement is from rest, and how fast it moves."""

@@ -16,7 +16,7 @@ from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.declaration import Declaration, Values, check, normal
 from bwbayes.model.operator import UNIT, Span
 from bwbayes.model.step import Gone, HysteresisStep
 
@@ -81,12 +81,7 @@ class PolynomialGain:
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a coefficient is not finite."""
-        for declared in self.parameters:
-            finite = np.isfinite(column[declared.name])
-            if not finite.all():
-                row = int(np.argmin(finite))
-                value = column[declared.name][row]
-                raise InputError(f"{declared.name}: {value:.6g} in model {row}; must be finite")
+        check(self.parameters, column)
 
     def scaled(self, voltage: FloatArray) -> FloatArray:
         """Return x (samples,) of voltages (samples,), V."""

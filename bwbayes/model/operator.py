@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values
+from bwbayes.model.declaration import Declaration, Values, check
 from bwbayes.model.step import HysteresisStep
 
 __all__ = ["UNIT", "Operator", "Span", "narrower"]
@@ -76,9 +76,12 @@ class Operator(ABC):
     def parameters(self) -> tuple[Declaration, ...]:
         """Its parameters; the last is ``initial``, of scope ``record``."""
 
-    @abstractmethod
     def check(self, column: Values) -> None:
-        """Raise an InputError that names the parameter where a model is outside of the domain."""
+        """Raise an InputError that names the parameter where a model is outside of the domain.
+
+        By default where a parameter is not finite, or below its floor.
+        """
+        check(self.parameters, column)
 
     @abstractmethod
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Any:

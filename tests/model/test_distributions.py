@@ -53,6 +53,26 @@ def test_names_and_arguments_mean_scipys_distribution(
 
 
 @pytest.mark.parametrize("distribution", [d for d, _ in FAMILIAR], ids=str)
+@pytest.mark.parametrize("cut", ["neither", "lower", "both"])
+def test_a_map_is_the_one_in_scipys_functions(distribution: Distribution, cut: str) -> None:
+    """As x = F⁻¹(F(l) + Φ(z) (F(u) − F(l))), and the probability between the bounds, to 1e-10."""
+    scipys = distribution.frozen
+    lower, upper = distribution.support
+    if cut != "neither":
+        lower = float(scipys.ppf(0.3))
+    if cut == "both":
+        upper = float(scipys.ppf(0.8))
+    z = np.linspace(-5, 0, 11)  # where probabilities near one keep their digits
+    x, between = distribution.from_normal(z, np.asarray(lower), np.asarray(upper))
+    whole = scipys.cdf(upper) - scipys.cdf(lower)
+    np.testing.assert_allclose(between, whole, rtol=1e-10)
+    below = scipys.cdf(lower) + stats.norm.cdf(z) * whole
+    np.testing.assert_allclose(x, scipys.ppf(below), rtol=1e-9, atol=1e-10)
+    back = distribution.to_normal(x, np.asarray(lower), np.asarray(upper))
+    np.testing.assert_allclose(back, z, atol=1e-7)
+
+
+@pytest.mark.parametrize("distribution", [d for d, _ in FAMILIAR], ids=str)
 def test_scores_round_trip_in_both_tails(distribution: Distribution) -> None:
     low, high = REPRESENTABLE[distribution.name]
     z = np.linspace(low, high, 121)

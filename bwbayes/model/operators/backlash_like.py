@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values
+from bwbayes.model.declaration import Declaration, Values, check
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     OneState,
@@ -19,7 +17,6 @@ from bwbayes.model.operators.one_state import (
     beta,
     d,
     initial,
-    refuse,
 )
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
@@ -52,11 +49,8 @@ class BacklashLike(OneState):
         return d(), alpha(), beta(), initial()
 
     def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is not finite, or α or β is not positive."""
-        for name in ("d", "alpha", "beta", "initial"):
-            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
-        refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
-        refuse(column, "beta", column["beta"] < 0, "must not be negative")
+        """Raise an InputError where a parameter is not finite, d or β negative, or α ≤ 0."""
+        check(self.parameters, column, ("d", "beta"))
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d."""

@@ -18,7 +18,15 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.model.boucwen import ceiling, hysteresis
-from bwbayes.model.declaration import Context, Declaration, Ranges, Values, lognormal, normal
+from bwbayes.model.declaration import (
+    Context,
+    Declaration,
+    Ranges,
+    Values,
+    lognormal,
+    normal,
+    refuse,
+)
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
@@ -28,7 +36,6 @@ from bwbayes.model.operators.one_state import (
     below_d,
     d,
     initial,
-    refuse,
 )
 from bwbayes.model.power import PowerStep
 from bwbayes.model.relaxing import RelaxingStep
@@ -128,7 +135,7 @@ class BoucWen(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where d is not finite; :func:`hysteresis` sees to the rest."""
-        refuse(column, "d", ~np.isfinite(column["d"]), "must be finite")
+        refuse("d", ~np.isfinite(column["d"]), column["d"], "must be finite")
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray

@@ -17,7 +17,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.declaration import Declaration, Values, check, normal, refuse
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     HIGHEST_CEILING,
@@ -27,7 +27,6 @@ from bwbayes.model.operators.one_state import (
     beta,
     d,
     initial_anywhere,
-    refuse,
 )
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
@@ -131,13 +130,9 @@ class BoucWenAsymmetric(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite or |γ'| > β' for a pair of signs."""
-        for declared in self.parameters:
-            wrong = ~np.isfinite(column[declared.name])
-            refuse(column, declared.name, wrong, "must be finite")
-        refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
-        refuse(column, "beta", column["beta"] < 0, "must not be negative")
+        check(self.parameters, column, ("d", "beta"))
         demand = "with beta and b2 to b6 the loop must be passive, |gamma'| <= beta'"
-        refuse(column, "gamma", ~_passive(column), demand)
+        refuse("gamma", ~_passive(column), column["gamma"], demand)
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d and, for all four pairs of signs, |γ'| ≤ β'."""

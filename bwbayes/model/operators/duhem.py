@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, normal, rounded
+from bwbayes.model.declaration import (
+    Context,
+    Declaration,
+    Values,
+    check,
+    normal,
+    refuse,
+    rounded,
+)
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
@@ -22,7 +30,6 @@ from bwbayes.model.operators.one_state import (
     beta,
     d,
     initial_anywhere,
-    refuse,
 )
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import Gone, HysteresisStep
@@ -105,16 +112,11 @@ class Duhem(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite, α ≤ 0, β < 0, or energy comes in."""
-        for declared in self.parameters:
-            name = declared.name
-            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
-        refuse(column, "alpha", column["alpha"] <= 0, "must be positive")
-        refuse(column, "beta", column["beta"] < 0, "must not be negative")
-        refuse(column, "alpha2", column["alpha2"] < 0, "must not be negative")
+        check(self.parameters, column, ("d", "beta"))
         demand = "must not be above 4 alpha beta^2"
         if not self.odd:
             demand = "beta^2 (4 alpha alpha2 - alpha1^2) must be at least alpha2^2"
-        refuse(column, "alpha2", ~_passive(column), demand)
+        refuse("alpha2", ~_passive(column), column["alpha2"], demand)
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d and the hysteresis is passive at any voltage."""

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.declaration import Declaration, Values, lognormal, refuse
 from bwbayes.model.elementwise import select
-from bwbayes.model.operators.memory import INITIAL, RemembersExtrema, refuse
+from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 from bwbayes.model.operators.preisach import DENSITY
 

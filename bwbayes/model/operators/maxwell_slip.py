@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.operators.memory import INITIAL, refuse
+from bwbayes.model.declaration import Declaration, Values, refuse
+from bwbayes.model.operators.memory import INITIAL
 from bwbayes.model.operators.prandtl_ishlinskii import (
     InParallel,
     PlaysStep,

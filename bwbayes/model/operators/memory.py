@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values, refuse
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.operator import Operator, Span, narrower
 
-__all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema", "refuse"]
+__all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema"]
 
 INITIAL = Declaration(
     name="initial",
@@ -112,16 +111,9 @@ class RemembersExtrema(Operator):
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
-        for parameter in self.parameters:
-            values = column[parameter.name]
-            wrong, demand = ~np.isfinite(values), "must be finite"
-            if parameter.positive:
-                wrong, demand = wrong | (values <= 0), "must be positive and finite"
-            elif parameter.floor == 0:
-                wrong, demand = wrong | (values < 0), "must be finite and not negative"
-            elif parameter.name == INITIAL.name:
-                wrong, demand = wrong | (np.abs(values) > 1), "must lie between -1 and 1"
-            refuse(parameter.name, wrong, values, demand)
+        super().check(column)
+        initial = column[INITIAL.name]
+        refuse(INITIAL.name, np.abs(initial) > 1, initial, "must lie between -1 and 1")
 
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> Memory:
         """Return the memory at a record's first voltage.
@@ -198,13 +190,6 @@ class RemembersExtrema(Operator):
             width = 1e-6 * max(abs(span.low), 1.0)
         climbed = branch(span.low, np.array([[span.low + width]]))
         return np.broadcast_to(climbed[:, 0], column[INITIAL.name].shape) / width
-
-
-def refuse(name: str, wrong: BoolArray, values: FloatArray, demand: str) -> None:
-    """Raise an InputError that names the first model (models,) whose parameter is ``wrong``."""
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise InputError(f"{name}: {values[row]:.6g} in model {row}; {demand}")
 
 
 def _follow(

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.declaration import Declaration, Values, check, lognormal
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, d, initial_anywhere, refuse
+from bwbayes.model.operators.one_state import OneState, d, initial_anywhere
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
@@ -43,9 +43,8 @@ class NoHysteresis(OneState):
         return slope, replace(initial_anywhere(), default=lambda _: 0.0)
 
     def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is not finite."""
-        for name in ("d", "initial"):
-            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
+        """Raise an InputError where a parameter is not finite, or d negative."""
+        check(self.parameters, column, ("d",))
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray

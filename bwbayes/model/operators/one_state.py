@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
 from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.operator import Operator, Span
@@ -32,7 +31,6 @@ __all__ = [
     "d",
     "initial",
     "initial_anywhere",
-    "refuse",
 ]
 
 # Stands for an infinite ceiling, um.
@@ -115,13 +113,6 @@ class OneState(Operator):
         sweeps = [0.0, high, low, high, low, voltage], [0.0, low, high, low, high, voltage]
         start = np.zeros_like(column["d"])
         return [self.trace(column, np.array(sweep), start)[1] for sweep in sweeps]
-
-
-def refuse(column: Values, name: str, wrong: BoolArray, demand: str) -> None:
-    """Raise an InputError that names the parameter and the first model that is wrong."""
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise InputError(f"{name}: {column[name][row]:.6g} in model {row}; {demand}")
 
 
 # What is the same thing as in the Bouc-Wen model, with the same priors.

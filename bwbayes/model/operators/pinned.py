@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.declaration import Declaration, Values, lognormal, refuse
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, StateMemory, initial, refuse
+from bwbayes.model.operators.one_state import OneState, StateMemory, initial
 from bwbayes.model.operators.walls import Solver, Walls
 
 __all__ = ["Pinned"]
@@ -125,21 +125,15 @@ class Pinned(OneState, Solver):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite or outside of its bounds."""
-        for declared in self.parameters:
-            name = declared.name
-            refuse(column, name, ~np.isfinite(column[name]), "must be finite")
-        for name in ("d", "saturation", "pinning"):
-            refuse(column, name, column[name] <= 0, "must be positive")
+        super().check(column)
         for name in ("coupling", "reversible"):
-            values = column[name]
-            wrong = (values < 0) | (values > STRONGEST)
-            refuse(column, name, wrong, f"must lie between 0 and {STRONGEST:g}")
+            refuse(name, column[name] > STRONGEST, column[name], f"must be at most {STRONGEST:g}")
         weak = column["pinning"] < (1 - 1e-9) * WEAKEST * self.walls(column).field
         demand = f"must be at least {WEAKEST:g} of saturation/d, the voltage that saturates"
-        refuse(column, "pinning", weak, demand)
+        refuse("pinning", weak, column["pinning"], demand)
         bound = (1 + 1e-9) * self.walls(column).lag
         demand = "must lie within pinning d (1 - coupling) of zero"
-        refuse(column, "initial", np.abs(column["initial"]) > bound, demand)
+        refuse("initial", np.abs(column["initial"]) > bound, column["initial"], demand)
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return U/k."""

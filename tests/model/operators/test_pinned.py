@@ -182,8 +182,8 @@ def test_walls_never_lag_further_than_the_bound(operator: Pinned) -> None:
     ("name", "value", "message"),
     [
         ("saturation", 0.0, "saturation: 0 in model 0; must be positive"),
-        ("coupling", 1.0, "coupling: 1 in model 0; must lie between 0 and 0.98"),
-        ("reversible", -0.1, "reversible: -0.1 in model 0; must lie between 0 and 0.98"),
+        ("coupling", 1.0, "coupling: 1 in model 0; must be at most 0.98"),
+        ("reversible", -0.1, "reversible: -0.1 in model 0; must not be negative"),
         ("pinning", 1e-6, "pinning: 1e-06 in model 0; must be at least 0.001"),
         ("initial", -5.3, "initial: -5.3 in model 0; must lie within pinning d"),
         ("d", math.nan, "d: nan in model 0; must be finite"),
