@@ -75,9 +75,8 @@ CAPTIONS = {
     "spectrum": Caption(
         "Spectrum of the residuals",
         "Amplitude spectral density of the residuals, and that of the noise model at the most "
-        "probable draw. Dashed: oscillations above the noise, the strongest first, with their "
-        "likely source and amplitude; the noise model does not describe them.",
-        "Amplitude density of the residuals and of the noise model against frequency, with lines",
+        "probable draw. A peak above it is an oscillation that the noise model does not describe.",
+        "Amplitude density of the residuals and of the noise model against frequency",
     ),
     "corner": Caption(
         "Posterior",

@@ -15,7 +15,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import agreement, innovations, learned, loops, replicated, steps
+from bwbayes.results import agreement, learned, loops, replicated, steps
 from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
@@ -155,9 +155,7 @@ def summary(result: Result) -> dict[str, object]:
             name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
             for name, s in result.scores.items()
         }
-        whitened = {
-            name: innovations.numbers(series) for name, series in result.innovations.items()
-        }
+        whitened = {name: series.numbers for name, series in result.innovations.items()}
         if whitened:
             # Those of one record stand alone, those of several by their names.
             numbers["innovations"] = (

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.results.innovations import Innovations, departures, innovations, numbers
+from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.results.innovations import Innovations, departures, innovations
 from tests.inference import problems
 
 
@@ -66,6 +67,36 @@ def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
     assert abs(np.mean(result.white)) < 4.5 / np.sqrt(3000)
     assert abs(np.std(result.white) - 1) < 4.5 / np.sqrt(6000)
     assert () == departures(result)
-    said = numbers(result)
-    assert 3000 == said["readings"]
-    assert {"rate", "voltage", "direction"} == set(said["by"])  # type: ignore[call-overload]
+    assert 3000 == result.numbers["readings"]
+    assert {"rate", "voltage", "direction"} == set(result.numbers["by"])  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_the_density_of_white_noise_is_flat(share: float) -> None:
+    """The sd times √(2 / sampling rate), whether readings are missing or not, within 6 %."""
+    rng = np.random.default_rng(7)
+    time = 0.002 * np.flatnonzero(rng.random(16000) < share)
+    white = rng.normal(size=time.size)
+    series = Innovations(time, white, white, white, 0.5 * white, 0.002)
+    frequency, density = series.residual_density()
+    assert np.sqrt(np.mean(density**2)) == pytest.approx(0.5 * np.sqrt(0.004), rel=0.06)
+    assert frequency[-1] == pytest.approx(250.0, abs=0.1)
+
+
+@pytest.mark.parametrize("theta", [(0.5, 1.4, 0.3), (0.02, 3.0, 40.0), (0.7, 1e-9, 0.01)])
+def test_density_of_the_noise_model_is_that_of_its_covariance(
+    theta: tuple[float, float, float],
+) -> None:
+    """Against the sum over all lags: 2 Δ Σ cov(k Δ) cos(2π f k Δ)."""
+    (sensor, sd, time), interval, lags = theta, 0.01, np.arange(1, 400_000)
+    covariance = sd**2 * np.exp(-interval * lags / time)
+    frequency = np.array([0.3, 2.0, 17.0, 50.0])
+    angles = 2 * np.pi * interval * frequency
+    sums = [sensor**2 + sd**2 + 2 * np.sum(covariance * np.cos(a * lags)) for a in angles]
+    empty = np.empty(0)
+    series = Innovations(
+        empty, empty, empty, empty, empty, interval, DiscrepancyNoise(interval), np.array(theta)
+    )
+    density = series.noise_density(frequency)
+    assert density is not None
+    np.testing.assert_allclose(density, np.sqrt(2 * interval * np.array(sums)), rtol=1e-6)

@@ -83,7 +83,7 @@ class Plots:
         return drawn(draw_innovations, self.converged().innovations[self._record(name)])
 
     def spectrum(self, name: str | None = None) -> Figure:
-        """Draw the residual's spectrum with its lines, beside the noise model's.
+        """Draw the residual's spectrum beside the noise model's.
 
         Of several records in the one of this name, by default the first.
         """
