@@ -24,19 +24,13 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.results.identifiability import LEFT_OPEN, combined, percent
 from bwbayes.shown import brief
 
-__all__ = ["Combination", "Learned", "Taught", "learned", "numbers"]
+__all__ = ["Combination", "Learned", "Taught", "learned"]
 
-# Draws of the prior, and of the posterior that the sensitivities are worked out from.
-PRIOR_DRAWS, DRAWS = 4000, 4000
+# Draws of the prior, and of the posterior, that are looked at.
+DRAWS = 4000
 
 # Sensitivities above this are not small (Kallioinen and others, section 4).
 SENSITIVE = 0.05
-
-# Combinations that are named, at most.
-COMBINATIONS = 3
-
-# Normal scores beyond this have no probability that a float can hold.
-FARTHEST = 37.0
 
 
 @dataclass(frozen=True)
@@ -57,11 +51,6 @@ class Taught:
         """Whether it moves with the prior, and not with the likelihood."""
         return self.prior >= SENSITIVE > self.likelihood
 
-    @property
-    def conflict(self) -> bool:
-        """Whether it moves with both: prior and readings pull, maybe apart."""
-        return self.prior >= SENSITIVE and self.likelihood >= SENSITIVE
-
 
 @dataclass(frozen=True)
 class Combination:
@@ -73,13 +62,48 @@ class Combination:
 
 @dataclass(frozen=True)
 class Learned:
-    """What a record taught: by parameter, the worst combinations, and what the prior decides."""
+    """What a record taught, by parameter, and the worst combinations, the worst first."""
 
     __repr__ = brief
 
     parameters: Mapping[str, Taught]
     combinations: tuple[Combination, ...]
-    findings: tuple[Finding, ...]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Parameters that the prior decides, and the combination that is determined worst."""
+        findings = [
+            Finding(
+                name,
+                f"the prior decides (power-scaling sensitivity {taught.prior:.2f} to the prior, "
+                f"{taught.likelihood:.2f} to the readings; contraction {taught.contraction:.2f})",
+                "give it the prior that is known, or a record that shows it",
+            )
+            for name, taught in self.parameters.items()
+            if taught.prior_decides
+        ]
+        for combination in self.combinations[:1]:
+            text = f"{combination.text}: {percent(combination.left)} of the prior's SD remains"
+            fix = "quote its members together, or add a record that tells them apart"
+            findings.append(Finding("determined worst", text, fix))
+        return findings
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it, as ``identifiability``."""
+        return {
+            "parameters": {
+                name: {
+                    "contraction": taught.contraction,
+                    "prior_sensitivity": taught.prior,
+                    "likelihood_sensitivity": taught.likelihood,
+                    "prior_decides": taught.prior_decides,
+                }
+                for name, taught in self.parameters.items()
+            },
+            "combinations": [asdict(combination) for combination in self.combinations],
+            "findings": [str(finding) for finding in self.findings],
+        }
 
 
 def learned(
@@ -106,36 +130,18 @@ def learned(
     N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
-    every = max(log_density.size // DRAWS, 1)
-    thin = draws.reshape(-1, draws.shape[-1])[::every]
-    density = log_density.ravel()[::every] - prior.constrain(prior.unconstrain(thin))[1]
+    step = max(log_density.size // DRAWS, 1)
+    thin = draws.reshape(-1, draws.shape[-1])[::step]
+    log_likelihood = log_density.ravel()[::step] - prior.constrain(prior.unconstrain(thin))[1]
     after = _scores(prior, thin)
-    before = _scores(prior, prior.draw(generator, PRIOR_DRAWS))
+    before = _scores(prior, prior.draw(generator, DRAWS))
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
-    by_prior, by_likelihood = _sensitivities(prior, thin, density)
+    sensitivities = _sensitivities(prior, thin, log_likelihood)
     parameters = {
-        name: Taught(float(contraction[i]), by_prior[name], by_likelihood[name])
+        name: Taught(float(contraction[i]), *sensitivities[name])
         for i, name in enumerate(prior.free_names)
     }
-    combinations = tuple(_combinations(prior.free_names, before, after))
-    return Learned(parameters, combinations, tuple(_findings(parameters, combinations)))
-
-
-def numbers(taught: Learned) -> dict[str, object]:
-    """Return it as ``identifiability`` in summary.json."""
-    return {
-        "parameters": {
-            name: {
-                "contraction": parameter.contraction,
-                "prior_sensitivity": parameter.prior,
-                "likelihood_sensitivity": parameter.likelihood,
-                "prior_decides": parameter.prior_decides,
-            }
-            for name, parameter in taught.parameters.items()
-        },
-        "combinations": [asdict(combination) for combination in taught.combinations],
-        "findings": [str(finding) for finding in taught.findings],
-    }
+    return Learned(parameters, tuple(_combinations(prior.free_names, before, after)))
 
 
 def _scores(prior: JointPrior, free: FloatArray) -> FloatArray:
@@ -145,12 +151,13 @@ def _scores(prior: JointPrior, free: FloatArray) -> FloatArray:
         assert parameter.prior is not None
         low, high = (np.asarray(end) for end in parameter.support)
         columns.append(parameter.prior.to_normal(column, low, high))
-    return np.clip(np.stack(columns, axis=1), -FARTHEST, FARTHEST)
+    # Beyond 37 there is no probability that a float can hold.
+    return np.clip(np.stack(columns, axis=1), -37.0, 37.0)
 
 
 def _sensitivities(
     prior: JointPrior, draws: FloatArray, log_likelihood: FloatArray
-) -> tuple[dict[str, float], dict[str, float]]:
+) -> dict[str, tuple[float, float]]:
     """Return power-scaling sensitivities to prior and likelihood, by parameter.
 
     From draws (draws, free), taken as one chain: weights depend on no order.
@@ -165,46 +172,22 @@ def _sensitivities(
             "log_likelihood": {"joint": log_likelihood[np.newaxis]},
         }
     )
-    taught = []
-    for group in ("prior", "likelihood"):
-        said = psense(tree, group=group)
-        taught.append({name: float(said[name]) for name in prior.free_names})
-    return taught[0], taught[1]
+    by_prior, by_likelihood = (psense(tree, group=group) for group in ("prior", "likelihood"))
+    return {name: (float(by_prior[name]), float(by_likelihood[name])) for name in prior.free_names}
 
 
-def _combinations(names: Sequence[str], before: FloatArray, after: FloatArray) -> list[Combination]:
-    """Return the directions that kept most of their prior sd, in words.
+def _combinations(
+    names: Sequence[str], before: FloatArray, after: FloatArray
+) -> Iterator[Combination]:
+    """Yield the three directions that keep most of their prior sd, in words.
 
     In the prior's own normal scores, whose spread the constraints may have changed: the
     eigenvectors of the posterior's covariance relative to the prior's.
     """
-    prior, posterior = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (before, after))
+    prior, posterior = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
     variances, directions = linalg.eigh(posterior, prior)
-    said: list[Combination] = []
-    for i in range(len(variances) - 1, -1, -1):
+    for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
         sd = float(np.sqrt(max(variances[i], 0.0)))
-        if sd < LEFT_OPEN or len(said) == COMBINATIONS:
-            break
-        # How the scores move together along it, and not what picks it out.
-        move = posterior @ directions[:, i]
-        said.append(Combination(combined(move, names), sd))
-    return said
-
-
-def _findings(
-    parameters: Mapping[str, Taught], combinations: Sequence[Combination]
-) -> Iterator[Finding]:
-    for name, taught in parameters.items():
-        if taught.prior_decides:
-            yield Finding(
-                name,
-                f"the prior decides (power-scaling sensitivity {taught.prior:.2f} to the prior, "
-                f"{taught.likelihood:.2f} to the readings; contraction {taught.contraction:.2f})",
-                "give it the prior that is known, or a record that shows it",
-            )
-    for combination in combinations[:1]:
-        yield Finding(
-            "determined worst",
-            f"{combination.text}: {percent(combination.left)} of the prior's SD remains",
-            "quote its members together, or add a record that tells them apart",
-        )
+        if sd >= LEFT_OPEN:
+            # How the scores move together along it, and not what picks it out.
+            yield Combination(combined(posterior @ directions[:, i], names), sd)

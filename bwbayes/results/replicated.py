@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain
 
 import numpy as np
 import scipy
@@ -21,19 +21,10 @@ from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
-__all__ = ["STATISTICS", "Replicated", "Statistic", "numbers", "replicated"]
+__all__ = ["STATISTICS", "Replicated", "Statistic", "replicated"]
 
 # Replicated records; p-values come in steps of one over them.
 RECORDS = 200
-
-# Readings of several records that are looked at together.
-LARGEST = 1 << 18
-
-# A p-value below this, two-sided, is odd.
-ODD = 0.01
-
-# The parts of the spectrum, as parts of the highest frequency.
-SLOW, MIDDLE = 0.01, 0.1
 
 # What is looked at: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
@@ -41,8 +32,8 @@ STATISTICS: Mapping[str, tuple[str, str]] = {
     "loop_area_um_V": ("Area of the loops", "um V"),
     "residual_sd_um": ("Sd of the residuals", "um"),
     "residual_lag_1": ("Correlation of neighboring residuals", "-"),
-    "residual_slow": (f"Power of the residuals below {SLOW:g} of the highest frequency", "-"),
-    "residual_fast": (f"Power of the residuals above {MIDDLE:g} of the highest frequency", "-"),
+    "residual_slow": ("Power of the residuals below 0.01 of the highest frequency", "-"),
+    "residual_fast": ("Power of the residuals above 0.1 of the highest frequency", "-"),
     "pit_mean": ("Mean place in the band", "-"),
     "pit_outside": ("Readings outside of the 90 % band", "-"),
 }
@@ -63,8 +54,8 @@ class Statistic:
 
     @property
     def odd(self) -> bool:
-        """Whether hardly any replicated record has as much, or as little."""
-        return min(self.p, 1 - self.p) < ODD / 2
+        """Whether no more than one in a hundred replicated records has as much, or as little."""
+        return min(self.p, 1 - self.p) < 0.005
 
 
 @dataclass(frozen=True)
@@ -75,6 +66,23 @@ class Replicated:
 
     statistics: Mapping[str, Statistic]
     records: int
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it, as ``replicated``."""
+        return {
+            "records": self.records,
+            "statistics": {
+                name: {
+                    "observed": statistic.observed,
+                    "lower_95": statistic.lower,
+                    "upper_95": statistic.upper,
+                    "p": statistic.p,
+                    "odd": statistic.odd,
+                }
+                for name, statistic in self.statistics.items()
+            },
+        }
 
 
 def replicated(
@@ -108,22 +116,18 @@ def replicated(
     voltage, samples = dataset.voltage[rows], int(rows[-1]) + 1
     # Where readings are missing they are missing in all.
     neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
-
-    def looked_at(readings: FloatArray) -> FloatArray:
-        return _statistics(readings, voltage, mean, sd, neighbors)
-
-    pieces, noises_left = [], iter(noise)
-    # Once more, rather than to keep them all.
+    statistics, row = [], 0
+    # Simulated once more, rather than to keep all; a few at a time are looked at together.
     for simulated in posterior.simulations(theta, rows, record):
-        for batch in batches(len(simulated), rows.size, LARGEST):
-            noises = (
-                dataset.noise.draw(own[np.newaxis], samples, generator)
-                for own in islice(noises_left, len(simulated[batch]))
-            )
-            added = np.array([(discrepancy + sensor)[rows] for discrepancy, sensor in noises])
-            pieces.append(looked_at(simulated[batch] + added))
-    replicates = np.concatenate(pieces)
-    observed = looked_at(np.asarray(dataset.readings.values)[np.newaxis])[0]
+        for batch in batches(len(simulated), rows.size, 1 << 18):
+            readings = simulated[batch].copy()
+            for i in range(len(readings)):
+                drawn = dataset.noise.draw(noise[row : row + 1], samples, generator)
+                readings[i] += np.sum(drawn, axis=0)[rows]
+                row += 1
+            statistics.append(_statistics(readings, voltage, mean, sd, neighbors))
+    replicates = np.concatenate(statistics)
+    observed = _statistics(dataset.readings.values[np.newaxis], voltage, mean, sd, neighbors)[0]
     lower, upper = np.quantile(replicates, [0.025, 0.975], axis=0)
     p = np.mean(replicates > observed, axis=0) + 0.5 * np.mean(replicates == observed, axis=0)
     values = np.stack([observed, lower, upper, p], axis=1).tolist()
@@ -132,67 +136,46 @@ def replicated(
     )
 
 
-def numbers(checked: Replicated) -> dict[str, object]:
-    """Return it as ``replicated`` in summary.json."""
-    return {
-        "records": checked.records,
-        "statistics": {
-            name: {
-                "observed": statistic.observed,
-                "lower_95": statistic.lower,
-                "upper_95": statistic.upper,
-                "p": statistic.p,
-                "odd": statistic.odd,
-            }
-            for name, statistic in checked.statistics.items()
-        },
-    }
-
-
-def _moments(pieces: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance (readings,) of rows that come a few at a time, (some, readings)."""
+def _moments(simulations: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance (readings,) of rows that come a few at a time, (any, readings)."""
     mean, squares = np.zeros(1), np.zeros(1)
-    for number, row in enumerate(chain.from_iterable(pieces), 1):
-        away = row - mean
-        mean = mean + away / number
-        squares = squares + away * (row - mean)
+    for number, row in enumerate(chain.from_iterable(simulations), 1):
+        deviation = row - mean
+        mean = mean + deviation / number
+        squares = squares + deviation * (row - mean)
     return mean, squares / number
 
 
 def _statistics(
     readings: FloatArray,
     voltage: FloatArray,
-    middle: FloatArray,
+    mean: FloatArray,
     sd: FloatArray,
     neighbors: IntArray,
 ) -> FloatArray:
     """Work out all ``STATISTICS`` of readings (records, readings): (records, statistics)."""
-    residual = readings - middle
+    residual = readings - mean
     centered = residual - np.mean(residual, axis=1, keepdims=True)
-    at = neighbors
     total = np.sum(centered**2, axis=1)
-    lag = np.sum(centered[:, at] * centered[:, at + 1], axis=1)
+    lag = np.sum(centered[:, neighbors] * centered[:, neighbors + 1], axis=1)
     frequency, power = scipy.signal.periodogram(residual, detrend="constant")
-    whole = np.sum(power, axis=1)
     relative = frequency / frequency[-1]
-    slow, fast = (np.sum(power[:, band], axis=1) for band in (relative <= SLOW, relative > MIDDLE))
+    slow, fast = (np.sum(power[:, band], axis=1) for band in (relative <= 0.01, relative > 0.1))
     pit = ndtr(residual / sd)
     # ∮ y du, by trapezes; turns of either direction count with their sign.
     area = np.sum(0.5 * (readings[:, 1:] + readings[:, :-1]) * np.diff(voltage), axis=1)
 
-    def ratio(of: FloatArray, all_of: FloatArray) -> FloatArray:
-        return np.divide(of, all_of, out=np.zeros_like(of), where=all_of > 0)
+    def share(part: FloatArray, of: FloatArray) -> FloatArray:
+        return np.divide(part, of, out=np.zeros_like(part), where=of > 0)
 
-    return np.stack(
-        [
-            np.ptp(readings, axis=1),
-            np.abs(area),
-            np.std(residual, axis=1),
-            ratio(lag, total),
-            ratio(slow, whole),
-            ratio(fast, whole),
-            np.mean(pit, axis=1),
-            np.mean(np.abs(pit - 0.5) > 0.45, axis=1),
-        ],
-        axis=1,
+    columns = (
+        np.ptp(readings, axis=1),
+        np.abs(area),
+        np.std(residual, axis=1),
+        share(lag, total),
+        share(slow, np.sum(power, axis=1)),
+        share(fast, np.sum(power, axis=1)),
+        np.mean(pit, axis=1),
+        np.mean(np.abs(pit - 0.5) > 0.45, axis=1),
     )
+    return np.stack(columns, axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import agreement, learned, loops, replicated, steps
+from bwbayes.results import agreement, loops, steps
 from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
@@ -166,9 +166,9 @@ def summary(result: Result) -> dict[str, object]:
         if result.loops is not None:
             numbers["loops"] = loops.numbers(result.loops)
         if result.learned is not None:
-            numbers["identifiability"] = learned.numbers(result.learned)
+            numbers["identifiability"] = result.learned.numbers
         numbers["replicated"] = {
-            name: replicated.numbers(checks) for name, checks in result.replicated.items()
+            name: checks.numbers for name, checks in result.replicated.items()
         } or None
         numbers["explanations"] = {
             name: [explanation.numbers for explanation in explained]

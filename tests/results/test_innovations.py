@@ -75,7 +75,7 @@ def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
 def test_the_density_of_white_noise_is_flat(share: float) -> None:
     """The sd times √(2 / sampling rate), whether readings are missing or not, within 6 %."""
     rng = np.random.default_rng(7)
-    time = 0.002 * np.flatnonzero(rng.random(16000) < share)
+    time = 0.002 * np.flatnonzero(rng.random(16000) < share).astype(np.float64)
     white = rng.normal(size=time.size)
     series = Innovations(time, white, white, white, 0.5 * white, 0.002)
     frequency, density = series.residual_density()

@@ -9,7 +9,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.learned import Learned, learned, numbers
+from bwbayes.results.learned import Learned, learned
 from tests.inference.test_solvable import closed_form, linear_posterior, prior_moments
 
 
@@ -80,6 +80,6 @@ def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Pos
 
 
 def test_the_numbers_are_json(posterior: Posterior) -> None:
-    said = json.loads(json.dumps(numbers(of(posterior, exact(posterior))), allow_nan=False))
+    said = json.loads(json.dumps(of(posterior, exact(posterior)).numbers, allow_nan=False))
     assert set(said["parameters"]) == set(posterior.names)
     assert len(said["findings"])

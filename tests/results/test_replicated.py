@@ -13,7 +13,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.replicated import STATISTICS, Replicated, numbers, replicated
+from bwbayes.results.replicated import STATISTICS, Replicated, replicated
 from tests.inference.problems import INTERVAL, TRUE_NOISE, short_posterior, truth
 
 SAMPLES = 400
@@ -75,6 +75,6 @@ def test_readings_that_are_missing_are_missing_in_all() -> None:
 
 
 def test_the_numbers_are_json() -> None:
-    said = json.loads(json.dumps(numbers(looked_at(short_posterior(samples=SAMPLES)))))
+    said = json.loads(json.dumps(looked_at(short_posterior(samples=SAMPLES)).numbers))
     assert said["records"] == 200
     assert set(said["statistics"]["range_um"]) == {"observed", "lower_95", "upper_95", "p", "odd"}

@@ -70,7 +70,7 @@ def check(config: Config, folder: Path, out: Path) -> tuple[Problem, Report]:
     shown = {f"{name}: {finding}" for name, issues in findings.items() for finding in issues}
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
-    untold = [*map(str, identifiability.undetermined(posterior, point, likely))]
+    untold = [*map(str, identifiability.undetermined(posterior, point))]
     explanations: list[str] = []
     for name, alone, theta in posterior.each(free):
         odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))

@@ -75,7 +75,7 @@ def assemble(
         *problem.remarks,
         *outcome.remarks,
         *conflict.conflicts(posterior.prior, flat, problem.defaults),
-        *identifiability.undetermined(posterior, chain.point, flat),
+        *identifiability.undetermined(posterior, chain.point),
     ]
     _, alone, first_draws = next(posterior.each(flat))
     columns = alone.table.columns(alone.prior.theta(first_draws))

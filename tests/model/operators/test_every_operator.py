@@ -122,7 +122,7 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
     point = PointFit(mode, identity, 0.0, mode[np.newaxis], identity)
     column = of.table.columns(of.prior.theta(draws))
     findings = [
-        *identifiability.undetermined(of, point, draws),
+        *identifiability.undetermined(of, point),
         *conflicts(of.prior, draws, {}),
         *of.only.actuator.hysteresis.remarks(column, of.names),
     ]
