@@ -75,7 +75,7 @@ class Config(ConfigTable):
 
     name: Annotated[str, Field(min_length=1)] | None = key(None, example='"bender 7"')
     """The run's name; by default the config's file name."""
-    seed: int = key(1, ge=0, le=LARGEST_SEED, example="7")
+    seed: int = key(1, ge=0, le=LARGEST_SEED, example="7", called="random_seed rng")
     """Seed of all random numbers."""
     record: Annotated[
         Annotated[RecordConfig, Tag(ONE)] | Annotated[dict[Name, RecordConfig], Tag(SEVERAL)],
@@ -89,11 +89,11 @@ class Config(ConfigTable):
     """The virtual test stand, for signals."""
     model: ModelConfig = key(ModelConfig())
     """The model of the actuator and of the residual."""
-    parameters: dict[str, ParameterConfig] = key({})
+    parameters: dict[str, ParameterConfig] = key({}, called="priors")
     """What is known of a parameter; NAME is its name, see `bwbayes models`."""
     sampling: SamplingConfig = key(SamplingConfig())
     """How to sample, and when to stop."""
-    validation: dict[Name, ValidationConfig] = key({})
+    validation: dict[Name, ValidationConfig] = key({}, called="holdout test")
     """Data to predict and judge, under a NAME of your choice."""
     truth: dict[str, float] = key({}, unit="the parameter's", example="{ d = 0.7, alpha = 0.3575 }")
     """True parameters of a simulated record, to be shown beside the estimates."""

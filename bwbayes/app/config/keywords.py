@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from bwbayes.app.config.config import ALONE, Config, checked
-from bwbayes.app.config.keys import MEANINGS
+from bwbayes.app.config.keys import synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig, ValidationConfig
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
@@ -117,7 +117,7 @@ def _hint(key: str, names: list[str]) -> str:
     if key in TABLES:
         example = next(iter(TABLES[key].model_fields))
         return f"give the keys of [{key}] themselves, {example} for instance"
-    return suggestion(key, names, MEANINGS)
+    return suggestion(key, names, synonyms(Config))
 
 
 def _validation(name: str, held_out: Any, records: dict[str, Record], where: str) -> Any:

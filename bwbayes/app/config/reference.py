@@ -16,7 +16,7 @@ from itertools import groupby
 from typing import Any
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.config.keys import ANY, MEANINGS, Key, keys
+from bwbayes.app.config.keys import ANY, Key, keys, synonyms
 from bwbayes.data.waveforms import signal_names
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noises import NOISES
@@ -82,9 +82,11 @@ def config_reference(requested: str | None) -> str:
         return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(documented))])
     requested_keys = [key for key in documented if _is_asked(key, requested.split("."))]
     if not requested_keys:
-        names = list(dict.fromkeys(key.name for key in documented if key.name != ANY))
+        names = list(dict.fromkeys(key.name for key in documented))
         last = requested.split(".")[-1]
-        raise InputError(f"config: no key {requested!r}; {suggestion(last, names, MEANINGS)}")
+        raise InputError(
+            f"config: no key {requested!r}; {suggestion(last, names, synonyms(Config))}"
+        )
     inside = tuple(f"{key.path}." for key in requested_keys if key.table is not None)
     shown = [key for key in documented if key in requested_keys or key.path.startswith(inside)]
     return "\n\n".join(_entry(key) for key in shown)
@@ -92,7 +94,7 @@ def config_reference(requested: str | None) -> str:
 
 def _once(documented: list[Key]) -> Iterator[Key]:
     """Yield keys without those of a table that stands elsewhere already."""
-    first_paths: dict[type, str] = {}
+    first_paths: dict[str, str] = {}
     skipped: tuple[str, ...] = ()
     for key in documented:
         if key.path.startswith(skipped or ("\n",)):

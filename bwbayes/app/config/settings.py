@@ -51,7 +51,7 @@ class SignalConfig(ConfigTable):
     """Shape of a period, or steps."""
     amplitude: Positive | None = key(None, unit="V", example="100.0")
     """Amplitude; not for steps."""
-    frequency: Positive | None = key(None, unit="Hz", example="1.0")
+    frequency: Positive | None = key(None, unit="Hz", example="1.0", called="freq")
     """Frequency; not for steps."""
     levels: Annotated[list[float], Field(min_length=1)] | None = key(
         None, unit="V", example="[10.0, 50.0, 0.0]"
@@ -59,9 +59,9 @@ class SignalConfig(ConfigTable):
     """Voltages of steps."""
     dwell: Positive | None = key(None, unit="s", example="2.0")
     """How long each step lasts; the last one stays to the end."""
-    duration: Positive = key(unit="s", example="16.0")
+    duration: Positive = key(unit="s", example="16.0", called="length")
     """Length of the record, from zero."""
-    start: NotNegative = key(0.0, unit="s", example="0.5")
+    start: NotNegative = key(0.0, unit="s", example="0.5", called="begin")
     """When the voltage leaves zero."""
     decay: NotNegative = key(0.0, unit="1/s", example="0.1")
     """Part of the amplitude that is lost every second."""
@@ -81,10 +81,12 @@ class SignalConfig(ConfigTable):
 class _Source(ConfigTable):
     """Where samples come from: a file, or a signal on the virtual test stand."""
 
-    file: str | None = key(None, example='"my_record.csv"')
+    file: str | None = key(None, example='"my_record.csv"', called="path data filename")
     """A record's file (text, HDF5, MATLAB, LVM or TDMS), relative to the config; this or signal."""
     signal: str | SignalConfig | None = key(
-        None, example="{ amplitude = 100.0, frequency = 1.0, duration = 16.0, decay = 0.1 }"
+        None,
+        example="{ amplitude = 100.0, frequency = 1.0, duration = 16.0, decay = 0.1 }",
+        called="waveform",
     )
     """A voltage that the virtual test stand runs, by name or as a table."""
     voltage_is: Literal["command", "output"] | None = key(None, example='"command"')
@@ -119,23 +121,25 @@ class RecordConfig(_Source):
 
     from_rest: bool = key(False, example="true")
     """Whether the record starts at rest, demagnetized."""
-    continues: Name | None = key(None, example='"first"')
+    continues: Name | None = key(None, example='"first"', called="follows")
     """Of several records, the one that this one goes on from at once: state, offset and discrepancy
     carry over, and the two are fitted as one record of that name.
     """
     start: float | None = key(None, unit="s", example="2.0")
     """Readings before are left out; the voltage is not, because the hysteresis remembers it."""
-    stop: float | None = key(None, unit="s", example="14.0")
+    stop: float | None = key(None, unit="s", example="14.0", called="end")
     """The record is cut here."""
-    exclude: Windows | None = key(None, unit="s", example="[[3.1, 3.2]]")
+    exclude: Windows | None = key(None, unit="s", example="[[3.1, 3.2]]", called="skip mask ignore")
     """Stretches whose readings are left out."""
     outliers: list[float] | None = key(None, unit="s", example="[3.105, 7.42]")
     """Times of single readings that are left out; a run with model.outliers writes them."""
     remarks: Texts | None = key(None, example='["my_record.csv:1: ignored columns: temperature_C"]')
     """What was noted when the record's files were read; a run writes it and shows it again."""
-    decimate: int = key(1, ge=1, example="5")
+    decimate: int = key(1, ge=1, example="5", called="thin downsample")
     """Of so many readings one is used."""
-    train: Windows | None = key(None, unit="s", example="[[0.0, 12.0]]")
+    train: Windows | None = key(
+        None, unit="s", example="[[0.0, 12.0]]", called="fit training windows"
+    )
     """Windows to fit, [start, stop]; by default the whole record."""
 
     @model_validator(mode="after")
@@ -211,7 +215,7 @@ class StandConfig(ConfigTable):
     """How the stand's actuator departs from the model: not at all, by a random process, or by
     creep, drift and an even term.
     """
-    sample_rate: Positive = key(1000.0, unit="Hz", example="200.0")
+    sample_rate: Positive = key(1000.0, unit="Hz", example="200.0", called="rate sampling_rate")
     """Samples of a record per second."""
     model: StandModelConfig = key(StandModelConfig())
     """The actuator on the stand, in parts."""
@@ -227,15 +231,15 @@ class ParameterConfig(ConfigTable):
         None, example='{ distribution = "normal", mean = 0.7, sd = 0.07 }'
     )
     """Its prior: a distribution and its arguments."""
-    fixed: float | None = key(None, unit="the parameter's", example="0.7")
+    fixed: float | None = key(None, unit="the parameter's", example="0.7", called="value constant")
     """Its value, if it is not fitted."""
-    lower: float | None = key(None, unit="the parameter's", example="0.5")
+    lower: float | None = key(None, unit="the parameter's", example="0.5", called="min minimum")
     """Lower bound."""
-    upper: float | None = key(None, unit="the parameter's", example="0.9")
+    upper: float | None = key(None, unit="the parameter's", example="0.9", called="max maximum")
     """Upper bound."""
-    unit: str | None = key(None, example='"um/V"')
+    unit: str | None = key(None, example='"um/V"', called="units")
     """Its unit, to be checked; no other can be chosen."""
-    label: str | None = key(None, example='"d_{33}"')
+    label: str | None = key(None, example='"d_{33}"', called="symbol")
     """Its symbol in figures, in LaTeX."""
     description: str | None = key(None, example='"gain of the bender"')
     """What it is, for the report."""
@@ -254,18 +258,18 @@ class SamplingConfig(ConfigTable):
 
     engine: EngineChoice = key("auto", example='"numpy"')
     """What evaluates the likelihood; auto: numba if installed."""
-    ess: Positive = key(2000.0, example="4000")
+    ess: Positive = key(2000.0, example="4000", called="draws samples")
     """Effective draws of every parameter at which to stop."""
-    ensembles: int = key(4, ge=4, example="8")
+    ensembles: int = key(4, ge=4, example="8", called="chains")
     """Independent ensembles of walkers."""
     walkers: Annotated[int, Field(ge=4, multiple_of=2)] | None = key(None, example="40")
     """Walkers of each ensemble; by default 64 (numba) or 32 (NumPy), or more for many parameters.
     """
     block: int = key(50, ge=10, example="25")
     """Steps between two looks at convergence."""
-    steps: int = key(20_000, ge=1, example="40_000")
+    steps: int = key(20_000, ge=1, example="40_000", called="iterations budget")
     """Largest number of steps that count."""
-    pilot_steps: int = key(3_000, ge=1, example="6_000")
+    pilot_steps: int = key(3_000, ge=1, example="6_000", called="warmup burn_in")
     """Largest number of steps until the ensembles have met."""
 
 
