@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from typing import Any
@@ -28,13 +28,10 @@ from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
 
 __all__ = ["config_reference", "parts_reference"]
 
-WIDTH = 96
-
 # The paper's ring bender on its identification signal: +-100 V at 1 Hz, +-62 um.
 RING_BENDER = Ranges(
     voltage=100.0, displacement=62.0, middle=0.0, time=0.5, interval=1e-3, duration=16.0
 )
-STIFFNESS = 4.10e5  # N/m
 
 Maker = Callable[..., Any]
 
@@ -48,18 +45,14 @@ PARTS: Mapping[str, Mapping[str, Maker]] = {
 }
 
 # What a text in a config may be, by its key's name, besides a choice of its own.
-IMPORTED = "or module:Class"
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "hysteresis": (*HYSTERESIS, IMPORTED),
+    "hysteresis": (*HYSTERESIS, "or module:Class"),
     "gain": tuple(TERMS),
-    "dynamics": (*DYNAMICS, IMPORTED),
-    "noise": ("auto", *NOISES, IMPORTED),
+    "dynamics": (*DYNAMICS, "or module:Class"),
+    "noise": ("auto", *NOISES, "or module:Class"),
     "prior": (*(f"{n}({', '.join(a)})" for n, a in FAMILIAR.items()), "or one of scipy.stats"),
     "signal": signal_names(),
 }
-
-# How reStructuredText marks names: the text to show, or the last part of a path.
-ROLE = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
 
 
 def config_reference(requested: str | None) -> str:
@@ -73,47 +66,41 @@ def config_reference(requested: str | None) -> str:
     InputError
         There is no such key.
     """
-    documented = list(keys(Config))
+    documented = keys(Config)
     if requested is None:
         head = (
             "Every key of a config, by table. `bwbayes config KEY` shows one; notebooks and runs "
             "have whole configs."
         )
         return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(documented))])
-    requested_keys = [key for key in documented if _is_asked(key, requested.split("."))]
-    if not requested_keys:
+    path = requested.split(".")
+    found = [key for key in documented if _ends_with(key, path)]
+    if not found:
         names = list(dict.fromkeys(key.name for key in documented))
-        last = requested.split(".")[-1]
-        raise InputError(
-            f"config: no key {requested!r}; {suggestion(last, names, synonyms(Config))}"
-        )
-    inside = tuple(f"{key.path}." for key in requested_keys if key.table is not None)
-    shown = [key for key in documented if key in requested_keys or key.path.startswith(inside)]
-    return "\n\n".join(_entry(key) for key in shown)
+        hint = suggestion(path[-1], names, synonyms(Config))
+        raise InputError(f"config: no key {requested!r}; {hint}")
+    inside = tuple(f"{key.path}." for key in found if key.table is not None)
+    shown = [key for key in documented if key in found or key.path.startswith(inside)]
+    return "\n\n".join(map(_entry, shown))
 
 
-def _once(documented: list[Key]) -> Iterator[Key]:
+def _once(documented: Sequence[Key]) -> Iterator[Key]:
     """Yield keys without those of a table that stands elsewhere already."""
     first_paths: dict[str, str] = {}
     skipped: tuple[str, ...] = ()
     for key in documented:
-        if key.path.startswith(skipped or ("\n",)):
-            continue
-        yield key
-        if key.table is not None and first_paths.setdefault(key.table, key.path) != key.path:
-            skipped = (*skipped, f"{key.path}.")
+        if not key.path.startswith(skipped):
+            yield key
+            if key.table is not None and first_paths.setdefault(key.table, key.path) != key.path:
+                skipped = (*skipped, f"{key.path}.")
 
 
-def _is_asked(key: Key, requested: list[str]) -> bool:
-    """Tell whether the path that a user wrote ends a key's path, with a name of theirs for NAME."""
-    path = key.path.split(".")
-    for candidate in (path, path[:-1] if path[-1] == ANY else path):
-        tail = candidate[-len(requested) :]
-        if len(tail) == len(requested) and tail[0] == requested[0]:
-            return all(
-                documented in (ANY, written)
-                for documented, written in zip(tail, requested, strict=True)
-            )
+def _ends_with(key: Key, written: Sequence[str]) -> bool:
+    """Tell whether a key's path ends as a user wrote it, with a name of theirs for NAME."""
+    for path in (key.path, key.path.removesuffix(f".{ANY}")):
+        end = path.split(".")[-len(written) :]
+        if len(end) == len(written) and end[0] == written[0]:
+            return all(a in (ANY, b) for a, b in zip(end, written, strict=True))
     return False
 
 
@@ -121,9 +108,7 @@ def _entry(key: Key) -> str:
     """Say all of a key: where and what it is, then an example in TOML."""
     holds_keys = key.table is not None and key.name != "signal"
     unit = f" ({key.unit})" if key.unit else ""
-    default = "" if key.default == "none" else f"; default: {key.default}"
-    if key.default == "required":
-        default = "; required"
+    default = {"none": "", "required": "; required"}.get(key.default, f"; default: {key.default}")
     title = f"[{key.path}]" if holds_keys else f"{key.path}: {key.kind}{unit}{default}"
     lines = [title, _wrapped(key.description, "    ")]
     if key.name in CHOICES and not holds_keys:
@@ -135,7 +120,7 @@ def _entry(key: Key) -> str:
 
 def _wrapped(text: str, indent: str = "") -> str:
     return textwrap.fill(
-        text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+        text, 96, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
     )
 
 
@@ -150,7 +135,14 @@ def parts_reference(requested: str | None) -> str:
         There is no such part.
     """
     if requested is not None:
-        return "\n\n".join(_part(kind, requested, maker) for kind, maker in _asked_parts(requested))
+        found = [(kind, makers[requested]) for kind, makers in PARTS.items() if requested in makers]
+        if not found:
+            registered = {
+                name: maker for makers in PARTS.values() for name, maker in makers.items()
+            }
+            component = made("models", requested, registered, {})
+            found = [("from outside", lambda: component)]
+        return "\n\n".join(_part(kind, requested, maker()) for kind, maker in found)
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():
         lines.append(f"{kind}:")
@@ -167,64 +159,49 @@ def parts_reference(requested: str | None) -> str:
     return "\n".join(lines)
 
 
-def _asked_parts(requested: str) -> Iterator[tuple[str, Maker]]:
-    kinds = [kind for kind, makers in PARTS.items() if requested in makers]
-    for kind in kinds:
-        yield kind, PARTS[kind][requested]
-    if not kinds:
-        registered = {name: maker for makers in PARTS.values() for name, maker in makers.items()}
-        component = made("models", requested, registered, {})
-        yield "from outside", lambda: component
-
-
-def _part(kind: str, name: str, maker: Maker) -> str:
+def _part(kind: str, name: str, component: Any) -> str:
     """Say all of a part: its docstring, then its parameters."""
-    component = maker()
-    text = inspect.getdoc(type(component)) or "It has no docstring."
-    declared: tuple[Declaration, ...] = (
+    lines = [f"{name} ({kind})", ""]
+    body, *sections = re.split(
+        r"\n\n(?=\w+\n-+\n)", inspect.getdoc(type(component)) or "It has no docstring."
+    )
+    lines.append(_without_marks(body))
+    for title, _, content in (section.split("\n", 2) for section in sections):
+        if title == "Notes":
+            lines += ["", _without_marks(content)]
+        elif title == "Parameters" and kind == "hysteresis":
+            lines += ["", "Options:", textwrap.indent(_without_marks(content), "    ")]
+    declared: Sequence[Declaration] = (
         component.declarations if hasattr(component, "declarations") else component.parameters
     )
-    lines = [f"{name} ({kind})", "", *_plain(text, options=kind == "hysteresis")]
     if declared:
-        ranges = RING_BENDER
         lines += [
             "",
             _wrapped(
                 "Parameters, with the default priors that they have at the ring bender's ranges "
-                f"(+-{ranges.voltage:g} V, +-{ranges.displacement:g} um, {ranges.time:g} s from "
-                "turn to turn); they scale with those of a record. `bwbayes check` prints yours."
+                f"(+-{RING_BENDER.voltage:g} V, +-{RING_BENDER.displacement:g} um, "
+                f"{RING_BENDER.time:g} s from turn to turn); they scale with those of a record. "
+                "`bwbayes check` prints yours."
             ),
         ]
-        for _, group in groupby(
-            declared, lambda declaration: re.sub(r"_\d+$", "_#", declaration.name)
-        ):
-            lines += ["", *_parameter(list(group), "residual" if kind == "noise" else "actuator")]
+    for _, numbered in groupby(declared, lambda one: re.sub(r"_\d+$", "_#", one.name)):
+        lines += ["", *_parameter(list(numbered), "residual" if kind == "noise" else "actuator")]
     return "\n".join(lines)
 
 
-def _plain(doc: str, *, options: bool) -> Iterator[str]:
-    """Yield the lines of a docstring without its marks, and of its sections those for a user."""
-    body, *sections = re.split(r"\n\n(?=\w+\n-+\n)", doc)
-    yield from _unmarked(body)
-    for section in sections:
-        title, _, content = section.split("\n", 2)
-        if title == "Notes":
-            yield from ("", *_unmarked(content))
-        elif title == "Parameters" and options:
-            yield from ("", "Options:", *(f"    {line}" for line in _unmarked(content)))
-
-
-def _unmarked(text: str) -> Iterator[str]:
-    """Yield the lines of a text without its marks; prose is wrapped again."""
+def _without_marks(text: str) -> str:
+    """Return a text without the marks of reStructuredText; prose is wrapped again."""
     text = re.sub(r"(?:^|\n)::\n", "", text).replace("::\n", ":\n").replace("``", "")
-    text = ROLE.sub(lambda role: role[1] or role[2], text)
-    paragraphs = [p if "\n " in f"\n{p}" else _wrapped(p) for p in text.split("\n\n")]
-    yield from "\n\n".join(paragraphs).splitlines()
+    # Of a name in a role, the text to show, or the last part of its path.
+    role = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
+    text = role.sub(lambda name: name[1] or name[2], text)
+    paragraphs = (p if "\n " in f"\n{p}" else _wrapped(p) for p in text.split("\n\n"))
+    return "\n\n".join(paragraphs)
 
 
-def _parameter(group: list[Declaration], of: str) -> Iterator[str]:
+def _parameter(numbered: Sequence[Declaration], of: str) -> Iterator[str]:
     """Yield the lines of a parameter, or of a row of numbered ones that are alike."""
-    declared, last = group[0], group[-1]
+    declared, last = numbered[0], numbered[-1]
     unit = "no unit" if declared.unit == "-" else declared.unit
     names = declared.name if last is declared else f"{declared.name} to {last.name}"
     until = "" if last is declared else f", and so on to: {last.description}"
@@ -239,11 +216,12 @@ def _default(declared: Declaration) -> str:
     """Say a default prior at the ring bender's ranges."""
     default, condition = declared.default(Context(RING_BENDER)), ""
     if default is None:
-        default = declared.default(Context(RING_BENDER, {"stiffness": STIFFNESS}))
-        condition = f" if stiffness is fixed, here at {STIFFNESS:g} N/m"
+        stiffness = 4.10e5  # N/m, the ring bender's
+        default = declared.default(Context(RING_BENDER, {"stiffness": stiffness}))
+        condition = f" if stiffness is fixed, here at {stiffness:g} N/m"
     if default is None:
         why = f" ({declared.without_default})" if declared.without_default else ""
         return f"no default: give prior or fixed{why}"
-    if isinstance(default, float | int):
-        return f"fixed at {default:g}{condition}"
-    return f"{default}{condition}"
+    return (
+        f"fixed at {default:g}" if isinstance(default, float | int) else str(default)
+    ) + condition
