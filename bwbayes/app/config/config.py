@@ -46,10 +46,7 @@ __all__ = [
     "parse",
 ]
 
-# Python's TOML reader takes time and memory by the square of what it reads, or worse.
 LARGEST_FILE = 1_000_000  # bytes
-MOST_KEY_PARTS = 100
-
 
 # What a record is called that is the only one.
 ALONE = "record"
@@ -111,21 +108,14 @@ class Config(ConfigTable):
                 )
         return value
 
-    @field_validator("validation")
-    @classmethod
-    def _names_of_its_own(cls, tables: dict[str, object]) -> dict[str, object]:
-        for name in tables:
-            if name == "record" or re.fullmatch(r"training(-\d+)?", name):
-                raise ValueError(f"the name {name!r} is taken by the training record")
-        return tables
-
     @model_validator(mode="after")
-    def _names_of_their_own(self) -> Self:
-        for name in self.records:
-            if len(self.records) > 1 and re.fullmatch(r"record|training(-\d+)?", name):
+    def _different_names(self) -> Self:
+        for name in self.records if len(self.records) > 1 else ():
+            if re.fullmatch(r"record|training(-\d+)?", name):
                 raise ValueError(f"the name {name!r} of a record is taken; choose another")
+        taken = "|".join(map(re.escape, (ALONE, "training", *self.records)))
         for name, validation in self.validation.items():
-            if any(re.fullmatch(rf"{re.escape(other)}(-\d+)?", name) for other in self.records):
+            if re.fullmatch(rf"({taken})(-\d+)?", name):
                 raise ValueError(f"validation: the name {name!r} is taken by a training record")
             if validation.of is not None and validation.of not in self.records:
                 hint = suggestion(validation.of, list(self.records))
@@ -191,13 +181,11 @@ def is_config(path: Path) -> bool:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError):
         return path.suffix == ".toml"
-    rows = re.findall(r"^[-+\d.,;\s]*\d[-+\d.,;eE \t]*$", text, re.MULTILINE)
-    if path.suffix == ".toml" and 2 * len(rows) < len(text.splitlines()) + 1:
-        return True
-    try:
-        return bool(tomllib.loads(text))
-    except (ValueError, RecursionError):
-        return re.search(r"^\s*\[+[a-z]", text, re.MULTILINE) is not None
+    if path.suffix == ".toml":
+        # A record may be called so by mistake: it is mostly rows of numbers.
+        rows = re.findall(r"^[-+\d.,;\s]*\d[-+\d.,;eE \t]*$", text, re.MULTILINE)
+        return 2 * len(rows) <= len(text.splitlines())
+    return re.search(r"^\s*(\[+[a-z]|record\b)", text, re.MULTILINE) is not None
 
 
 def parse(text: str, where: str) -> Config:
@@ -210,7 +198,10 @@ def parse(text: str, where: str) -> Config:
     ('bouc-wen', 'lag')
     """
     try:
-        _check_keys(text)
+        # Python's TOML reader takes time and memory by the square of a key's parts.
+        lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
+        if any(name.count(".") > 100 for line in lines for name in re.split("[=,{]", line)):
+            raise ValueError("a key has too many parts")
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         # Besides its own error, a ValueError for a whole number that is too long for Python.
@@ -224,13 +215,6 @@ def checked(table: Mapping[str, object], where: str) -> Config:
         return Config.model_validate(table)
     except ValidationError as error:
         raise InputError(one_line(where, error, Config)) from None
-
-
-def _check_keys(text: str) -> None:
-    for line in text.splitlines():
-        parts = max(name.count(".") for name in re.split("[=,{]", line))
-        if parts > MOST_KEY_PARTS and not line.lstrip().startswith("#"):
-            raise ValueError("a key has too many parts")
 
 
 def dump(config: Config) -> str:

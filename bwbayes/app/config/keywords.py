@@ -16,22 +16,11 @@ from pydantic import BaseModel
 
 from bwbayes.app.config.config import ALONE, Config, checked
 from bwbayes.app.config.keys import synonyms
-from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig, ValidationConfig
+from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
 
 __all__ = ["config_of"]
-
-# Where a key belongs; of a key of two tables (`outliers`) the first table counts.
-TABLES: dict[str, type[BaseModel]] = {
-    "model": ModelConfig,
-    "record": RecordConfig,
-    "sampling": SamplingConfig,
-}
-ABOVE = ("name", "seed", "parameters", "validation", "truth")
-
-# What a record is called that is not a file.
-IN_MEMORY = "records/{}.h5"
 
 
 def config_of(
@@ -61,29 +50,38 @@ def config_of(
     InputError
         A key that does not exist, or what no config can say.
     """
-    homes = {key: name for name in reversed(TABLES) for key in TABLES[name].model_fields}
-    homes = {key: name for key, name in homes.items() if key not in ("file", "signal")}
+    keyed: dict[str, type[BaseModel]] = {
+        "sampling": SamplingConfig,
+        "record": RecordConfig,
+        "model": ModelConfig,  # the last of two tables with a key of the same name counts
+    }
+    homes = {key: table for table, kind in keyed.items() for key in kind.model_fields}
+    homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth"), "")
+    del homes["file"], homes["signal"]
     tables: dict[str, Any] = {"record": {}, "model": {}, "sampling": {}}
     for key, value in keys.items():
-        if key in ABOVE:
-            tables[key] = _plain(value)
-        elif key in homes:
-            tables[homes[key]][key] = _plain(value)
-        else:
-            raise InputError(f"{where}: {key}: unknown key; {_hint(key, [*homes, *ABOVE])}")
+        if key in keyed:
+            example = next(iter(keyed[key].model_fields))
+            hint = f"give the keys of [{key}] themselves, {example} for instance"
+            raise InputError(f"{where}: {key}: unknown key; {hint}")
+        if key not in homes:
+            hint = suggestion(key, [*homes], synonyms(Config))
+            raise InputError(f"{where}: {key}: unknown key; {hint}")
+        (tables[homes[key]] if homes[key] else tables)[key] = _plain(value)
     records: dict[str, Record] = {}
     if isinstance(record, Record | str | Path):
         tables["record"]["file"] = _file(record, ALONE, records, where)
     else:
         tables["record"] = {
-            name: tables["record"] | _training(name, training, records, where)
+            name: tables["record"] | _table(name, training, records, where)
             for name, training in _by_name(record, where).items()
         }
-    if isinstance(keys.get("validation"), Mapping):
-        tables["validation"] = {
-            name: _validation(str(name), held_out, records, where)
-            for name, held_out in keys["validation"].items()
-        }
+    validations = keys.get("validation")
+    for name, held_out in validations.items() if isinstance(validations, Mapping) else ():
+        if isinstance(held_out, Record | str | Path | Mapping):
+            tables["validation"][str(name)] = _table(str(name), held_out, records, where)
+        else:
+            tables["validation"][str(name)] = {"window": _plain(held_out)}
     return checked(tables, where), records
 
 
@@ -104,37 +102,14 @@ def _by_name(record: Any, where: str) -> Mapping[str, Any]:
     return named
 
 
-def _training(name: str, source: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
-    """Return one of several training records as a config's table has it."""
+def _table(name: str, source: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
+    """Return a record, or the keys of its table with ``record`` among them, as in a config."""
     if not isinstance(source, Mapping):
         return {"file": _file(source, name, records, where)}
-    table = {key: _plain(value) for key, value in source.items() if key != "record"}
-    return table | {"file": _file(source.get("record"), name, records, where)}
-
-
-def _hint(key: str, names: list[str]) -> str:
-    """Say which key is meant."""
-    if key in TABLES:
-        example = next(iter(TABLES[key].model_fields))
-        return f"give the keys of [{key}] themselves, {example} for instance"
-    return suggestion(key, names, synonyms(Config))
-
-
-def _validation(name: str, held_out: Any, records: dict[str, Record], where: str) -> Any:
-    """Return a validation as a config's table has it."""
-    if isinstance(held_out, Record | str | Path):
-        return {"file": _file(held_out, name, records, where)}
-    if not isinstance(held_out, Mapping):
-        return {"window": _plain(held_out)}
-    table = {key: _plain(value) for key, value in held_out.items() if key != "record"}
-    if "record" in held_out:
-        if not isinstance(held_out["record"], Record | str | Path):
-            names = ", ".join(ValidationConfig.model_fields)
-            raise InputError(
-                f"{where}: validation.{name}.record: is not a record; give a Record, a file or a "
-                f"window; other keys are {names}"
-            )
-        table["file"] = _file(held_out["record"], name, records, where)
+    table: dict[str, Any] = _plain(source)
+    if "record" in source:
+        del table["record"]
+        table["file"] = _file(source["record"], name, records, where)
     return table
 
 
@@ -144,7 +119,7 @@ def _file(source: Any, name: str, records: dict[str, Record], where: str) -> str
         if source.displacement is None:
             raise InputError(f"{where}: {name}: has no displacement; give a measured record")
         records[name] = source
-        return IN_MEMORY.format(name)
+        return f"records/{name}.h5"
     if isinstance(source, str | Path):
         return str(Path(source).absolute())
     raise InputError(
