@@ -34,29 +34,6 @@ from bwbayes.model.registry import DYNAMICS
 
 __all__ = ["ConfigProposal", "propose"]
 
-# A quarter is held out: of the whole record, or of each of so many equal parts; where it begins in
-# a part; and the fewest readings that are fitted or held out.
-PARTS = (1, 2, 3, 4, 5, 6, 8)
-BEGINNINGS = (0.75, 0.625, 0.5)
-FEWEST_FITTED, FEWEST_HELD_OUT = 100, 25
-
-# Windows are enough where no voltage and no rate is this much rarer or more frequent in them than
-# in the rest (a difference of distribution functions), and no more than twice that of the range is
-# missing.
-ALIKE = 0.15
-
-# Samples of which a drive's distribution is taken.
-SEEN = 20_000
-
-# Part of the voltages' range that a held-out drive may lie beyond the fitted one.
-SLACK = 0.02
-
-# Parts of its range by which a voltage starts away from zero, and moves at its first steps.
-AWAY, MOVES = 0.01, 0.01
-
-# What makes a fit pointless; a run without a config does not begin one.
-POINTLESS = ("wrong units", "no relation", "reversed sign", "swapped columns")
-
 
 @dataclass(frozen=True)
 class ConfigProposal:
@@ -75,7 +52,8 @@ class ConfigProposal:
     @property
     def pointless(self) -> Finding | None:
         """What makes a fit pointless, if anything."""
-        return next((finding for finding in self.findings if finding.kind in POINTLESS), None)
+        kinds = ("wrong units", "no relation", "reversed sign", "swapped columns")
+        return next((finding for finding in self.findings if finding.kind in kinds), None)
 
 
 def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
@@ -133,33 +111,47 @@ def _text(
         else:
             notes.append(f"#   fix: {finding.fix}")
     held = _held_out(record)
-    train = _rest(record, held)
-    aside = _spikes(record, held)
-    if aside and not any(line.startswith("exclude") for line in lines["record"]):
-        lines["record"].append(
-            f"exclude = {_windows(record, aside)}  # spikes in the part that is held out"
-        )
+    # No fit sets aside the spikes that are held out.
+    spikes = [s for s in isolated_outliers(record).tolist() for w in held if w.start <= s < w.stop]
+    if spikes and not any(line.startswith("exclude") for line in lines["record"]):
+        windows = _windows(record, [slice(s, s + 1) for s in spikes])
+        lines["record"].append(f"exclude = {windows}  # spikes in the part that is held out")
+    first, stop = _span(record)
+    edges = [first, *(edge for window in held for edge in (window.start, window.stop)), stop]
+    train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     file = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
-    written = [
-        *_facts(record),
-        *(notes or ["# No issues found."]),
-        "",
-        "[record]",
+    lines["record"] = [
         f"file = {_quoted(file)}",
-        *_tables(naming),
+        *_columns(naming),
         f"train = {_windows(record, train)}  # s: fitted",
         *lines["record"],
-        *_start(record),
+        _start(record),
     ]
     if naming.units.get("voltage") is None and record.voltage_is == "output":
-        written.append(
+        lines["record"].append(
             '# voltage_is = "command"  # if a DAC holds the voltage between samples; it is taken '
             "for measured"
         )
-    written += [
+    others = ", ".join(_quoted(name) for name in DYNAMICS if name != "lag")
+    ending = [
+        "# Too little of the record can be left out of the fit to hold bands against it:",
+        "# [validation.another]",
+        '# file = "another.csv"',
+    ]
+    if held:
+        ending = [
+            "[validation.held_out]",
+            f"window = {_windows(record, held)}  # s: held out, used to validate the bands",
+        ]
+    written = [
+        *_ranges(record),
+        *(notes or ["# No issues found."]),
+        "",
+        "[record]",
+        *lines["record"],
         "",
         "[model]",
-        f'dynamics = "lag"  # or {", ".join(_quoted(n) for n in DYNAMICS if n != "lag")}',
+        f'dynamics = "lag"  # or {others}',
         *lines["model"],
         "",
         "# Priors come from the record's ranges; `bwbayes check` shows them. To say more:",
@@ -169,22 +161,12 @@ def _text(
         "# [sampling]",
         "# ess = 2000  # effective draws of every parameter",
         "",
+        *ending,
     ]
-    if not held:
-        written += [
-            "# Too little of the record can be left out of the fit to hold bands against it:",
-            "# [validation.another]",
-            '# file = "another.csv"',
-        ]
-    else:
-        written += [
-            "[validation.held_out]",
-            f"window = {_windows(record, held)}  # s: held out, used to validate the bands",
-        ]
     return "\n".join(written) + "\n"
 
 
-def _facts(record: Record) -> list[str]:
+def _ranges(record: Record) -> list[str]:
     low, high = record.range_voltage
     assert record.displacement is not None
     missing = record.samples - record.readings
@@ -196,27 +178,24 @@ def _facts(record: Record) -> list[str]:
     ]
 
 
-def _start(record: Record) -> list[str]:
-    """Say how the drive starts, and what no record tells of it."""
-    extent = float(np.ptp(record.voltage))
-    away = abs(float(record.voltage[0])) > AWAY * extent
+def _start(record: Record) -> str:
+    """Say how the drive starts, to a hundredth of its range, and what no record tells of it."""
     beginning = record.voltage[: max(record.samples // 100, 2)]
-    moving = float(np.ptp(beginning)) > MOVES * extent
-    state = f"at {record.voltage[0]:.3g} V, {'moving' if moving else 'at rest'}"
-    if away:
-        return [f"# from_rest = false  # it starts {state}: its history is unknown, and estimated"]
-    return [
-        f"# from_rest = true  # it starts {state}; say so if the actuator was demagnetized and "
-        "nothing moved"
-    ]
+    hundredth = 0.01 * float(np.ptp(record.voltage))
+    motion = "moving" if float(np.ptp(beginning)) > hundredth else "at rest"
+    state = f"it starts at {beginning[0]:.3g} V, {motion}"
+    if abs(float(beginning[0])) > hundredth:
+        return f"# from_rest = false  # {state}: its history is unknown, and estimated"
+    return (
+        f"# from_rest = true  # {state}; say so if the actuator was demagnetized and nothing moved"
+    )
 
 
-def _tables(naming: Naming) -> list[str]:
+def _columns(naming: Naming) -> list[str]:
     """Write which columns are meant, and their units."""
-    tables = {"columns": naming.columns, "units": naming.units}
     lines = [
         f"{key} = {{ {', '.join(f'{q} = {_quoted(name)}' for q, name in table.items())} }}"
-        for key, table in tables.items()
+        for key, table in (("columns", naming.columns), ("units", naming.units))
         if table
     ]
     return lines if naming.fs is None else [*lines, f"fs = {naming.fs!r}"]
@@ -231,17 +210,18 @@ def _span(record: Record) -> tuple[int, int]:
 def _held_out(record: Record) -> list[slice]:
     """Return the windows of a quarter of the record whose drive is as the rest's, if there are any.
 
-    The fewest that are alike, or else those that come nearest to it.
+    A quarter of the whole record, or of each of so many equal parts: the fewest windows that are
+    alike to 0.15, or else those that come nearest to it.
     """
-    first, last = _span(record)
+    first, stop = _span(record)
     candidates = []
-    for parts, begin in product(PARTS, BEGINNINGS):
-        edges = first + (last - first) / parts * np.add.outer(
+    for parts, begin in product((1, 2, 3, 4, 5, 6, 8), (0.75, 0.625, 0.5)):
+        edges = first + (stop - first) / parts * np.add.outer(
             np.arange(parts), [begin, begin + 0.25]
         )
         windows = [slice(*edge) for edge in np.rint(edges).astype(np.int64).tolist()]
         difference = _difference(record, windows)
-        if difference <= ALIKE:
+        if difference <= 0.15:
             return windows
         candidates.append((difference, windows))
     difference, windows = min(candidates, key=lambda candidate: candidate[0])
@@ -249,39 +229,28 @@ def _held_out(record: Record) -> list[slice]:
 
 
 def _difference(record: Record, windows: list[slice]) -> float:
-    """Return how far windows are from being like the record; 1 where they will not do."""
+    """Return how far windows are from being like the rest of a record; 1 where they will not do.
+
+    The largest difference of the distribution functions of voltages and rates, or half of the part
+    of the voltages' range that is missing.
+    """
     held = np.zeros(record.samples, dtype=np.bool_)
     for window in windows:
         held[window] = True
     readings = record.has_reading
     fitted, other = record.voltage[readings & ~held], record.voltage[readings & held]
-    if fitted.size < FEWEST_FITTED or other.size < FEWEST_HELD_OUT:
+    if fitted.size < 100 or other.size < 25:
         return 1.0
-    slack = SLACK * float(np.ptp(fitted))
+    slack = 0.02 * float(np.ptp(fitted))
     inside = other.min() >= fitted.min() - slack and other.max() <= fitted.max() + slack
     assert record.displacement is not None
     if not inside or np.ptp(other) == 0 or np.ptp(record.displacement[readings & held]) == 0:
         return 1.0
-    drive = record.voltage, np.abs(rate(record.voltage, record.interval))
-    thinned = slice(None, None, 1 + record.samples // SEEN)
-    differences = [
-        scipy.stats.ks_2samp(x[thinned][held[thinned]], x[thinned][~held[thinned]])[0]
-        for x in drive
-    ]
+    thinned = slice(None, None, 1 + record.samples // 20_000)
+    held = held[thinned]
+    drive = record.voltage[thinned], np.abs(rate(record.voltage, record.interval))[thinned]
+    differences = [scipy.stats.ks_2samp(x[held], x[~held])[0] for x in drive]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
-
-
-def _rest(record: Record, held: list[slice]) -> list[slice]:
-    """Return the windows between those that are held out."""
-    first, last = _span(record)
-    edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last]
-    return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-
-
-def _spikes(record: Record, held: list[slice]) -> list[slice]:
-    """Return a window around each spike that is held out, where no fit sets it aside."""
-    spikes = isolated_outliers(record).tolist()
-    return [slice(s, s + 1) for s in spikes if any(w.start <= s < w.stop for w in held)]
 
 
 def _windows(record: Record, windows: list[slice]) -> str:
