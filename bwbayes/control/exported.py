@@ -18,8 +18,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.discrete import linear_part
-from bwbayes.control.printed import ascii_of, c_functions, number_in_c
+from bwbayes.control.codegen import c_functions, to_ascii, to_c_number
 from bwbayes.control.sampled import (
     BISECTION_ROUNDS,
     NEWTON_ROUNDS,
@@ -35,8 +34,6 @@ from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Exported", "exported"]
-
-BETWEEN = {"first": "voltage's drive goes straight", "zero": "voltage is held"}
 
 
 @dataclass(frozen=True)
@@ -71,8 +68,7 @@ class Exported:
     @property
     def linear(self) -> Any:
         """The linear part, a discrete ``scipy.signal.StateSpace``."""
-        actuator, column = self.model.actuator, self.model.column
-        return linear_part(actuator, np.array([column[name][0] for name in actuator.parameters]))
+        return self.model.linear
 
     def numbers(self) -> dict[str, Any]:
         """Return what ``model.json`` says: parts, parameters and coefficients, with their units."""
@@ -108,7 +104,7 @@ class Exported:
                 for name, (value, unit) in self.model.step.coefficients().items()
             },
             "gain": self._gain,
-            "creep_growth_per_V": self._growth,
+            "creep_growth_per_V": float(self.model.creep_growth[0]),
             "zero": {
                 "value": float(self.model.zero[0]),
                 "unit": "um",
@@ -135,9 +131,10 @@ class Exported:
             trim_blocks=True,
             lstrip_blocks=True,
             keep_trailing_newline=True,
-            finalize=_in_c,
+            finalize=lambda value: to_c_number(value) if isinstance(value, float) else value,
         )
         actuator, step = self.model.actuator, self.model.step
+        held = actuator.hold == "zero"
         remembered = step.demagnetized()[0]
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] if actuator.gain else []
@@ -148,13 +145,13 @@ class Exported:
             warnings=[_plain(line) for text in self.standing.said for line in wrap(text, 92)],
             version=_plain(version("bwbayes")),
             interval=actuator.interval,
-            between=BETWEEN[actuator.hold],
-            held=actuator.hold == "zero",
+            between="voltage is held" if held else "voltage's drive goes straight",
+            held=held,
             low=self.limits.low,
             high=self.limits.high,
-            hysteresis=ascii_of(type(step).__doc__ or "").split("\n\n")[0],
-            parameters_are=ascii_of(type(step).parameters.__doc__ or ""),
-            parameters=[*map(number_in_c, step.parameters[0].tolist())],
+            hysteresis=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
+            parameters_are=to_ascii(type(step).parameters.__doc__ or ""),
+            parameters=[*map(to_c_number, step.parameters[0].tolist())],
             remembered=remembered.tolist(),
             functions=c_functions(
                 type(step).move,
@@ -163,7 +160,7 @@ class Exported:
             ),
             sections=self._sections,
             gain=self._gain,
-            growth=self._growth,
+            growth=float(self.model.creep_growth[0]),
             zero=float(self.model.zero[0]),
             inverse=self.without_inverse is None,
             without_inverse=_plain(self.without_inverse or ""),
@@ -181,17 +178,15 @@ class Exported:
 
     @property
     def _sections(self) -> list[dict[str, Any]]:
-        numerator, denominator, gains, crept = (values[0] for values in self.model.sections)
+        sections = zip(*(values[0].tolist() for values in self.model.sections), strict=True)
         return [
             {
-                "what": "creep" if is_creep else "dynamics",
-                "numerator": top.tolist(),
-                "denominator": bottom.tolist(),
-                "gain": float(gain),
+                "what": "creep" if number else "dynamics",
+                "numerator": numerator,
+                "denominator": denominator,
+                "gain": gain,
             }
-            for top, bottom, gain, is_creep in zip(
-                numerator, denominator, gains, crept, strict=True
-            )
+            for number, (numerator, denominator, gain) in enumerate(sections)
         ]
 
     @property
@@ -204,13 +199,6 @@ class Exported:
             for name in ("quadratic", "cubic")
         }
         return {"middle_V": gain.reference.middle, "half_V": gain.reference.half, **terms}
-
-    @property
-    def _growth(self) -> float:
-        creep = self.model.actuator.creep
-        if creep is None or not creep.growing:
-            return 0.0
-        return float(self.model.column["creep_growth"][0]) * float(creep.size(np.array(1.0)))
 
 
 def exported(
@@ -246,16 +234,12 @@ def exported(
             f"limits: {limits.low:g} to {limits.high:g} V; give two voltages, the lower one first"
         )
     model = SampledModel.of(actuator, np.atleast_2d(theta))
+    without_inverse = None
     try:
         require_inverse(model, limits)
     except InputError as error:
-        return Exported(name, model, limits, sds or {}, str(error))
-    return Exported(name, model, limits, sds or {}, None)
-
-
-def _in_c(value: Any) -> Any:
-    """Return a number as C has it, to the last bit."""
-    return number_in_c(value) if isinstance(value, float) else value
+        without_inverse = str(error)
+    return Exported(name, model, limits, sds or {}, without_inverse)
 
 
 def _plain(text: str) -> str:

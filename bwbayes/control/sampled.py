@@ -1,20 +1,22 @@
-"""A model that runs at a controller's pace: one sample in, one sample out, forward or backward.
+"""A fitted model at a controller's pace: one sample in, one sample out, forward or inverse.
 
 :class:`SampledModel` is what ``bwbayes export`` writes as C and what ``bwbayes track`` closes the
-loop around. It is the actuator's own recursion, with a voltage for each model; backward it finds
-the voltage that brings the displacement where it is to be, by a safeguarded Newton iteration whose
-number of rounds is bounded.
+loop around. It is the actuator's own recursion, with a voltage for each model. The inverse is a
+safeguarded Newton iteration with a bounded number of rounds. What follows the hysteresis is linear,
+and is given as a system of ``scipy.signal`` too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import scipy
+from scipy.linalg import block_diag
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.gain import DriveStep
@@ -30,41 +32,35 @@ __all__ = [
     "SteppedState",
     "require_inverse",
     "resolution",
-    "sections_of",
 ]
 
-# Rounds of the solver at most: some of Newton's, of which it needs a few, and should they not do,
-# bisection to the last bit of a voltage.
+# Rounds of the inverse at most: Newton's rule needs a few; if it fails, bisection goes on to the
+# last bit of a voltage.
 NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
-
-# A zero that is nearer to -1 than this leaves an inverse that swings for thousands of samples.
-LARGEST_ZERO = 0.999
 
 
 class SampledSections(NamedTuple):
-    """Linear recursions side by side, (models, sections, 3) and (models, sections).
+    """Linear recursions side by side: taps (models, sections, 3) and gains (models, sections).
 
-    ``crept`` (models, sections) tells the sections whose drive is that of the creep.
+    The first is that of the dynamics, the others are the lags of the creep.
     """
 
     numerator: FloatArray
     denominator: FloatArray
     gains: FloatArray
-    crept: BoolArray
 
 
 class SteppedState(NamedTuple):
-    """What the models remember between two samples.
+    """State of the models between two samples.
 
-    ``memory`` is the hysteresis' own, ``voltage`` (models,) the last one, V, ``rest`` (models,) and
-    ``crept_rest`` (models,) are the drives at the start, um, and ``filters`` (models, sections, 2)
-    the recursions' states.
+    ``memory`` (models, any) is that of the hysteresis, ``voltage`` (models,) the last one, V,
+    ``rest`` (models, sections) the drives at the start, um, and ``filters`` (models, sections, 2)
+    the states of the recursions.
     """
 
     memory: FloatArray
     voltage: FloatArray
     rest: FloatArray
-    crept_rest: FloatArray
     filters: FloatArray
 
 
@@ -105,57 +101,55 @@ class SampledModel:
             The hysteresis has no step of bounded time.
         """
         column = {name: values.copy() for name, values in actuator.columns(theta).items()}
-        return cls(
-            actuator, column, actuator.hysteresis.step(column), sections_of(actuator, column)
-        )
+        sections = SampledSections(*actuator.sections(column).taps)
+        return cls(actuator, column, actuator.hysteresis.step(column), sections)
 
     @property
     def models(self) -> int:
-        """How many there are."""
+        """Number of models."""
         return int(self.sections.gains.shape[0])
+
+    @cached_property
+    def creep_growth(self) -> FloatArray:
+        """κ / U (models,), 1/V, by which the creep's drive w (1 + κ |u| / U) grows."""
+        creep = self.actuator.creep
+        if creep is None or not creep.growing:
+            return np.zeros(self.models)
+        return np.asarray(self.column["creep_growth"] * creep.size(np.array(1.0)))
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        equilibrium, _, memory = self.drive(self.step.demagnetized(), voltage)
+        w, _, memory = self.drive(self.step.demagnetized(), voltage)
         filters = np.zeros((*self.sections.gains.shape, 2))
-        return SteppedState(
-            memory, voltage, equilibrium, equilibrium * self._growth(voltage), filters
-        )
+        return SteppedState(memory, voltage, self._section_drives(w, voltage), filters)
 
     @cached_property
     def zero(self) -> FloatArray:
         """What dynamics and creep make of the drive at zero volts, where 0 um is, (models,), um."""
-        return self._settled(self.begin(np.zeros(self.models)))
+        return self._weigh(self.begin(np.zeros(self.models)).rest)
 
     def level(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,) at which they began, um."""
-        return self._settled(state) - self.zero
-
-    def _settled(self, state: SteppedState) -> FloatArray:
-        before = np.where(self.sections.crept, state.crept_rest[:, None], state.rest[:, None])
-        return (self.sections.gains * before).sum(axis=1)
+        return self._weigh(state.rest) - self.zero
 
     def displacement(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,), um, that a held voltage has led to."""
-        return self.level(state) + (self.sections.gains * state.filters[..., 0]).sum(axis=1)
+        return self.level(state) + self._weigh(state.filters[..., 0])
 
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
         """Return the displacement (models,), um, at a sample with this voltage, and the state.
 
         If the voltage is held, the displacement is that just before it changes.
         """
-        numerator, denominator, gains, crept = self.sections
+        numerator, denominator, _ = self.sections
         w, _, memory = self.drive(state.memory, voltage)
-        creeping = w if self._even else w * self._growth(voltage)
-        drives = np.where(
-            crept, (creeping - state.crept_rest)[:, np.newaxis], (w - state.rest)[:, np.newaxis]
-        )
+        drives = self._section_drives(w, voltage) - state.rest
         moved = numerator[..., 0] * drives + state.filters[..., 0]
-        ahead = numerator[..., 1:] * drives[..., np.newaxis]
-        ahead -= denominator[..., 1:] * moved[..., np.newaxis]
-        ahead[..., 0] += state.filters[..., 1]
-        displacement = self.level(state) + (gains * moved).sum(axis=1)
-        return displacement, state._replace(memory=memory, voltage=voltage, filters=ahead)
+        filters = numerator[..., 1:] * drives[..., np.newaxis]
+        filters -= denominator[..., 1:] * moved[..., np.newaxis]
+        filters[..., 0] += state.filters[..., 1]
+        displacement = self.level(state) + self._weigh(moved)
+        return displacement, state._replace(memory=memory, voltage=voltage, filters=filters)
 
     def inverse(
         self,
@@ -163,112 +157,111 @@ class SampledModel:
         displacement: FloatArray,
         limits: Span,
         guess: FloatArray | None = None,
-        close: float | None = None,
+        tolerance: float | None = None,
     ) -> tuple[FloatArray, SteppedState]:
         """Return the voltage (models,), V, that gives a displacement (models,), um, and the state.
 
         If the voltage is held, it is the displacement of the next sample. What would need a voltage
-        outside of the limits gets the limit. The search starts at a ``guess``, or else the last
-        voltage, and ends when it is ``close``, V, by default to the last bits.
+        outside of the limits gets the limit. The search starts at a ``guess``, by default the last
+        voltage, and ends at a ``tolerance``, V, by default the last bits.
         """
-        drive, crept, missing = self._instant(state, displacement)
-        first = np.clip(state.voltage if guess is None else guess, *limits)
-        close = resolution(limits) if close is None else close
-        voltage = self._solve(state.memory, first, (drive, crept, missing), limits, close)
+        numerator, denominator, gains = self.sections
+        carried, now = state.filters[..., 0], numerator[..., 0]
+        if self.actuator.hold == "zero":
+            # The next sample; this one is out of reach.
+            carried = state.filters[..., 1] - denominator[..., 1] * carried
+            now = numerator[..., 1]
+        weights = gains * now
+        direct, creeping = weights[:, 0], weights[:, 1:].sum(axis=1)
+        demand = displacement - self.level(state) - self._weigh(carried)
+        demand += (weights * state.rest).sum(axis=1)
+        tolerance = resolution(limits) if tolerance is None else tolerance
+
+        # (direct + creeping (1 + κ |u| / U)) w(u) = demand, where the left side rises with u.
+        voltage = np.clip(state.voltage if guess is None else guess, *limits)
+        low, high = np.full_like(demand, limits.low), np.full_like(demand, limits.high)
+        for iteration in range(NEWTON_ROUNDS + BISECTION_ROUNDS):
+            w, slope, _ = self.drive(state.memory, voltage)
+            factor = direct + creeping * (1 + self.creep_growth * np.abs(voltage))
+            excess = factor * w - demand
+            steepness = factor * slope + creeping * w * self.creep_growth * np.sign(voltage)
+            low = np.where(excess < 0, voltage, low)
+            high = np.where(excess < 0, high, voltage)
+            better = (low + high) / 2
+            if iteration < NEWTON_ROUNDS:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    newton = np.clip(voltage - excess / steepness, limits.low, limits.high)
+                better = np.where((newton >= low) & (newton <= high), newton, better)
+            change, voltage = np.abs(better - voltage), better
+            if np.all(change <= tolerance):
+                break
         return voltage, self.forward(state, voltage)[1]
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
         smallest, largest = self.step.slopes(limits)
-        if self.actuator.gain is None:
-            return smallest, largest
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
-        added = self._shaped.added_slope(np.linspace(*limits, 1001)[:, np.newaxis])
+        added = self._drive_step.added_slope(np.linspace(*limits, 1001)[:, np.newaxis])
         return smallest + added.min(axis=0), largest + added.max(axis=0)
 
-    def _instant(
-        self, state: SteppedState, displacement: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the drives w and w (1 + κ |u| / U) count at once, and their sum, um."""
-        numerator, denominator, gains, crept = self.sections
-        carried = state.filters[..., 0]
-        now = numerator[..., 0]
-        if self.actuator.hold == "zero":
-            # The next sample; this one is out of reach.
-            carried = state.filters[..., 1] - denominator[..., 1] * carried
-            now = numerator[..., 1]
-        counts = gains * now
-        drive = np.where(crept, 0.0, counts).sum(axis=1)
-        creep = np.where(crept, counts, 0.0).sum(axis=1)
-        missing = displacement - self.level(state) - (gains * carried).sum(axis=1)
-        return drive, creep, missing + drive * state.rest + creep * state.crept_rest
-
-    def _solve(
-        self,
-        memory: FloatArray,
-        voltage: FloatArray,
-        demand: tuple[FloatArray, FloatArray, FloatArray],
-        limits: Span,
-        close: float,
-    ) -> FloatArray:
-        """Solve (b + b_c (1 + κ |u| / U)) w(u) = missing, rising in u, between limits."""
-        drive, crept, missing = demand
-        low, high = np.full_like(missing, limits.low), np.full_like(missing, limits.high)
-        for done in range(NEWTON_ROUNDS + BISECTION_ROUNDS):
-            w, slope, _ = self.drive(memory, voltage)
-            factor = drive + crept * self._growth(voltage)
-            excess = factor * w - missing
-            steepness = factor * slope + crept * w * self._growth_slope(voltage)
-            low = np.where(excess < 0, voltage, low)
-            high = np.where(excess < 0, high, voltage)
-            better = (low + high) / 2
-            if done < NEWTON_ROUNDS:
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    newton = np.clip(voltage - excess / steepness, limits.low, limits.high)
-                better = np.where((newton >= low) & (newton <= high), newton, better)
-            moved, voltage = np.abs(better - voltage), better
-            if np.all(moved <= close):
-                break
-        return voltage
-
     def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return hysteresis and gain once the voltage has gone there."""
-        return self._shaped.go(memory, voltage)
+        """Return hysteresis and gain, um, once the voltages (models,) have gone there."""
+        return self._drive_step.go(memory, voltage)
+
+    def frequency_response(self, angles: FloatArray) -> FloatArray:
+        """Return the complex response (models, frequencies) of dynamics and creep together.
+
+        ``angles`` (frequencies,) are per sample, rad.
+        """
+        powers = np.exp(-1j * np.outer(np.arange(3), angles))
+        responses = (self.sections.numerator @ powers) / (self.sections.denominator @ powers)
+        total: Any = np.einsum("ms,msf->mf", self.sections.gains, responses)
+        return np.asarray(total)
 
     @property
-    def _shaped(self) -> DriveStep:
+    def linear(self) -> Any:
+        """What follows the hysteresis of the first model, a discrete ``scipy.signal.StateSpace``.
+
+        With the drive w in um, from hysteresis and gain, and x the displacement in um, both as
+        differences from rest,
+
+            z[t+1] = A z[t] + B w[t],   x[t] = C z[t] + D w[t],
+
+        with the states that ``scipy.signal.lfilter`` has. If the creep grows with the voltage,
+        w (1 + κ |u| / U) is a second input. ``dt`` is in s.
+        """
+        growing = self.actuator.creep is not None and self.actuator.creep.growing
+        a, b, c, d = [], [], [], np.zeros((1, 1 + growing))
+        sections = zip(*(values[0] for values in self.sections), strict=True)
+        for number, (numerator, denominator, gain) in enumerate(sections):
+            order = max(int(np.max(np.nonzero([numerator, denominator])[1])), 1)
+            column = int(growing and number > 0)
+            shift, entry = np.eye(order, k=1), np.zeros((order, 1 + growing))
+            shift[:, 0] -= denominator[1 : order + 1]
+            entry[:, column] = (numerator - denominator * numerator[0])[1 : order + 1]
+            d[0, column] += gain * numerator[0]
+            a.append(shift)
+            b.append(entry)
+            c.append(gain * np.eye(1, order))
+        return scipy.signal.StateSpace(
+            block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
+        )
+
+    @property
+    def _drive_step(self) -> DriveStep:
         return DriveStep(self.step, self.actuator.gain, self.column)
 
-    @property
-    def _even(self) -> bool:
-        """Whether the creep does not grow with the voltage."""
-        return self.actuator.creep is None or not self.actuator.creep.growing
+    def _section_drives(self, w: FloatArray, voltage: FloatArray) -> FloatArray:
+        """Return what drives each section, (models, sections), um."""
+        drives = np.empty_like(self.sections.gains)
+        drives[:, 0] = w
+        drives[:, 1:] = (w * (1 + self.creep_growth * np.abs(voltage)))[:, np.newaxis]
+        return drives
 
-    def _growth(self, voltage: FloatArray) -> FloatArray:
-        """Return 1 + κ |u| / U (models,)."""
-        creep = self.actuator.creep
-        if creep is None or self._even:
-            return np.ones_like(voltage)
-        grown: FloatArray = 1 + self.column["creep_growth"] * creep.size(voltage)
-        return grown
-
-    def _growth_slope(self, voltage: FloatArray) -> FloatArray:
-        """Return the slope of 1 + κ |u| / U, 1/V."""
-        creep = self.actuator.creep
-        if creep is None or self._even:
-            return np.zeros_like(voltage)
-        slope: FloatArray = (
-            np.sign(voltage) * self.column["creep_growth"] * creep.size(np.array(1.0))
-        )
-        return slope
-
-
-def sections_of(actuator: Actuator, column: dict[str, FloatArray]) -> SampledSections:
-    """Return dynamics and creep of models given by the columns (models,) of θ."""
-    numerator, denominator, gains = actuator.sections(column).taps
-    # The first is that of the dynamics.
-    crept = np.broadcast_to(np.arange(gains.shape[1]) > 0, gains.shape)
-    return SampledSections(numerator, denominator, gains, crept)
+    def _weigh(self, values: FloatArray) -> FloatArray:
+        """Return the sum of the sections' values (models, sections), each times its gain."""
+        total: FloatArray = (self.sections.gains * values).sum(axis=1)
+        return total
 
 
 def require_inverse(model: SampledModel, limits: Span) -> None:
@@ -287,7 +280,9 @@ def require_inverse(model: SampledModel, limits: Span) -> None:
             f"to {limits.high:g} V, so that a displacement has more than one voltage"
         )
     zeros = model.actuator.sections(model.column).zeros
-    for zero in zeros[(abs(zeros) >= 1) | ((zeros.real < 0) & (abs(zeros) > LARGEST_ZERO))]:
+    # With a zero that is nearer to -1 than this, an inverse swings for thousands of samples.
+    unstable = (abs(zeros) >= 1) | ((zeros.real < 0) & (abs(zeros) > 0.999))
+    for zero in zeros[unstable]:
         raise InputError(
             "inverse: from sample to sample the voltage would swing on and on (the sampled "
             f"dynamics have a zero at {zero.real:.4g}); sample more slowly, or hold the voltage"

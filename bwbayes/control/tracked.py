@@ -117,7 +117,6 @@ class Tracking:
                 "phase_margin_least_deg": float(margins.phase.min()),
                 "crossover_Hz": [float(margins.crossover.min()), float(margins.crossover.max())],
                 "circle_criterion_least": float(margins.circle.min()),
-                "largest_pole": float(margins.pole.max()),
                 "stable": margins.stable,
                 "draws": int(margins.gain.size),
             },

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.discrete import frequency_response
 from bwbayes.control.gains import Robustness, design
 from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, TrackingErrors, follow
 from bwbayes.control.references import SHAPES, reference
@@ -156,12 +155,14 @@ def _fed(
     )
     command, reached = np.zeros_like(desired), np.zeros_like(desired)
     state = model.begin(np.zeros(model.models))
-    last, close = np.zeros(model.models), CLOSE * stand.amplifier.step
+    last, tolerance = np.zeros(model.models), CLOSE * stand.amplifier.step
     for t in range(longest - 1):
         reached[:, t] = model.displacement(state)
         guess = 2 * state.voltage - last
         last = state.voltage
-        command[:, t], state = model.inverse(state, desired[:, t + 1], stand.limits, guess, close)
+        command[:, t], state = model.inverse(
+            state, desired[:, t + 1], stand.limits, guess, tolerance
+        )
     reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
     ends = np.cumsum([reference.shape[0] for reference in references])[:-1]
     parts = zip(references, np.split(command, ends), np.split(reached, ends), strict=True)
@@ -221,7 +222,7 @@ def _rise(mean: SampledModel) -> int:
     is a Hann window, stays within the reach that the amplitude is 80 % of.
     """
     turns = np.geomspace(1e-4, np.pi, 400)
-    response = np.abs(frequency_response(mean.sections, turns))[0]
+    response = np.abs(mean.frequency_response(turns))[0]
     slow = turns[response < LEFT]
     return max(round(4 / float(slow[0])), 1) if slow.size else 1
 
@@ -248,9 +249,7 @@ def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tup
             if frequency > fastest:
                 return tuple(chosen)
             chosen.append(frequency)
-            response = np.abs(
-                frequency_response(mean.sections, np.array([2 * np.pi * frequency * interval]))
-            )
+            response = np.abs(mean.frequency_response(np.array([2 * np.pi * frequency * interval])))
             if response[0, 0] < LEFT:
                 return tuple(chosen)
     return tuple(chosen)

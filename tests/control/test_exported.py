@@ -11,9 +11,8 @@ import pytest
 from scipy.signal import StateSpace, dlsim
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.discrete import frequency_response, linear_part
 from bwbayes.control.exported import Exported, exported
-from bwbayes.control.sampled import sections_of
+from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
@@ -95,7 +94,7 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     if actuator.creep is not None and actuator.creep.growing:
         inputs.append(actuator.creep.drive(column, w, voltage)[0])
     drives = np.stack(inputs, axis=1)
-    system = linear_part(actuator, theta[0])
+    system = SampledModel.of(actuator, theta).linear
     assert isinstance(system, StateSpace)
     moved = simulated(system, drives - drives[0])[:, 0]
     expected = actuator.displacement(theta, voltage, from_rest=True)[0]
@@ -107,9 +106,9 @@ def test_the_frequency_response_is_that_of_the_system(name: str) -> None:
     actuator = cases.actuator(name, "zero")
     theta = cases.theta(actuator, 2, name)
     turns = np.linspace(0.01, 3.1, 50)
-    response = frequency_response(sections_of(actuator, actuator.columns(theta)), turns)
+    response = SampledModel.of(actuator, theta).frequency_response(turns)
     for row, values in zip(response, theta, strict=True):
-        system = linear_part(actuator, values)
+        system = SampledModel.of(actuator, values[np.newaxis]).linear
         z = np.exp(1j * turns)
         eye = np.eye(len(system.A))
         each = [system.C @ np.linalg.solve(one * eye - system.A, system.B) + system.D for one in z]
@@ -150,8 +149,3 @@ def test_an_exponent_says_in_what_units_beta_and_gamma_are() -> None:
 def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="give two voltages, the lower one first"):
         of("bouc-wen", "first", Span(*limits))
-
-
-def test_a_theta_of_another_length_is_refused() -> None:
-    with pytest.raises(InputError, match="give one value each of d, alpha"):
-        linear_part(Actuator("lag"), [1.0, 2.0])

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bwbayes.control.printed import ascii_of, c_functions
+from bwbayes.control.codegen import c_functions, to_ascii
 from bwbayes.errors import InputError
 from bwbayes.model.elementwise import anywhere, look_up, select
 from tests.control.compiled import STRICT
@@ -64,7 +64,7 @@ def unknown(x: Any) -> Any:
 
 
 def test_greek_and_signs_have_names() -> None:
-    assert "alpha - beta^2 >= phi_1(-z)" == ascii_of("α − β² ≥ φ_1(−z)")
+    assert "alpha - beta^2 >= phi_1(-z)" == to_ascii("α − β² ≥ φ_1(−z)")
 
 
 @pytest.mark.parametrize("function", [swaps, divides, unknown])

@@ -1,0 +1,259 @@
+"""C generated from Python functions of numbers, so that a controller's code is written once.
+
+An operator's step is made of assignments, ``if``, loops, arithmetic, functions of ``math.h``, and
+functions of the same kind. Python's own unparser writes its expressions; what C spells otherwise is
+replaced in the syntax tree first.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import FunctionType
+from typing import Any
+
+from bwbayes.errors import InputError
+
+__all__ = ["c_functions", "to_ascii", "to_c_number"]
+
+# NumPy's names of functions that math.h calls otherwise.
+MATH_NAMES = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
+
+# Arguments of these names are arrays; all others are numbers.
+ARRAYS = {
+    "parameters": "const double *parameters",
+    "memory": "const double *memory",
+    "after": "double *after",
+}
+
+
+def c_functions(function: Callable[..., Any], lengths: Mapping[str, int], prefix: str) -> str:
+    """Return a function and those that it calls as static functions of C, callees first.
+
+    Parameters
+    ----------
+    function
+        Of numbers, and of arrays called ``parameters``, ``memory`` and ``after``. C returns the
+        first number that it returns, and writes the others through pointers.
+    lengths
+        Lengths of the arrays, by name.
+    prefix
+        Beginning of the functions' names.
+
+    Raises
+    ------
+    InputError
+        An expression or statement that has no counterpart here.
+    """
+    assert inspect.isfunction(function)
+    printed: dict[FunctionType, str] = {}
+    _Printer(function, lengths, prefix, printed)
+    return "\n".join(printed.values())
+
+
+def to_ascii(text: str) -> str:
+    """Return a text with Greek letters by their names and exponents as plain digits."""
+    signs = {"−": "-", "′": "'", "≥": ">=", "≤": "<=", "``": "", "Σ": "sum of", "²": "^2"}
+    for sign, plain in {**signs, "ⁿ": "^n"}.items():
+        text = text.replace(sign, plain)
+    for letter in set(text):
+        if "GREEK" in unicodedata.name(letter, ""):
+            text = text.replace(letter, unicodedata.name(letter).rsplit(" ", 1)[1].lower())
+    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+
+
+def to_c_number(value: float) -> str:
+    """Return a number as C writes it, to the last bit."""
+    return repr(float(value)).replace("inf", "HUGE_VAL")
+
+
+class _Printer(ast.NodeTransformer):
+    """Prints one function into ``printed``, after those that it calls."""
+
+    def __init__(
+        self,
+        function: FunctionType,
+        lengths: Mapping[str, int],
+        prefix: str,
+        printed: dict[FunctionType, str],
+    ) -> None:
+        self.function, self.lengths, self.prefix, self.printed = function, lengths, prefix, printed
+        self.tables: dict[str, Sequence[float]] = {}
+        self.variables = set(function.__code__.co_varnames)
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+        assert isinstance(tree, ast.FunctionDef)
+        body = [f"    {line}" for line in self.block(tree.body)]
+        declared = list(self.declarations(tree))
+        lines = [self.head(tree), "{", *declared, *[""] * bool(declared), *body, "}", ""]
+        comment = (
+            to_ascii(inspect.getdoc(function) or "").replace("\n", "\n * ").replace(" * \n", " *\n")
+        )
+        deeper = "            "
+        wrapped = [textwrap.fill(line, 100, subsequent_indent=deeper) for line in lines]
+        printed[function] = "\n".join([f"/* {comment} */", *wrapped])
+
+    def head(self, tree: ast.FunctionDef) -> str:
+        """Return the function's name, arguments, and pointers for further results."""
+        returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
+        results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
+        names = [argument.arg for argument in tree.args.args]
+        arguments = [ARRAYS.get(name, f"double {name}") for name in names]
+        arguments += [f"double *result_{number}" for number in range(1, results)]
+        return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"
+
+    def declarations(self, tree: ast.FunctionDef) -> Iterator[str]:
+        """Yield the lines that declare tables, numbers and counters of loops."""
+        for name, row in self.tables.items():
+            numbers = ", ".join(map(to_c_number, row))
+            yield f"    static const double {name}[] = {{ {numbers} }};"
+        nodes = list(ast.walk(tree))
+        counters = [ast.unparse(node.target) for node in nodes if isinstance(node, ast.For)]
+        stored = [n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)]
+        known = {*counters, *(argument.arg for argument in tree.args.args)}
+        numbers_of = [name for name in dict.fromkeys(stored) if name not in known]
+        for kind, names in (("double", numbers_of), ("int", list(dict.fromkeys(counters)))):
+            if names:
+                yield f"    {kind} {', '.join(names)};"
+
+    def block(self, statements: Sequence[ast.stmt]) -> list[str]:
+        """Return the lines of statements."""
+        return [line for statement in statements for line in self.statement(statement)]
+
+    def braced(self, head: str, statements: Sequence[ast.stmt]) -> list[str]:
+        """Return the lines of a block in braces."""
+        return [f"{head} {{", *(f"    {line}" for line in self.block(statements)), "}"]
+
+    def statement(self, node: ast.stmt) -> Iterator[str]:
+        """Yield the lines of a statement."""
+        match node:
+            case ast.Expr(value=ast.Constant(value=str())):  # a docstring
+                pass
+            case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
+                texts = [self.text(target) for target in targets]
+                for number, value in enumerate(values):
+                    if {ast.unparse(inner) for inner in ast.walk(value)} & set(texts[:number]):
+                        raise self.refused(node)  # in C one comes after the other
+                    yield f"{texts[number]} = {self.text(value)};"
+            case ast.Assign(targets=[ast.Tuple(elts=[target, *others])], value=ast.Call() as call):
+                pointers = [f"&{self.text(other)}" for other in others]
+                yield f"{self.text(target)} = {self.call(call, pointers)};"
+            case ast.Assign(targets=[target], value=value):
+                yield f"{self.text(target)} = {self.text(value)};"
+            case ast.AugAssign(target=target, op=op, value=value):
+                yield f"{self.text(target)} = {self.text(ast.BinOp(target, op, value))};"
+            case ast.Return(value=ast.expr() as value):
+                first, *others = value.elts if isinstance(value, ast.Tuple) else [value]
+                yield from (f"*result_{n} = {self.text(x)};" for n, x in enumerate(others, 1))
+                yield f"return {self.text(first)};"
+            case ast.If(test=test, body=body, orelse=orelse):
+                lines = self.braced(f"if ({self.text(test)})", body)
+                yield from [*lines[:-1], *self.braced("} else", orelse)] if orelse else lines
+            case ast.While(test=test, body=body):
+                yield from self.braced(f"while ({self.text(test)})", body)
+            case ast.For(target=target, iter=ast.Call(func=ast.Name(id="range"), args=bounds)):
+                implied = [] if bounds[1:] else ["0"]
+                start, stop, step = (implied + self.whole(*bounds) + ["1"])[:3]
+                compared, change = (">", "--") if step == "-1" else ("<", "++")
+                name = ast.unparse(target)
+                head = f"for ({name} = {start}; {name} {compared} {stop}; {name}{change})"
+                yield from self.braced(head, node.body)
+            case _:
+                raise self.refused(node)
+
+    def text(self, node: ast.expr) -> str:
+        """Return an expression."""
+        return ast.unparse(self.visit(node))
+
+    def whole(self, *nodes: ast.expr) -> list[str]:
+        """Return expressions that are whole numbers."""
+        texts = [self.text(node).removesuffix(".0") for node in nodes]
+        return [text if re.fullmatch(r"-?\w+", text) else f"(int)({text})" for text in texts]
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        """Return a number."""
+        if not isinstance(node.value, int | float):
+            raise self.refused(node)
+        return ast.Name(to_c_number(node.value))
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Return a variable, or the value of a module's constant."""
+        if node.id in self.variables:
+            return node
+        return ast.Name(to_c_number(self.function.__globals__[node.id]))
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        """Return an element of an array, or of a module's table."""
+        name = ast.unparse(node.value)
+        if name not in self.variables:
+            self.tables[name] = self.function.__globals__[name]
+        return ast.Name(f"{name}[{self.whole(node.slice)[0]}]")
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
+        """Return a number with its sign, or a condition that is denied."""
+        operand = self.visit(node.operand)
+        if isinstance(node.op, ast.Not):
+            return ast.Name(f"!({ast.unparse(operand)})")
+        return ast.UnaryOp(node.op, operand)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        """Return an operation; a power is a function of C."""
+        if isinstance(node.op, ast.Pow):
+            return ast.Name(f"pow({self.text(node.left)}, {self.text(node.right)})")
+        allowed = ast.Add | ast.Sub | ast.Mult | ast.Div | ast.BitAnd | ast.BitOr
+        if not isinstance(node.op, allowed):
+            raise self.refused(node)
+        return ast.BinOp(self.visit(node.left), node.op, self.visit(node.right))
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
+        """Return conditions together."""
+        sign = " && " if isinstance(node.op, ast.And) else " || "
+        return ast.Name(f"({sign.join(f'({self.text(value)})' for value in node.values)})")
+
+    def visit_Compare(self, node: ast.Compare) -> ast.expr:
+        """Return a comparison of two numbers."""
+        if len(node.ops) > 1 or isinstance(node.ops[0], ast.Is | ast.IsNot | ast.In | ast.NotIn):
+            raise self.refused(node)
+        return ast.Compare(self.visit(node.left), node.ops, [self.visit(node.comparators[0])])
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        """Return a call, or the number that stands for a function of arrays."""
+        match node:
+            case ast.Call(func=ast.Name(id="anywhere"), args=[condition]):
+                return self.visit(condition)  # type: ignore[no-any-return]
+            case ast.Call(func=ast.Name(id="look_up"), args=[table, index]):
+                return ast.Name(f"{self.text(table)}[{self.whole(index)[0]}]")
+            case ast.Call(func=ast.Name(id="len"), args=[ast.Name(id=array)]):
+                return ast.Name(to_c_number(self.lengths[array]))
+            case ast.Call(func=ast.Name(id="select"), args=choice):
+                test, yes, no = map(self.text, choice)
+                return ast.Name(f"({test} ? {yes} : {no})")
+        return ast.Name(self.call(node, []))
+
+    def call(self, node: ast.Call, pointers: Sequence[str]) -> str:
+        """Return a call of a function of math.h, or of one that is printed before this one."""
+        arguments = ", ".join([*map(self.text, node.args), *pointers])
+        match node.func:
+            case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
+                return f"{MATH_NAMES.get(name, name)}({arguments})"
+            case ast.Name(id=name):
+                function = self.function.__globals__.get(name)
+                if inspect.isfunction(function):
+                    if function not in self.printed:
+                        _Printer(function, self.lengths, self.prefix, self.printed)
+                    return f"{self.prefix}{name}({arguments})"
+        raise self.refused(node)
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        """Refuse all other expressions."""
+        raise self.refused(node)
+
+    def refused(self, node: ast.AST) -> InputError:
+        """Return the error that names what cannot be printed."""
+        return InputError(
+            f"{self.function.__qualname__}: `{ast.unparse(node)}` has no counterpart in C here; "
+            "write it with arithmetic, if, for, while and NumPy's functions of a number"
+        )
