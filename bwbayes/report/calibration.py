@@ -8,7 +8,7 @@ from itertools import product
 from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
 from bwbayes.report.words import symbol, unit_text
 from bwbayes.results.bands import KINDS, LEVELS
-from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration, summary
+from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration
 from bwbayes.results.replicates import RANKED
 
 __all__ = ["calibration_report"]
@@ -37,7 +37,7 @@ def calibration_report(calibration: Calibration) -> Report:
             Section("Priors", [_priors(calibration)]),
             Section("Settings", [Facts(calibration.facts)]),
         ],
-        numbers=summary(calibration),
+        numbers=calibration.numbers,
     )
 
 
@@ -164,7 +164,8 @@ def _tests(calibration: Calibration) -> list[Text]:
         Text(
             f"{2 * count} tests, two for each of {count} statistics, with a false alarm in "
             f"{FAMILY_LEVEL:.0%} of sound calibrations: Neyman's smooth test with two terms, and "
-            "the simultaneous band around the ranks' distribution function."
+            "that of Kolmogorov and Smirnov, the simultaneous band around the ranks' distribution "
+            "function."
         ),
         Text(
             "The power of the smooth test of one statistic, with so many replicates: it finds "

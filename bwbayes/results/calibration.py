@@ -3,25 +3,25 @@
 Where a posterior is right, the truth's rank among its draws is even over replicates
 (:mod:`bwbayes.results.replicates`). Ranks that heap up at both ends tell of posteriors that are too
 narrow, in the middle of ones too wide, at one end of a bias. Two tests look at each statistic. The
-smooth test looks for just these shapes and is by far the more powerful; the simultaneous band
-around the ranks' distribution function sees any other. Both together raise a false alarm in one
-sound calibration of a hundred. Bands on held-out samples must cover what they promise within three
-standard errors. Single coverages are far from normal, so this is asked of 500 replicates or more,
-of which at most one sound calibration in forty fails it by chance (one in 28 would with 150, one in
-17 with 100). These rates are those of one look: who goes on until a calibration passes has others.
-What did not converge is counted, and ranked with the rest if it has draws at all.
+smooth test looks for just these shapes and is by far the more powerful; that of Kolmogorov and
+Smirnov sees any other. Both together raise a false alarm in one sound calibration of a hundred.
+Bands on held-out samples must cover what they promise within three standard errors. Single
+coverages are far from normal, so this is asked of 500 replicates or more, of which at most one
+sound calibration in forty fails it by chance (one in 28 would with 150, one in 17 with 100). These
+rates are those of one look: who goes on until a calibration passes has others. What did not
+converge is counted, and ranked with the rest if it has draws at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
 from scipy.special import ndtr
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
 from bwbayes.results.bands import LEVELS
@@ -31,38 +31,22 @@ from bwbayes.shown import brief
 __all__ = [
     "FAMILY_LEVEL",
     "JUDGED_FROM",
-    "LARGEST_UNCONVERGED",
     "LIMIT",
     "Calibration",
     "Coverage",
-    "EcdfBand",
     "Uniformity",
-    "ecdf_band",
     "holm",
     "judge",
     "smooth_power",
     "smooth_test",
-    "summary",
 ]
 
 # Probability of a false alarm from all tests of all statistics, half of it for either test.
 FAMILY_LEVEL = 0.01
 
-# Part of the replicates that may stay unconverged.
-LARGEST_UNCONVERGED = 0.01
-
 # Standard errors that a band's coverage may be off, once its mean over replicates is near normal.
 LIMIT = 3.0
 JUDGED_FROM = 500
-
-# Points at which the distribution functions of ranks are held against their band.
-POINTS = 49
-
-# Power below which nothing follows from a calibration that has passed.
-TELLING = 0.8
-
-# Ratios of a stated to a right posterior sd for which the power is stated.
-WIDTHS = {"20 % too small": 0.8, "10 % too small": 0.9}
 
 
 @dataclass(frozen=True)
@@ -70,8 +54,8 @@ class Uniformity:
     """How even the ranks of one statistic are.
 
     ``p`` is the smooth test's, ``adjusted`` the same by Holm for all statistics; ``outside`` says
-    that the distribution function leaves its simultaneous band; ``covered`` is the part of the
-    central intervals that hold the truth, by level in percent.
+    that the distribution function leaves its band; ``covered`` is the part of the central intervals
+    that hold the truth, by level in percent.
     """
 
     p: float
@@ -89,30 +73,6 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class EcdfBand:
-    """The simultaneous band around the distribution function of even ranks.
-
-    ``points`` (POINTS,) in (0, 1); ``lower`` and ``upper`` (POINTS,) the smallest and largest part
-    of the replicates below each.
-    """
-
-    points: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-
-    def ecdf(self, positions: FloatArray) -> FloatArray:
-        """Part of the positions (replicates, statistics) up to each point, (POINTS, statistics)."""
-        below: FloatArray = np.mean(positions <= self.points[:, np.newaxis, np.newaxis], axis=1)
-        return below
-
-    def left(self, positions: FloatArray) -> BoolArray:
-        """Tell which statistics (statistics,) leave the band anywhere."""
-        observed = self.ecdf(positions).T
-        outside: BoolArray = ((observed < self.lower) | (observed > self.upper)).any(axis=1)
-        return outside
-
-
-@dataclass(frozen=True)
 class Calibration:
     """What many replicates say.
 
@@ -124,8 +84,8 @@ class Calibration:
         (ranked replicates, statistics) in (0, 1): where each truth lies in its posterior.
     statistics
         Judgment by statistic.
-    ecdf
-        The band of the rank test.
+    ecdf_limit
+        How far a distribution function of even ranks may lie from the straight line.
     limits
         Binomial limits of the intervals' coverage, by level.
     bands
@@ -145,7 +105,7 @@ class Calibration:
     unconverged: tuple[int, ...]
     positions: FloatArray
     statistics: Mapping[str, Uniformity]
-    ecdf: EcdfBand
+    ecdf_limit: float
     limits: Mapping[int, tuple[float, float]]
     bands: Mapping[str, Coverage]
     power: Mapping[str, float]
@@ -163,12 +123,41 @@ class Calibration:
     @property
     def predicted(self) -> tuple[str, ...]:
         """What the bands are of: "" for the held-out windows together, and other records' names."""
-        return tuple(dict.fromkeys(_whose(name) for name in self.bands))
+        return tuple(dict.fromkeys(" ".join(name.split(" ")[:-2]) for name in self.bands))
 
     @property
     def telling(self) -> bool:
         """Whether there are enough replicates to have noticed sds a fifth too small."""
-        return max(self.power.values()) >= TELLING
+        return max(self.power.values()) >= 0.8
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``calibration.json`` holds."""
+        return dict(self.provenance) | {
+            "passed": self.passed,
+            "telling": self.telling,
+            "shortcomings": list(self.shortcomings),
+            "replicates": self.replicates,
+            "unconverged": list(self.unconverged),
+            "draws_ranked_among": RANKED,
+            "tests": 2 * len(self.statistics),
+            "family_level": FAMILY_LEVEL,
+            "power_of_one_smooth_test": dict(self.power),
+            "statistics": {
+                name: {
+                    "p": statistic.p,
+                    "p_adjusted": statistic.adjusted,
+                    "ecdf_leaves_band": statistic.outside,
+                    "covered": {str(level): share for level, share in statistic.covered.items()},
+                }
+                for name, statistic in self.statistics.items()
+            },
+            "binomial_limits": {str(level): list(pair) for level, pair in self.limits.items()},
+            "bands": {
+                name: {"covered": coverage.mean, "error": coverage.error}
+                for name, coverage in self.bands.items()
+            },
+        }
 
 
 def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibration:
@@ -190,37 +179,46 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
     if not ranked:
         why = entries[0]["stop_reason"] if entries else "there is none"
         raise InputError(f"none of the {len(entries)} replicates could be fitted: {why}")
-    names = tuple(ranked[0]["ranks"])
+    count, names = len(ranked), tuple(ranked[0]["ranks"])
     ranks = np.array([[entry["ranks"][name] for name in names] for entry in ranked])
     positions = (ranks + generator.uniform(size=ranks.shape)) / (RANKED + 1)
-    each = FAMILY_LEVEL / 2 / len(names)
-    ecdf = ecdf_band(len(ranked), each)
+    level = FAMILY_LEVEL / 2 / len(names)
     p = smooth_test(positions)
-    adjusted, outside = holm(p), ecdf.left(positions)
+    ecdf_limit = float(scipy.stats.kstwo.isf(level, count))
     statistics = {
         name: Uniformity(
             float(p[i]),
-            float(adjusted[i]),
-            bool(outside[i]),
+            float(adjusted),
+            bool(scipy.stats.kstest(column, "uniform").statistic > ecdf_limit),
             {level: float(np.mean(np.abs(column - 0.5) < level / 200)) for level in LEVELS},
         )
-        for i, (name, column) in enumerate(zip(names, positions.T, strict=True))
+        for i, (name, adjusted, column) in enumerate(zip(names, holm(p), positions.T, strict=True))
     }
     unconverged = tuple(entry["number"] for entry in entries if not entry["converged"])
-    bands = _bands(ranked)
+    bands = {}
+    for name in ranked[0]["covered"]:
+        covered = np.array([entry["covered"][name] for entry in ranked])
+        error = np.std(covered, ddof=1) / np.sqrt(count) if count > 1 else np.nan
+        bands[name] = Coverage(float(np.mean(covered)), float(error))
+    intervals = {level: scipy.stats.binom.interval(0.99, count, level / 100) for level in LEVELS}
     return Calibration(
         replicates=len(entries),
         unconverged=unconverged,
         positions=positions,
         statistics=statistics,
-        ecdf=ecdf,
-        limits={level: _binomial_limits(len(ranked), level) for level in LEVELS},
+        ecdf_limit=ecdf_limit,
+        limits={
+            lvl: (float(low / count), float(high / count)) for lvl, (low, high) in intervals.items()
+        },
         bands=bands,
-        power={text: smooth_power(len(ranked), each, width) for text, width in WIDTHS.items()},
+        power={
+            "20 % too small": smooth_power(count, level, 0.8),
+            "10 % too small": smooth_power(count, level, 0.9),
+        },
         shortcomings=(
-            *_unconverged_remark(len(unconverged), len(entries)),
-            *(remark for name, even in statistics.items() for remark in _remarks(name, even)),
-            *(_band_remarks(bands) if len(ranked) >= JUDGED_FROM else ()),
+            *_unconverged_shortcoming(len(unconverged), len(entries)),
+            *_rank_shortcomings(statistics),
+            *(_band_shortcomings(bands) if count >= JUDGED_FROM else ()),
         ),
     )
 
@@ -273,128 +271,31 @@ def holm(p: FloatArray) -> FloatArray:
     return adjusted
 
 
-def ecdf_band(count: int, level: float) -> EcdfBand:
-    """Return the band that ``count`` uniform values leave with probability ``level`` at most.
-
-    Every point has the same binomial tail probability γ, and the largest γ is taken that keeps the
-    level. The probability to stay inside is exact: a uniform sample is a Poisson process given its
-    total, whose counts go from point to point by convolution. (arviz finds the same band by
-    simulation, which at the small levels of a family of tests takes too many.)
-    """
-    points = np.arange(1, POINTS + 1) / (POINTS + 1)
-    # log γ between values that certainly leave the band and certainly keep inside.
-    high, low = 0.0, np.log(level) - np.log(2 * POINTS)
-    for _ in range(40):
-        center = (low + high) / 2
-        inside = _stays_inside(count, *_pointwise(count, points, np.exp(center)))
-        low, high = (center, high) if inside >= 1 - level else (low, center)
-    lower, upper = _pointwise(count, points, np.exp(low))
-    return EcdfBand(points, lower / count, upper / count)
-
-
-def _pointwise(count: int, points: FloatArray, tail: float) -> tuple[FloatArray, FloatArray]:
-    """Return counts (POINTS,) beyond which lies at most half the tail's probability either side."""
-    either = (
-        scipy.stats.binom.ppf(tail / 2, count, points),
-        scipy.stats.binom.isf(tail / 2, count, points),
-    )
-    return np.asarray(either[0]), np.asarray(either[1])
-
-
-def _stays_inside(count: int, lower: FloatArray, upper: FloatArray) -> float:
-    """Probability that the counts of a uniform sample stay between both, at every point."""
-    counts = np.arange(count + 1)
-    step = scipy.stats.poisson.pmf(counts, count / (POINTS + 1))
-    probability = np.zeros(count + 1)
-    probability[0] = 1.0
-    for low, high in zip(lower, upper, strict=True):
-        probability = np.convolve(probability, step)[: count + 1]
-        probability[(counts < low) | (counts > high)] = 0.0
-    whole = np.convolve(probability, step)[count]
-    return float(whole / scipy.stats.poisson.pmf(count, count))
-
-
 def _legendre(u: FloatArray) -> FloatArray:
     """First two Legendre polynomials, orthonormal on (0, 1), stacked in front."""
     return np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u * (u - 1) + 1)])
 
 
-def _binomial_limits(count: int, level: int) -> tuple[float, float]:
-    low, high = scipy.stats.binom.interval(0.99, count, level / 100)
-    return float(low / count), float(high / count)
+def _unconverged_shortcoming(unconverged: int, replicates: int) -> Iterator[str]:
+    if unconverged > 0.01 * replicates:
+        yield f"{unconverged} of {replicates} replicates did not converge, more than 1%"
 
 
-def _bands(entries: Sequence[Entry]) -> dict[str, Coverage]:
-    """Mean coverage and its standard error, by the bands' names."""
-    coverages = {}
-    for name in entries[0]["covered"]:
-        covered = np.array([entry["covered"][name] for entry in entries])
-        error = np.std(covered, ddof=1) / np.sqrt(covered.size) if covered.size > 1 else np.nan
-        coverages[name] = Coverage(float(np.mean(covered)), float(error))
-    return coverages
+def _rank_shortcomings(statistics: Mapping[str, Uniformity]) -> Iterator[str]:
+    for name, statistic in statistics.items():
+        if statistic.adjusted < FAMILY_LEVEL / 2:
+            yield f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})"
+        if statistic.outside:
+            yield f"{name}: the distribution of ranks leaves its band"
 
 
-def _whose(band: str) -> str:
-    """Return the name of the other record in a band's name, "" if it is of held-out windows."""
-    return " ".join(band.split(" ")[:-2])
-
-
-def _unconverged_remark(unconverged: int, replicates: int) -> list[str]:
-    if unconverged <= LARGEST_UNCONVERGED * replicates:
-        return []
-    return [
-        f"{unconverged} of {replicates} replicates did not converge, more than "
-        f"{LARGEST_UNCONVERGED:.0%}"
-    ]
-
-
-def _remarks(name: str, statistic: Uniformity) -> list[str]:
-    """Say what is wrong with a statistic's ranks."""
-    remarks = []
-    if statistic.adjusted < FAMILY_LEVEL / 2:
-        remarks.append(f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})")
-    if statistic.outside:
-        remarks.append(f"{name}: the distribution of ranks leaves its band")
-    return remarks
-
-
-def _band_remarks(bands: Mapping[str, Coverage]) -> list[str]:
-    """Say which bands do not keep their promise; written so that nan fails."""
-    remarks = []
+def _band_shortcomings(bands: Mapping[str, Coverage]) -> Iterator[str]:
     for name, coverage in bands.items():
-        other, (kind, level) = _whose(name), name.split()[-2:]
+        *record, kind, level = name.split(" ")
+        # Written so that nan fails.
         if not abs(coverage.mean - int(level) / 100) <= LIMIT * coverage.error:
-            remarks.append(
-                f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} of "
-                + (f"the record {other}" if other else "held-out samples")
+            samples = f"the record {' '.join(record)}" if record else "held-out samples"
+            yield (
+                f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} "
+                f"of {samples}"
             )
-    return remarks
-
-
-def summary(calibration: Calibration) -> dict[str, object]:
-    """Return the numbers as ``calibration.json`` holds them."""
-    return dict(calibration.provenance) | {
-        "passed": calibration.passed,
-        "telling": calibration.telling,
-        "shortcomings": list(calibration.shortcomings),
-        "replicates": calibration.replicates,
-        "unconverged": list(calibration.unconverged),
-        "draws_ranked_among": RANKED,
-        "tests": 2 * len(calibration.statistics),
-        "family_level": FAMILY_LEVEL,
-        "power_of_one_smooth_test": dict(calibration.power),
-        "statistics": {
-            name: {
-                "p": statistic.p,
-                "p_adjusted": statistic.adjusted,
-                "ecdf_leaves_band": statistic.outside,
-                "covered": {str(level): covered for level, covered in statistic.covered.items()},
-            }
-            for name, statistic in calibration.statistics.items()
-        },
-        "binomial_limits": {str(level): list(pair) for level, pair in calibration.limits.items()},
-        "bands": {
-            name: {"covered": coverage.mean, "error": coverage.error}
-            for name, coverage in calibration.bands.items()
-        },
-    }

@@ -9,7 +9,6 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.arrays import FloatArray
 from bwbayes.report.figures.style import COLORS, axis_label, hide_unused, share_legend
 from bwbayes.results.bands import KINDS, LEVELS
 from bwbayes.results.calibration import LIMIT, Calibration
@@ -52,19 +51,18 @@ def draw_histograms(calibration: Calibration) -> Figure:
 def draw_ecdf(calibration: Calibration) -> Figure:
     """Draw each distribution function of ranks less that of even ones, and its band."""
     labels = _labels(calibration)
-    band = calibration.ecdf
-    ecdf = band.ecdf(calibration.positions)
+    count, limit = calibration.positions.shape[0], 100 * calibration.ecdf_limit
     figure, panels = _grid(labels, "rank among the draws (%)", "ECDF less\neven ECDF (%)")
-    at = _closed(band.points, 0, 1)
-    lower, upper = (100 * _closed(edge - band.points, 0, 0) for edge in (band.lower, band.upper))
-    for i, (panel, ranks) in enumerate(zip(panels, calibration.statistics.values(), strict=True)):
-        panel.fill_between(
-            100 * at, lower, upper, color=EVEN_COLOR, lw=0, label="simultaneous band"
-        )
+    steps = np.arange(count + 1) / count
+    columns = np.sort(calibration.positions, axis=0).T
+    for panel, ranks, column in zip(panels, calibration.statistics.values(), columns, strict=True):
+        panel.axhspan(-limit, limit, color=EVEN_COLOR, lw=0, label="simultaneous band")
         panel.axhline(0.0, color=NOMINAL_COLOR, lw=0.8)
+        # The distribution function before and after each rank.
+        at = np.concatenate([[0.0], np.repeat(column, 2), [1.0]])
         panel.plot(
             100 * at,
-            100 * _closed(ecdf[:, i] - band.points, 0, 0),
+            100 * (np.repeat(steps, 2) - at),
             color=COLORS[1] if ranks.outside else COLORS[0],
             label="leaves the band" if ranks.outside else "replicates",
         )
@@ -151,7 +149,3 @@ def _grid(labels: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list
         if i % COLUMNS == 0:
             panel.set_ylabel(ylabel)
     return figure, panels
-
-
-def _closed(values: FloatArray, first: float, last: float) -> FloatArray:
-    return np.concatenate([[first], values, [last]])
