@@ -26,7 +26,7 @@ from bwbayes.errors import InputError, one_line
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS
-from bwbayes.results.passages import crossings, passed
+from bwbayes.results.loops import at_level, crossings
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.chain import draws
@@ -46,8 +46,8 @@ __all__ = [
     "replicates",
 ]
 
-# Draws that a truth is ranked among, and those in the bands: fewer than a run's, to save time.
-RANKED, MIXED = 199, 400
+# Draws that a truth is ranked among.
+RANKED = 199
 
 # What is ranked besides the free parameters.
 EXTRA = ("log_likelihood", "opening", "range")
@@ -106,7 +106,7 @@ class Experiment:
     belongs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not any(crossings(path).both for path in self._paths.values()):
+        if self.looped is None:
             raise InputError(
                 "record: its training voltage does not go back and forth, so there is no loop to "
                 "calibrate; take another signal"
@@ -134,20 +134,19 @@ class Experiment:
         return (*fitted_names, *(f"{other} {name}" for other in self.others for name in names))
 
     @cached_property
-    def _paths(self) -> dict[str, FloatArray]:
-        """The voltage of each record up to its last training sample."""
-        datasets = self.posterior.datasets
-        return {data.name: data.voltage[: data.training[-1].stop] for data in datasets}
-
-    @cached_property
-    def looped(self) -> str:
-        """The record whose loop is measured: the first that goes back and forth."""
-        return next(name for name, path in self._paths.items() if crossings(path).both)
+    def looped(self) -> tuple[str, FloatArray] | None:
+        """The first record that goes back and forth, and its voltage up to the last reading."""
+        for data in self.posterior.datasets:
+            path = data.voltage[: data.training[-1].stop]
+            if all(passage.size for passage in crossings(path)[1:]):
+                return data.name, path
+        return None
 
     @property
     def level(self) -> float:
         """Voltage at which loops are measured, V."""
-        return crossings(self._paths[self.looped]).level
+        assert self.looped is not None
+        return crossings(self.looped[1])[0]
 
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
         """Log likelihood and the two loop measures of models θ, (models, 3).
@@ -157,10 +156,11 @@ class Experiment:
         between samples, each the mean over all passages; the range (um) is its largest less its
         smallest displacement. Of several records, in the first that goes back and forth.
         """
-        displacement = posterior.simulate(theta, record=self.looped)
-        path = self._paths[self.looped]
-        level, up, down = crossings(path)
-        falling, rising = (passed(displacement, path, at, level) for at in (down, up))
+        assert self.looped is not None
+        name, path = self.looped
+        displacement = posterior.simulate(theta, record=name)
+        level, *passages = crossings(path)
+        rising, falling = (at_level(displacement, path, rows, level) for rows in passages)
         extent = np.ptp(displacement, axis=1)
         return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
 
@@ -226,8 +226,8 @@ def replicates(
 ) -> Iterator[Replicate]:
     """Make the replicates of those numbers, and yield each as soon as it is done.
 
-    Only so many ``together`` are under way: whoever stops waits for those alone. The executor may
-    be any of ``concurrent.futures``; its kind and size do not change a bit of any replicate.
+    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of any
+    replicate.
     """
     return as_done(executor, together, replicate, ((experiment, seed, n) for n in numbers))
 
@@ -245,13 +245,11 @@ def as_done[T](
     waiting = iter(arguments)
     running: set[Future[T]] = set()
     while True:
-        for each in islice(waiting, together - len(running)):
-            running.add(executor.submit(call, *each))
+        running |= {executor.submit(call, *a) for a in islice(waiting, together - len(running))}
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            yield future.result()
+        yield from (future.result() for future in done)
 
 
 def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
@@ -265,27 +263,32 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     generator = np.random.default_rng([seed, number])
     simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
     theta, simulated = _simulated(experiment, simulating)
-    readings = {name: record.reading for name, record in simulated.items()}
+    readings = {
+        name: record.displacement
+        for name, (record, _) in simulated.items()
+        if record.displacement is not None
+    }
     posterior = experiment.posterior.with_readings(readings)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
-    truth = _statistics(experiment, posterior, true)[0]
-    names = experiment.statistics
-    nothing = np.empty((0, len(names)))
+    names, truth = experiment.statistics, _statistics(experiment, posterior, true)[0]
+    covered_parts: dict[str, float] = {}
+    unranked = names, truth, np.empty((0, len(names))), covered_parts
     # InputError, and what linear algebra raises: one record must not end the whole calibration.
     try:
         outcome, chained = _sampled(posterior, experiment.plan, fitting, sampling)
     except ValueError as error:
-        return Replicate(number, False, one_line(str(error)), 0, 0, names, truth, nothing, {})
+        return Replicate(number, False, one_line(str(error)), 0, 0, *unranked)
     time = float(np.max(outcome.check.autocorrelation))
     spacing, free = _independent(chained, time, choosing)
-    ended = outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
+    ended = number, outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
     if len(free) < RANKED:
-        return Replicate(number, *ended, names, truth, nothing, {})
-    flat = thinned(chained.reshape(-1, free.shape[1]), predicting, MIXED)
-    inside = _held_out(experiment, posterior, flat, simulated, predicting)
+        return Replicate(*ended, *unranked)
+    # Fewer draws than a run's, to save time.
+    flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
     drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
-    inside |= _others(experiment, posterior, flat, theta, simulated, others)
-    return Replicate(number, *ended, names, truth, drawn, inside)
+    inside = _held_out(experiment, posterior, flat, simulated, predicting)
+    inside |= _others(experiment, posterior, flat, theta, readings, others)
+    return Replicate(*ended, names, truth, drawn, inside)
 
 
 def _simulated(
@@ -299,20 +302,17 @@ def _simulated(
     for fitted, dataset, likelihood in zip(
         experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
     ):
-        mine = source.table.of(theta, dataset.name)
-        sd = likelihood.start_sd(mine)
+        record_theta = source.table.of(theta, dataset.name)
+        sd = likelihood.start_sd(record_theta)
         model = likelihood.actuator.advance(
-            dataset.table.actuator(mine),
+            dataset.table.actuator(record_theta),
             dataset.voltage,
             unrest=sd * generator.standard_normal(sd.shape),
             from_rest=dataset.from_rest,
         )[0][0]
-        discrepancy, sensor = dataset.noise.draw(dataset.table.noise(mine), model.size, generator)
-        truth = model + discrepancy
-        reading = truth + sensor
-        reading[np.isnan(fitted.displacement)] = np.nan
-        record = Record(dataset.voltage, reading, dataset.actuator.interval, truth=truth)
-        made[dataset.name] = Simulated(record, model)
+        record = Record(dataset.voltage, fitted.displacement, dataset.actuator.interval)
+        noise = dataset.table.noise(record_theta)
+        made[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
     return column, made
 
 
@@ -347,35 +347,33 @@ def _independent(
     """
     steps, ensembles, walkers, free = chained.shape
     # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    apart = math.ceil(time) if math.isfinite(time) else 1
-    spacing = max(min(apart, steps * ensembles * walkers // RANKED), 1)
-    spaced = chained[::-spacing].reshape(-1, free)
-    return spacing, thinned(spaced, generator, RANKED)
+    longest = steps * ensembles * walkers // RANKED
+    spacing = max(min(math.ceil(time) if math.isfinite(time) else 1, longest), 1)
+    return spacing, thinned(chained[::-spacing].reshape(-1, free), generator, RANKED)
 
 
 def _held_out(
     experiment: Experiment,
     posterior: Posterior,
     draws: FloatArray,
-    made: Mapping[str, Simulated],
+    simulated: Mapping[str, Simulated],
     generator: np.random.Generator,
 ) -> dict[str, float]:
     """Part of the held-out samples, of all windows together, inside each band."""
-    parts = []
-    for name, alone, its in posterior.each(draws):
-        first = posterior.table.records[0]
+    predictions, first = [], posterior.table.records[0]
+    for name, single, record_draws in posterior.each(draws):
         windows = {
-            window: part
-            for window, part in experiment.held_out.items()
+            window: samples
+            for window, samples in experiment.held_out.items()
             if experiment.belongs.get(window, first) == name
         }
         if windows:
-            bands = predict_windows(alone, its, made[name].record, windows, generator)
-            parts += [
-                (predicted, made[name], part)
-                for predicted, part in zip(bands, windows.values(), strict=True)
-            ]
-    return {f"{kind} {level}": part for kind, level, part in covered(parts)} if parts else {}
+            record = simulated[name]
+            bands = predict_windows(single, record_draws, record.record, windows, generator)
+            predictions += [(b, record, w) for b, w in zip(bands, windows.values(), strict=True)]
+    if not predictions:
+        return {}
+    return {f"{kind} {level}": share for kind, level, share in covered(predictions)}
 
 
 def _others(
@@ -383,18 +381,18 @@ def _others(
     posterior: Posterior,
     draws: FloatArray,
     theta: Mapping[str, FloatArray],
-    records: Mapping[str, Simulated],
+    readings: Mapping[str, FloatArray],
     generator: np.random.Generator,
 ) -> dict[str, float]:
     """Make the other records with the same truth; part of their samples inside each band."""
-    source = experiment.truth.with_readings({name: r.reading for name, r in records.items()})
+    source = experiment.truth.with_readings(readings)
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     inside = {}
     for name, other in experiment.others.items():
         like = other.like or posterior.table.records[0]
         simulated = other.simulated(source.alone(like), source.table.of(true, like), generator)
-        alone, its = posterior.alone(like), posterior.its(draws, like)
-        bands, part = other.predicted(alone, its, simulated.record, generator)
-        for kind, level, covering in covered([(bands, simulated, part)]):
-            inside[f"{name} {kind} {level}"] = covering
+        single, record_draws = posterior.alone(like), posterior.its(draws, like)
+        bands, window = other.predicted(single, record_draws, simulated.record, generator)
+        for kind, level, share in covered([(bands, simulated, window)]):
+            inside[f"{name} {kind} {level}"] = share
     return inside

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from itertools import product
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record, Window
+from bwbayes.inference.noise import Noise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.results.prediction import predict_record
@@ -29,11 +31,32 @@ class Simulated(NamedTuple):
     record: Record
     model: FloatArray
 
-    @property
-    def reading(self) -> FloatArray:
-        """What its sensor says, (samples,), um."""
-        assert self.record.displacement is not None
-        return self.record.displacement
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        model: FloatArray,
+        noise: Noise,
+        parameters: FloatArray,
+        generator: np.random.Generator,
+    ) -> Self:
+        """Add the noise of ``parameters`` (1, parameters); missing readings stay missing."""
+        discrepancy, sensor = noise.draw(parameters, model.size, generator)
+        truth = model + discrepancy
+        reading = truth + sensor
+        if record.displacement is not None:
+            reading[np.isnan(record.displacement)] = np.nan
+        return cls(replace(record, displacement=reading, truth=truth), model)
+
+    def target(self, kind: Kind) -> FloatArray:
+        """Return what a kind of band is for, (samples,), um: model, truth or reading."""
+        values = {
+            "parameter": self.model,
+            "displacement": self.record.truth,
+            "sensor": self.record.displacement,
+        }[kind]
+        assert values is not None
+        return values
 
 
 @dataclass(frozen=True)
@@ -72,13 +95,14 @@ class OtherRecord:
         model = start_states.advance(planned.voltage)[0][0]
         if self.start.own_offset and self.record.displacement is not None:
             model = model + posterior.only.extent * generator.standard_normal()
-        noise = posterior.only.noise.at(planned.interval)
-        discrepancy, sensor = noise.draw(posterior.only.table.noise(theta), model.size, generator)
-        truth = model + discrepancy
-        reading = truth + sensor
-        if self.record.displacement is not None:
-            reading[np.isnan(self.record.displacement)] = np.nan
-        return Simulated(replace(planned, displacement=reading, truth=truth), model)
+        noise, parameters = posterior.only.noise, posterior.only.table.noise(theta)
+        return Simulated.of(
+            replace(self.record, truth=None),
+            model,
+            noise.at(planned.interval),
+            parameters,
+            generator,
+        )
 
     def predicted(
         self,
@@ -98,37 +122,17 @@ class OtherRecord:
 
 
 def covered(
-    every: Sequence[tuple[Bands, Simulated, slice]],
+    predictions: Sequence[tuple[Bands, Simulated, slice]],
 ) -> Iterator[tuple[Kind, int, float]]:
     """Yield the part of simulated records' samples that lie inside each kind and level of band.
 
-    The last samples of the bands are those of the slice of the record that they come with. The
-    parameter band is for the model's displacement, the displacement band for the simulated truth,
-    which has the discrepancy, and the sensor band for the readings, where there are any.
+    The last samples of the bands are those of the slice of the record that they come with. Samples
+    without a reading do not count for the sensor band.
     """
-    for kind in KINDS:
-        for level in LEVELS:
-            inside = [
-                _inside(bands, (kind, level), _target(kind, simulated)[window])
-                for bands, simulated, window in every
-            ]
-            yield kind, level, float(np.mean(np.concatenate(inside)))
-
-
-def _target(kind: Kind, made: Simulated) -> FloatArray:
-    """Return what a kind of band is for, (samples,), um."""
-    assert made.record.truth is not None
-    targets: dict[Kind, FloatArray] = {
-        "parameter": made.model,
-        "displacement": made.record.truth,
-        "sensor": made.reading,
-    }
-    return targets[kind]
-
-
-def _inside(bands: Bands, band: tuple[Kind, int], values: FloatArray) -> FloatArray:
-    """Tell which of the values (samples,) that there are lie inside the end of a band."""
-    finite = np.isfinite(values)
-    low, high = (edges[band][-values.size :] for edges in (bands.lower, bands.upper))
-    inside: FloatArray = ((low <= values) & (values <= high))[finite].astype(np.float64)
-    return inside
+    for kind, level in product(KINDS, LEVELS):
+        inside = []
+        for bands, simulated, window in predictions:
+            values = simulated.target(kind)[window]
+            low, high = (edge[kind, level][-values.size :] for edge in (bands.lower, bands.upper))
+            inside.append(((low <= values) & (values <= high))[np.isfinite(values)])
+        yield kind, level, float(np.mean(np.concatenate(inside)))

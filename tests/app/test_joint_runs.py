@@ -239,7 +239,8 @@ def test_parameters_of_a_record_are_shown_by_their_whole_name() -> None:
 def test_replicates_make_all_records_anew() -> None:
     """Each with its own readings; the loop is measured in the record that has one."""
     common = experiment(problem(("ess = 150", "ess = 100")))
-    assert common.looped == "loops"
+    assert common.looped is not None
+    assert common.looped[0] == "loops"
     assert {"later": "loops"} == common.belongs
     made = replicate(common, 1, 0)
     assert made.converged

@@ -64,24 +64,15 @@ def test_entry_is_plain_and_complete() -> None:
         assert sum(draw < true for draw in draws) == entry["ranks"][name]
 
 
-@pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError])
-def test_replicate_that_cannot_be_fitted_is_kept(
-    monkeypatch: pytest.MonkeyPatch, kind: type[Exception]
-) -> None:
+def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
-        raise kind("priors: no draw has a finite posterior density")
+        raise np.linalg.LinAlgError("priors: no draw has a finite posterior density")
 
     monkeypatch.setattr("bwbayes.inference.pointfit.fit", refuse)
     entry = replicate(small(), 1, 0).entry()
     assert (False, {}, {}) == (entry["converged"], entry["ranks"], entry["covered"])
     assert "finite posterior density" in entry["stop_reason"]
     assert 6 == len(entry["truth"])
-
-
-def test_replicate_out_of_budget_is_ranked_and_not_converged() -> None:
-    entry = replicate(small(plan=replace(PLAN, most_steps=10)), 1, 0).entry()
-    assert (False, 10) == (entry["converged"], entry["steps"])
-    assert 6 == len(entry["ranks"])
 
 
 def test_each_band_is_held_against_what_it_is_for() -> None:
@@ -138,13 +129,6 @@ def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
     assert np.isin(chosen, chain[::-20]).all()
 
 
-@pytest.mark.parametrize("time", [np.nan, 1e9])
-def test_short_or_stuck_chain_still_gives_enough_draws(time: float) -> None:
-    chain = np.random.default_rng(1).standard_normal((10, 4, 12, 2))
-    _, chosen = module._independent(chain, time, np.random.default_rng(2))
-    assert (RANKED, 2) == chosen.shape
-
-
 # Simulated records
 
 
@@ -186,40 +170,6 @@ def test_another_record_starts_anywhere() -> None:
     assert np.std(late) == pytest.approx(offset_sd, rel=0.12)
     unrest_sd = theta[0, 0] * np.ptp(posterior.only.voltage) / 2
     assert np.std(first - late) == pytest.approx(unrest_sd, rel=0.12)
-
-
-def test_another_record_from_rest_with_the_same_offset_is_simulated_so() -> None:
-    posterior, theta = moving_posterior()
-    rested = Start(from_rest=True, own_offset=False)
-    other = another(start=rested)
-    made = other.simulated(posterior, theta, np.random.default_rng(1))
-    actuator = replace(posterior.only.actuator, interval=0.005)
-    model = theta[:, : len(actuator.parameters)]
-    expected = actuator.displacement(model, other.record.voltage, from_rest=True)[0]
-    np.testing.assert_allclose(expected, made.model)
-
-
-def test_another_record_is_judged_after_its_lead_in() -> None:
-    posterior, theta = moving_posterior()
-    generator = np.random.default_rng(1)
-    made = another().simulated(posterior, theta, generator).record
-    free = posterior.prior.constrain(posterior.prior.draw(generator, 20))[0]
-    for window, judged in ((None, slice(20, 200)), ((0.5, 0.9), slice(100, 180))):
-        other = another(window=window)
-        assert judged == other.predicted(posterior, free, made, generator)[1]
-
-
-def test_a_planned_voltage_is_predicted_without_its_readings() -> None:
-    """So no lead-in is taken from them, and all samples are judged."""
-    posterior, theta = moving_posterior()
-    other = another(record=replace(another().record, displacement=None))
-    generator = np.random.default_rng(1)
-    made = other.simulated(posterior, theta, generator)
-    draws = posterior.prior.draw(generator, 20)
-    free = posterior.prior.constrain(draws)[0]
-    bands, judged = other.predicted(posterior, free, made.record, generator)
-    assert bands.measured is None
-    assert slice(0, 200) == judged
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:
