@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from bwbayes.data.waveforms import signal
     from bwbayes.diagnosis.record_checks import inspect
     from bwbayes.errors import InputError, InputWarning, NotConvergedError
-    from bwbayes.model.boucwen import hysteresis
+    from bwbayes.model.operators.bouc_wen import hysteresis
     from bwbayes.results.bands import Bands
 else:
     HOMES = {
@@ -71,7 +71,7 @@ else:
         "data.waveforms": ("signal",),
         "diagnosis.record_checks": ("inspect",),
         "errors": ("InputError", "InputWarning", "NotConvergedError"),
-        "model.boucwen": ("hysteresis",),
+        "model.operators.bouc_wen": ("hysteresis",),
         "results.bands": ("Bands",),
     }
 

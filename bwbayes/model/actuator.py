@@ -182,6 +182,8 @@ class Actuator:
         path = np.asarray(voltage, dtype=np.float64)
         if path.ndim != 1 or path.size == 0:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
+        if not np.isfinite(path).all():
+            raise InputError("voltage: must be finite; check the record")
         column = self.columns(models)
         self.check(column)
         sections = self.sections(column)

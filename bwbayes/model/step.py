@@ -15,11 +15,12 @@ of what :mod:`bwbayes.model.elementwise` says.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
+from bwbayes.model.drive import PIECE, monotone_stretches
 
 if TYPE_CHECKING:
     from bwbayes.model.operator import Span
@@ -39,11 +40,8 @@ class HysteresisStep(ABC):
     """A hysteresis operator w = Γ[u] that goes from one voltage (models,) straight to the next.
 
     Voltages are in V, displacements in um, slopes in um/V, all (models,). What it remembers is an
-    array (models, any). One that is not ``lean`` takes longer than NumPy does along a stretch: the
-    likelihood does without it.
+    array (models, any).
     """
-
-    lean: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -84,10 +82,6 @@ class HysteresisStep(ABC):
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return what the equation of the first model has: numbers by name, and their units."""
 
-    def holds(self, memory: FloatArray) -> BoolArray:
-        """Tell which models (models,) the step is for, where they stand; by default all."""
-        return np.ones(len(memory), dtype=np.bool_)
-
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return what is once the voltage has gone there; the memory that is given stays."""
         after = np.empty_like(memory)
@@ -95,17 +89,48 @@ class HysteresisStep(ABC):
 
 
 class OneStateStep(HysteresisStep):
-    """A step that remembers the voltage and one displacement h, (models, 2)."""
+    """A step that remembers the voltage, one displacement h, and maybe more that follows from both.
+
+    Its memory is (models, ``remembers``), zeros where it follows.
+    """
+
+    @property
+    def remembers(self) -> int:
+        """How many numbers: voltage and h."""
+        return 2
 
     def demagnetized(self) -> FloatArray:
         """Return zero volts and h = 0."""
-        return np.zeros((len(self.parameters), 2))
+        return np.zeros((len(self.parameters), self.remembers))
 
     def remembered(self, memory: Any) -> FloatArray:
         """Return voltage and h."""
-        pairs = np.empty((memory.state.size, 2))
-        pairs[:, 0], pairs[:, 1] = memory.voltage, memory.state
-        return pairs
+        return self._at(memory.voltage, memory.state)
+
+    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
+        """Return voltage and h."""
+        return self._at(voltage, initial)
+
+    def _at(self, voltage: float | FloatArray, state: FloatArray) -> FloatArray:
+        memory = self.demagnetized()
+        memory[:, 0], memory[:, 1] = voltage, state
+        return memory
+
+    def trace(self, voltage: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return w (models, samples) along a path (samples,), V, and h (models,) at its end.
+
+        ``state`` (models,), um, is h at its first sample.
+        """
+        w = np.empty((state.size, voltage.size))
+        w[:, 0] = self.go(self._at(voltage[0], state), np.full(state.size, voltage[0])).w
+        if np.ptp(voltage) == 0:
+            w[:] = w[:, :1]
+            return w, state
+        for first, last, _ in monotone_stretches(voltage, max(PIECE // max(state.size, 1), 1)):
+            ahead = slice(first + 1, last + 1)
+            w[:, ahead], states = self.along(voltage[first], state, voltage[ahead])
+            state = states[:, -1].copy()
+        return w, state
 
     def along(
         self, start: float, state: FloatArray, voltage: FloatArray
@@ -114,11 +139,12 @@ class OneStateStep(HysteresisStep):
 
         From a voltage ``start``, where h is ``state`` (models,); each goes there straight.
         """
-        memory = np.stack([np.full_like(state, start), state])[:, :, np.newaxis]
-        after = np.empty((2, state.size, voltage.size))
-        w, _ = self.move(self.parameters.T[:, :, np.newaxis], memory, voltage[np.newaxis], after)
-        return w, after[1]
+        return self.gone_along(self._at(start, state).T, voltage)
 
-    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
-        """Return voltage and h."""
-        return np.stack([voltage, initial], axis=1)
+    def gone_along(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return w and h from a memory (any, models) straight to each of the voltages."""
+        after = np.empty((*memory.shape, voltage.size))
+        w, _ = self.move(
+            self.parameters.T[:, :, np.newaxis], memory[:, :, np.newaxis], voltage, after
+        )
+        return w, after[1]

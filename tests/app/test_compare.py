@@ -20,7 +20,7 @@ from bwbayes.app.commands.compare import compare as compare_command
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.data import Record
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.operators.bouc_wen import hysteresis
 
 CONFIG = """\
 seed = 3

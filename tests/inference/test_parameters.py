@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.model.boucwen import ceiling
+from bwbayes.model.operators.bouc_wen import ceiling
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -70,7 +70,7 @@ PRIORS = {
     "active": active(cut_prior()),
     "active, gamma fixed": active(cut_prior(gamma=0.03)),
     "active, beta fixed": active(cut_prior(beta=0.01)),
-    "active, initial fixed": active(cut_prior(initial=9.0)),
+    "active, initial fixed": active(cut_prior(initial=3.0)),
 }
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.drive import (
     RETURN,
     fastest,
+    monotone_stretches,
     stretch_times,
     time_between_turns,
     turning_points,
@@ -104,3 +107,26 @@ def test_fastest_is_the_largest_slope_and_noise_counts_for_little() -> None:
 def test_step_is_faster_than_any_sine() -> None:
     step = np.repeat([0.0, 100.0], 5000)
     assert fastest(step, INTERVAL, 0.05) > 2 * fastest(sine(), INTERVAL, 0.05)
+
+
+def test_plateaus_belong_to_the_stretch_that_leads_to_them() -> None:
+    voltage = np.array([1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 0.0, 0.0, 1.0, 1.0])
+    assert [(0, 5, 1.0), (5, 7, -1.0), (7, 9, 1.0)] == list(monotone_stretches(voltage))
+
+
+@given(
+    steps=st.lists(st.integers(-2, 2), max_size=60),
+    longest=st.one_of(st.none(), st.integers(1, 9)),
+)
+@settings(deadline=None)
+def test_stretches_partition_the_record(steps: list[int], longest: int | None) -> None:
+    voltage = np.cumsum([0.0, *steps])
+    stretches = list(monotone_stretches(voltage, longest))
+    edges = [0, *(stretch.last for stretch in stretches)]
+    assert edges[:-1] == [stretch.first for stretch in stretches]
+    assert voltage.size - 1 == edges[-1]
+    for first, last, direction in stretches:
+        assert (direction * np.diff(voltage[first : last + 1]) >= 0).all()
+        assert 1 <= last - first <= (longest or voltage.size)
+    if longest is None:
+        assert all(one.direction == -two.direction for one, two in pairwise(stretches))

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.results.bands import KINDS, LEVELS, Bands, Kind
 
 __all__ = ["Made", "bands_of", "made", "process"]

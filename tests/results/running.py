@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.operators.bouc_wen import hysteresis
 
 __all__ = ["left_by_running_drives"]
 

@@ -89,12 +89,9 @@ def _staged(
     if compiled is None:
         memory = actuator.begin(column, voltage, from_rest=from_rest)
         stage = prepared(operator, column, voltage, memory)
-        if stage is not None and stage.able.all():
+        if stage is not None:
             yield slice(None), stage
             return
-        if stage is not None:
-            able, others = np.flatnonzero(stage.able), np.flatnonzero(~stage.able)
-            yield able, stage._replace(rest=stage.rest[able], group=stage.group[able])
     size = max(LARGEST // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
         values = {name: column[name][rows] for name in actuator.parameters}

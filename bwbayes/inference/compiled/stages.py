@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numba.extending import overload
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import extrema, pinned, relaxing, stepped
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import FormulaType
@@ -36,13 +36,11 @@ Kind = HysteresisStep | RemembersExtrema | None
 class Stage(NamedTuple):
     """What a compiled stage starts from.
 
-    ``kind`` is what brings its formula, None where the drive is known; ``able`` (models,) says for
-    which models; ``rest`` (models,) is w₀, um; ``group`` (models, rows) and ``plan`` are the
-    stage's own.
+    ``kind`` is what brings its formula, None where the drive is known; ``rest`` (models,) is w₀,
+    um; ``group`` (models, rows) and ``plan`` are the stage's own.
     """
 
     kind: Kind
-    able: BoolArray
     rest: FloatArray
     group: FloatArray
     plan: FloatArray
@@ -53,21 +51,16 @@ def prepared(operator: Operator, column: Values, voltage: FloatArray, memory: An
     if isinstance(operator, RemembersExtrema):
         plan = extrema.ExtremaPlan.of(voltage, memory)
         group = extrema.rows(operator.numbers(column), plan, memory)
-        able = np.ones(len(group), dtype=np.bool_)
-        return Stage(operator, able, memory.displacement, group, plan.rows)
+        return Stage(operator, memory.displacement, group, plan.rows)
     if type(operator).step is Operator.step:
         return None
     step = operator.step(column)
-    if not step.lean:
-        return None
     state = step.remembered(memory)
     if isinstance(step, RelaxingStep):
         group, plan_rows = relaxing.rows(step, state, voltage[0]), relaxing.planned(step)
-        return Stage(step, step.holds(state), group[:, 0], group, plan_rows)
+        return Stage(step, group[:, 0], group, plan_rows)
     equilibrium = step.go(state, np.full(len(state), voltage[0])).w
-    return Stage(
-        step, step.holds(state), equilibrium, stepped.rows(state, equilibrium), step.parameters
-    )
+    return Stage(step, equilibrium, stepped.rows(state, equilibrium), step.parameters)
 
 
 # What makes the drive of a whole piece at once, (models, samples), as the operator's ``advance``.
@@ -82,7 +75,7 @@ DRIVES: Mapping[
 def given(equilibrium: FloatArray, drive: FloatArray) -> Stage:
     """Take a known drive (models, samples), um, whose first sample was ``equilibrium``."""
     group = np.stack([np.arange(equilibrium.size), equilibrium], axis=1)
-    return Stage(None, np.ones(equilibrium.size, dtype=bool), equilibrium, group, drive)
+    return Stage(None, equilibrium, group, drive)
 
 
 @njit(nogil=True, cache=True)

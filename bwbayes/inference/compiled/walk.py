@@ -102,7 +102,7 @@ def walk(
 ) -> Walk | None:
     """Put models to a voltage's first sample; None if they are left to NumPy.
 
-    That is so for an operator that is not compiled, and where a stage cannot do a model. Parameters
+    That is so for an operator that is not compiled. Parameters
     and errors are those of :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the
     ``voltage`` (samples,) is known up to the end.
     """
@@ -116,7 +116,7 @@ def walk(
         stage = given(drive.along(voltage[:1])[:, 0], np.empty((0, 0)))
     else:
         stage = prepared(operator, column, voltage, memory)
-    if stage is None or not stage.able.all():
+    if stage is None:
         return None
     at = _lanes(len(theta))
     state = np.zeros((at.size // LANES, STATE))

@@ -74,7 +74,6 @@ def together(
         start = _first(singles, drive, columns["initial"], sections, growth, result[:, 0])
         memory = drive.step.begun(start, columns["initial"], singles[0].span)
     start = np.broadcast_to(start, models).astype(np.float64)
-    right = drive.step.holds(memory)
     w, slope, _ = drive.go(memory, start)
     largest = np.maximum(result.max(axis=1), -result.min(axis=1))
     farthest = [
@@ -93,7 +92,7 @@ def together(
         *_carried(sections, state),
         state is None,
     )
-    right &= invert(drive.step, memory, chains, result)
+    right = invert(drive.step, memory, chains, result)
     right &= np.max(np.abs(sections.zeros), axis=1, initial=0.0) <= 1 + ROUNDED
     # Bisection ends just before what is too far away.
     limit = (1 - ROUNDED) * chains.farthest

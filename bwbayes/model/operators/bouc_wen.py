@@ -1,8 +1,11 @@
-"""Bouc-Wen hysteresis as a part: w = d u − h, equations (5) and (6) of the paper.
+"""Bouc-Wen hysteresis, w = d u − h, equations (5) and (6) of the paper, without time stepping.
 
-The mathematics is in :mod:`bwbayes.model.boucwen`; here is what its parameters are called, in which
-unit, where they may lie, and what is known of them beforehand. With U half the range of the voltage
-and Y that of the displacement, d is Y/U or twice that, α a part of it, β near 1/U.
+Time does not appear in them: h depends on the path of the voltage alone. So a record is cut where
+the voltage turns, and every stretch between two turns is one array expression for all samples and
+all models at once (:mod:`bwbayes.model.relaxing` for n = 1, :mod:`bwbayes.model.power` for any n).
+
+Of the parameters this is known beforehand, with U half the range of the voltage and Y that of the
+displacement: d is Y/U or twice that, α a part of it, β near 1/U.
 
 With half a range below about a third of 1/β a small drive shows no loop that closes; then the
 priors, not the record, say how large β is, and leave room for the value that a large drive shows.
@@ -17,12 +20,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.boucwen import ceiling, hysteresis
+from bwbayes.errors import InputError
 from bwbayes.model.declaration import (
     Context,
     Declaration,
     Ranges,
     Values,
+    check,
     lognormal,
     normal,
     refuse,
@@ -41,7 +45,7 @@ from bwbayes.model.power import PowerStep
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["BoucWen"]
+__all__ = ["BoucWen", "ceiling", "hysteresis"]
 
 SHAPE = ("alpha", "beta", "gamma", "exponent")
 
@@ -134,33 +138,25 @@ class BoucWen(OneState):
         )
 
     def check(self, column: Values) -> None:
-        """Raise an InputError where d is not finite; :func:`hysteresis` sees to the rest."""
-        refuse("d", ~np.isfinite(column["d"]), column["d"], "must be finite")
-
-    def trace(
-        self, column: Values, voltage: FloatArray, state: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w = d u − h (models, samples), and h at the end."""
-        h = hysteresis(voltage, **{name: column[name] for name in SHAPE}, initial=state)
-        after = h[:, -1].copy()
-        np.subtract(column["d"][:, np.newaxis] * voltage, h, out=h)
-        return h, after
+        """Raise an InputError where a model is outside of the domain, or h may run away."""
+        check(self.parameters, column, ("d", "beta"))
+        gamma, initial = column["gamma"], column["initial"]
+        refuse("gamma", column["beta"] + gamma < 0, gamma, "beta + gamma must not be negative")
+        # A state may exceed the ceiling by its rounding.
+        above = ~_anywhere(column) & (np.abs(initial) > (1 + 1e-9) * _top(column))
+        demand = "must lie inside the ceiling (alpha/(beta + gamma))^(1/n)"
+        refuse("initial", above, initial, f"{demand}, unless n = 1 and gamma <= beta")
 
     def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""
         return column["d"]
 
     def holds(self, column: Values) -> BoolArray:
-        """Tell where α < d, and h does not run away from the initial state.
-
-        That is where γ ≤ β, or the initial state lies below the ceiling.
-        """
+        """Tell where α < d, and h is where the model has a solution: see ``check``."""
         inside = below_d(column)
-        names = {*SHAPE, "initial"}
-        if self.passive or not names <= column.keys() or not np.any(column["initial"]):
+        if not {*SHAPE, "initial"} <= column.keys() or not np.any(column["initial"]):
             return inside
-        start = np.abs(column["initial"])
-        return inside & ((column["gamma"] <= column["beta"]) | (start <= _top(column)))
+        return inside & (_anywhere(column) | (np.abs(column["initial"]) <= _top(column)))
 
     def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
         """Say that a posterior presses against γ ≤ β, if it does."""
@@ -203,6 +199,88 @@ def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
         return -np.inf, np.inf
     top = _top(earlier)
     return -top, top
+
+
+def ceiling(
+    alpha: FloatArray, beta: FloatArray, gamma: FloatArray, exponent: FloatArray
+) -> FloatArray:
+    """Return the largest |h| the model reaches, (α / (β + γ))^(1/n) in um, for starts inside it.
+
+    All arrays are (models,), units as in :class:`BoucWen`; infinite where β + γ = 0.
+    """
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.asarray(np.power(alpha / (beta + gamma), 1 / exponent))
+
+
+def hysteresis(
+    voltage: ArrayLike,
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    gamma: ArrayLike,
+    exponent: ArrayLike = 1.0,
+    initial: ArrayLike = 0.0,
+) -> FloatArray:
+    """Hysteretic displacement of a batch of Bouc-Wen models along one voltage path.
+
+    Parameters
+    ----------
+    voltage
+        (samples,) in V, finite; any path, plateaus and constant voltages included.
+    alpha
+        (models,) or scalar, um/V, positive.
+    beta, gamma
+        (models,) or scalar, um^(1−n)/V (1/V for n = 1); β ≥ 0 and β + γ ≥ 0.
+    exponent
+        n, (models,) or scalar, at least 1.
+    initial
+        h at the first sample, (models,) or scalar, um: not beyond the ceiling
+        (α / (β + γ))^(1/n), unless n = 1 and γ ≤ β.
+
+    Returns
+    -------
+    FloatArray
+        h, (models, samples), um.
+
+    Raises
+    ------
+    InputError
+        Outside the model's domain, or not finite, naming the argument.
+
+    Notes
+    -----
+    Equations (5) and (6) of the paper; its equation (8) prints the last term as γ u |dh|, which
+    is a misprint: read so it would define dh by itself, with two solutions or none.
+
+    Examples
+    --------
+    >>> h = hysteresis([0.0, 100.0, -100.0], alpha=[0.3, 0.36], beta=0.027, gamma=0.017)
+    >>> h.round(2)
+    array([[ 0.  ,  6.73, -6.82],
+           [ 0.  ,  8.08, -8.18]])
+    """
+    path = np.asarray(voltage, dtype=np.float64)
+    if path.ndim != 1 or path.size == 0 or not np.isfinite(path).all():
+        raise InputError("voltage: must be a non-empty row of finite numbers; check the record")
+    arguments = {
+        "alpha": alpha, "beta": beta, "gamma": gamma, "exponent": exponent, "initial": initial,
+    }  # fmt: skip
+    rows = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in arguments.items()}
+    size = max(values.size for values in rows.values())
+    for name, values in rows.items():
+        if values.ndim != 1 or values.size not in (1, size):
+            raise InputError(
+                f"{name}: has shape {values.shape}; give one number, or ({size},) as the others"
+            )
+    column = {name: np.broadcast_to(values, (size,)) for name, values in rows.items()}
+    column["d"] = np.zeros(size)
+    operator = BoucWen(passive=False)
+    operator.check(column)
+    return -operator.trace(column, path, column["initial"])[0]
+
+
+def _anywhere(column: Values) -> BoolArray:
+    """Tell which models (models,) follow the voltage from any h."""
+    return np.asarray((column["exponent"] == 1.0) & (column["gamma"] <= column["beta"]))
 
 
 def _top(column: Values) -> FloatArray:

@@ -16,7 +16,6 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
-from bwbayes.model.drive import PIECE, monotone_stretches
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.step import OneStateStep
 
@@ -59,16 +58,7 @@ class OneState(Operator):
         """
         step = self.step(column)
         assert isinstance(step, OneStateStep)
-        w = np.empty((state.size, voltage.size))
-        w[:, :1] = step.along(voltage[0], state, voltage[:1])[0]
-        if np.ptp(voltage) > 0:
-            for first, last, _ in monotone_stretches(voltage, max(PIECE // state.size, 1)):
-                ahead = slice(first + 1, last + 1)
-                w[:, ahead], states = step.along(voltage[first], state, voltage[ahead])
-                state = states[:, -1].copy()
-        else:
-            w[:] = w[:, :1]
-        return w, state
+        return step.trace(voltage, state)
 
     def begin(
         self,

@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse import together as side
 from bwbayes.model.inverse.alone import One
@@ -19,7 +18,7 @@ from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.together import MANY
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen import BoucWen, hysteresis
 from bwbayes.model.operators.one_state import StateMemory
 from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.operators.backlash_like import BacklashLike
+from bwbayes.model.operators.bouc_wen import hysteresis
 from tests.model.operators.differential import by_integration, paths, single, w_of
 from tests.model.references import assert_close
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.errors import InputError
-from bwbayes.model.boucwen import hysteresis
+from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from tests.model.operators.differential import by_integration, paths, prior_draws, single, w_of
 from tests.model.references import assert_close

@@ -4,38 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from scipy.special import hyp2f1
 
-from bwbayes.model.boucwen import hysteresis
 from bwbayes.model.operator import Span
 from bwbayes.model.power import PowerStep
 
 
 def power(exponent: float, gamma: float = 0.003, beta: float = 0.006) -> PowerStep:
-    d, alpha, *rest = (np.array([one]) for one in (0.7, 0.3575, beta, gamma, exponent))
+    d, alpha, *rest = (np.array([value]) for value in (0.7, 0.3575, beta, gamma, exponent))
     return PowerStep(d, alpha, *rest)
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    turns=st.lists(st.floats(-150.0, 150.0), min_size=1, max_size=8),
-    exponent=st.floats(1.0, 6.0),
-    part=st.floats(-0.98, 1.5),
-)
-def test_any_exponent_is_the_simulation(turns: list[float], exponent: float, part: float) -> None:
-    """On any path, of steps of any length, to 1e-10 of the largest h; also where γ > β."""
-    beta = 0.03 * 8.0 ** (1 - exponent)
-    step = power(exponent, part * beta, beta)
-    path = np.array([0.0, *turns])
-    shape = {"alpha": 0.3575, "beta": beta, "gamma": part * beta, "exponent": exponent}
-    expected = hysteresis(path, **shape)[0]
-    memory, made = step.demagnetized(), []
-    for one in path:
-        w, _, memory = step.go(memory, np.array([one]))
-        made.append(0.7 * one - w[0])
-    largest = max(float(np.max(np.abs(expected))), 1e-6)
-    np.testing.assert_allclose(made, expected, rtol=0, atol=1e-10 * largest)
+@pytest.mark.parametrize("exponent", [1.0, 1 + 1e-9, 1.05, 1.7, 3.3, 10.0, 50.0])
+def test_inverts_the_hypergeometric_travel_inside_the_ceiling(exponent: float) -> None:
+    """v(g) = (g/alpha) 2F1(1, 1/n; 1 + 1/n; (lambda/alpha) g^n), here with G = 1."""
+    height = np.concatenate((np.geomspace(1e-8, 0.5, 40), np.linspace(0.51, 0.98, 48)))
+    travel = height * hyp2f1(1.0, 1 / exponent, 1 + 1 / exponent, height**exponent) / 0.36
+    d, alpha, *rest = np.array([[0.0, 0.36, 0.6 * 0.36, 0.4 * 0.36, exponent]]).T
+    _, got = PowerStep(d, alpha, *rest).along(0.0, np.zeros(1), travel)
+    np.testing.assert_allclose(got[0], height, rtol=1e-11)
 
 
 def test_the_slope_is_that_of_the_displacement() -> None:
@@ -49,7 +36,7 @@ def test_the_slope_is_that_of_the_displacement() -> None:
 
 def test_at_the_ceiling_h_stays() -> None:
     step = power(2.0)
-    top = float(step.ceiling[0])
+    top = float(step.scales[1][0])
     assert top == pytest.approx((0.3575 / 0.009) ** 0.5)
     w, slope, memory = step.go(np.array([[10.0, top, 0.0, 0.0]]), np.array([50.0]))
     assert memory[0, 1] == pytest.approx(top, rel=1e-14)
