@@ -157,14 +157,14 @@ def time_at(parameters: Any, below: Any, height: Any) -> Any:
             value = value * fraction + look_up(parameters, cell + (2 + order) * cells)
         fraction = fraction - (value - height) / select(slope == 0.0, 1.0, slope)
     fraction = np.minimum(np.maximum(fraction, 0.0), 1.0)
-    return look_up(parameters, cell) + look_up(parameters, cell + cells) * fraction
+    return look_up(parameters, cell + 0 * cells) + look_up(parameters, cell + cells) * fraction
 
 
 def height_at(parameters: Any, below: Any, time: Any) -> Any:
     """Return the height at which the curve below zero, or above, is at a time."""
     cells = (len(parameters) - TABLE) / 20
     cell = find_cell(parameters, below, 0, time)
-    fraction = (time - look_up(parameters, cell)) / look_up(parameters, cell + cells)
+    fraction = (time - look_up(parameters, cell + 0 * cells)) / look_up(parameters, cell + cells)
     fraction, value = np.minimum(np.maximum(fraction, 0.0), 1.0), 0.0 * time
     for order in range(7, -1, -1):
         value = value * fraction + look_up(parameters, cell + (2 + order) * cells)

@@ -12,10 +12,9 @@ from scipy.special import logsumexp
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.model.operators.bouc_wen import ceiling
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen import BoucWen, ceiling
 from tests.declared import declared, joint, parameter
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 

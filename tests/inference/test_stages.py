@@ -49,7 +49,6 @@ def compiled(
     memory = operator.begin(column, float(voltage[0]), span, from_rest=False)
     stage = prepared(operator, column, voltage, memory)
     assert stage is not None
-    assert stage.able.all()
     own = np.ascontiguousarray(stage.group.T).ravel()
     out, parts = np.empty(piece * LANES), []
     for first in range(0, voltage.size, piece):

@@ -14,7 +14,6 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
-from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.pinned import Pinned
@@ -90,12 +89,3 @@ def test_operators_that_remember_extrema_walk_as_with_numpy(name: str) -> None:
     actuator = Actuator("lag", "first", 1e-3, CASES[name].operator, span=SPAN)
     for voltage in paths().values():
         assert_walks_as(actuator, as_theta(actuator, dict(CASES[name].column)), voltage, 1)
-
-
-def test_what_has_no_stage_is_left_to_numpy() -> None:
-    posterior = moving("white", "none", parts={"hysteresis": BoucWen()})
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 3))
-    actuator = posterior.only.actuator
-    model = posterior.only.table.actuator(theta)
-    model[1, actuator.parameters.index("exponent")] = 1.5
-    assert walk(actuator, model, posterior.only.voltage) is None
