@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from bwbayes.diagnosis import drive, model, noise, sensor
+from bwbayes.diagnosis import effects, model, noise
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
 
@@ -21,20 +21,20 @@ __all__ = ["ADDITIONS", "CHANGES", "LIMIT", "TIED", "explain", "followed_causes"
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
 # good fit refuses at once; the others are for fits of which something is known to be wrong.
 ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
-    sensor.transient,
-    sensor.drift,
-    sensor.step,
-    sensor.oscillation,
-    sensor.moving_gain,
-    sensor.reversed_sign,
-    drive.delay,
+    effects.transient,
+    effects.drift,
+    effects.step,
+    effects.oscillation,
+    effects.moving_gain,
+    effects.reversed_sign,
+    effects.delay,
     noise.heavy_tails,
     noise.growing_noise,
 )
 CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
-    drive.saturation,
-    drive.slew_limit,
-    drive.backlash,
+    effects.saturation,
+    effects.slew_limit,
+    effects.backlash,
     model.nonlinearity,
     model.creep,
     model.dynamics,

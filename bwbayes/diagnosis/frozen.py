@@ -14,15 +14,7 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.series_patterns import runs
 
-__all__ = ["SHORTEST_AT_END", "Stuck", "clipped", "clipped_drive", "held", "repeated"]
-
-SHORTEST_AT_END = 5  # samples in a row at the end of a range
-LEAST_FALL = 0.25  # of what follows a run, in its last quarter
-LEAST_OF_RANGE = 0.01
-MOST_REPEATED = 0.02  # of the readings of a sensor whose noise is larger than its steps
-FEWEST = 10  # samples that are stuck, in all
-LEAST_PART = 0.005  # of the samples
-LONG_ENOUGH = 20  # samples in a row, of which one run is enough
+__all__ = ["Stuck", "clipped", "held", "repeated"]
 
 
 class Stuck(NamedTuple):
@@ -45,66 +37,36 @@ class Stuck(NamedTuple):
 def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     """Return where values (samples,) stay at their largest while the other column moves on.
 
-    A sensor whose steps are finer than its noise hardly ever repeats itself: then all readings of
-    the largest value count. A coarse one repeats it in two ways that are harmless. At rest the
-    other column stands still: only runs count in which its quartiles lie apart, by 1 % of its range
-    and by what three steps of the sensor are worth. At a smooth peak the next level lasts as well:
-    a parabola stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
+    A sensor whose steps are finer than its noise hardly ever repeats itself, in 2 % of its
+    readings at most: then all readings of the largest value count. A coarse one repeats it in two
+    ways that are harmless. At rest the other column stands still: only runs count in which its
+    quartiles lie apart, by 1 % of its range and by what three steps of the sensor are worth. At a
+    smooth peak the next level lasts as well: a parabola stays at its top level up to 2.4 times as
+    long as at the next, a clipped one longer.
     """
     levels = np.unique(values)
     if levels.size < 3:
         return None
     at_top = values == levels[-1]
     first, lengths = runs(at_top)
-    if np.mean(np.diff(values)[~(at_top[1:] & at_top[:-1])] == 0) < MOST_REPEATED:
+    if np.mean(np.diff(values)[~(at_top[1:] & at_top[:-1])] == 0) < 0.02:
         enough = _enough(first, first + lengths - 1, np.full(first.size, np.ptp(other[at_top]) > 0))
     else:
         resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
         travel = max(0.01, 3 * resolution) * float(np.ptp(other))
         moving = _quartile_distances(other[at_top], lengths) > travel
-        enough = _enough(first, first + lengths - 1, (lengths >= SHORTEST_AT_END) & moving)
+        enough = _enough(first, first + lengths - 1, (lengths >= 5) & moving)
     if enough is None or enough.samples <= 3 * np.count_nonzero(values == levels[-2]):
         return None
     return enough
-
-
-def clipped_drive(values: FloatArray, other: FloatArray, usual: float) -> Stuck | None:
-    """Return where a voltage stays at its largest while the displacement turns and goes back.
-
-    Behind a voltage that really rests the displacement may lag and creep, but it does not fall
-    before the voltage does. Here it must, in the last quarters of the runs and on the whole, by a
-    part of what it falls by in the same time after them: more than it scatters by from run to run,
-    or than its unexplained part, of sd `usual`, would.
-    """
-    first, lengths = runs(values == values.max())
-    last = first + lengths - 1
-    quarter, shortest = lengths // 4, lengths // 8 + 1
-    whole = (lengths >= SHORTEST_AT_END) & (last + quarter < values.size)
-    if not whole.any():
-        return None
-    first, last, quarter, shortest = (each[whole] for each in (first, last, quarter, shortest))
-    sums = np.concatenate([[0.0], np.cumsum(other)])
-    before, end, after = (
-        (sums[at + 1] - sums[at + 1 - shortest]) / shortest
-        for at in (last - quarter, last, last + quarter)
-    )
-    falls, count = before - end, last.size
-    sure = falls.sum() > 4 * usual * np.sqrt(count)
-    if count >= 6:
-        sure |= falls.mean() > 4 * falls.std(ddof=1) / np.sqrt(count)
-    lowest_fall = max(
-        LEAST_FALL * float((end - after).sum()), LEAST_OF_RANGE * float(np.ptp(other))
-    )
-    if not sure or falls.sum() < lowest_fall:
-        return None
-    return _enough(first, last, np.ones(count, dtype=np.bool_))
 
 
 def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
     """Return where readings (samples,) are held while the voltage moves, and then jump.
 
     A sensor with coarse steps repeats itself where it moves slowly, and goes on by a step or two;
-    one that is held goes on by all that it has missed, on the same side as it came from.
+    one that is held goes on by all that it has missed, on the same side as it came from. One run
+    of twenty samples is enough, of shorter ones more than chance makes.
     """
     moved = np.diff(displacement)
     if not np.any(moved):
@@ -126,9 +88,9 @@ def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
     # A noisy reading comes twice by chance, half as often as it goes on by one step up or down.
     near = np.flatnonzero((moved[1:-1] != 0) & (np.abs(moved[1:-1]) < 1.5 * step)) + 1
     chance = np.count_nonzero(_jumps(moved[near - 1], moved[near + 1], step)) / 2
-    if np.count_nonzero(stuck) < 3 * chance + 5 and not np.any(lengths[stuck] >= LONG_ENOUGH):
+    if np.count_nonzero(stuck) < 3 * chance + 5 and not np.any(lengths[stuck] >= 20):
         return None
-    if lengths[stuck].sum() < LEAST_PART * displacement.size:
+    if lengths[stuck].sum() < 0.005 * displacement.size:
         return None
     return _enough(first, last, stuck)
 
@@ -163,9 +125,9 @@ def repeated(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
 
 
 def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> Stuck | None:
-    """Return the runs that are stuck if these are enough samples to say so."""
+    """Return the runs that are stuck if these are ten samples in all, enough to say so."""
     runs_stuck = Stuck(first[stuck], last[stuck])
-    return runs_stuck if runs_stuck.samples >= FEWEST else None
+    return runs_stuck if runs_stuck.samples >= 10 else None
 
 
 def _quartile_distances(values: FloatArray, lengths: IntArray) -> FloatArray:

@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 
@@ -40,15 +39,16 @@ FRACTIONS = 0.5 ** np.arange(8)
 Simulate = Callable[[FloatArray], FloatArray]
 
 
-class Effect(Protocol):
-    """An addition to a model, with sizes whose priors are standard normal."""
+@dataclass(frozen=True)
+class Effect:
+    """An addition to a model, with sizes whose priors are standard normal.
 
-    @property
-    def starts(self) -> FloatArray:
-        """Sizes (starts, sizes) to climb from."""
+    ``apply(simulate, voltage, sizes)`` returns the displacement (models, samples), um, of models
+    that all have these sizes (sizes,); ``starts`` (starts, sizes) are those to climb from.
+    """
 
-    def apply(self, simulate: Simulate, voltage: FloatArray, sizes: FloatArray) -> FloatArray:
-        """Return the displacement (models, samples), um, of models that all have these sizes."""
+    apply: Callable[[Simulate, FloatArray, FloatArray], FloatArray]
+    starts: FloatArray
 
 
 @dataclass(frozen=True)

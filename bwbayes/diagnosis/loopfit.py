@@ -15,17 +15,14 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.data.record import Record
-from bwbayes.diagnosis.series_patterns import DecayingStart, turning_points
+from bwbayes.diagnosis.series_patterns import turning_points
 
 __all__ = ["LoopFit", "fit_loop"]
 
-# Half widths of the plays, as parts of half the voltage's range.
+# Half widths of the plays, as fractions of half the voltage's range; the state at the start of
+# every other one is free.
 WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])
-FREE_STARTS = slice(2, None, 2)  # plays whose state at the start is free
-MOST_ROWS = 3000  # of each kind: evenly spaced, and extremes of the voltage
-EARLY_ROWS = 400
-LAGS = 9
-DECAYS = 20
+FREE_STARTS = slice(2, None, 2)
 
 
 @dataclass(frozen=True)
@@ -42,8 +39,8 @@ class LoopFit:
         Displacement per volt of a large, slow drive.
     lag : float, s
         Time constant with which the displacement follows.
-    decay : Decay
-        What dies out from the first reading on, whatever the voltage does; um and s.
+    decay, decay_time : float, um and s
+        What dies out from the first reading on, whatever the voltage does.
     start : float, um
         How far off the displacement starts in all: the decay, and what another state of the plays
         would change.
@@ -59,26 +56,26 @@ class LoopFit:
     residual: FloatArray
     gain: float
     lag: float
-    decay: DecayingStart
+    decay: float
+    decay_time: float
     start: float
     trend: float
     trend_told: float
     explained: float
 
 
-def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
-    """Fit loops to a record without the samples that are `left_out`, (samples,)."""
+def fit_loop(record: Record) -> LoopFit:
+    """Fit loops to a record's readings."""
     assert record.displacement is not None
-    usable = record.has_reading if left_out is None else record.has_reading & ~left_out
-    rows = _rows(record.voltage, np.flatnonzero(usable))
-    judged = usable[rows]
+    rows = _rows(record.voltage, np.flatnonzero(record.has_reading))
+    judged = record.has_reading[rows]
     displacement = record.displacement[rows[judged]]
     time = record.time[rows]
     centered = displacement - displacement.mean()
 
     elapsed = time[judged] - time[judged][0]
     trend_shape = elapsed / elapsed[-1] - 0.5
-    times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, DECAYS)
+    times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, 20)
     decays = np.exp(-elapsed[:, np.newaxis] / times)
 
     best: tuple[float, FloatArray, float, int] | None = None
@@ -106,7 +103,8 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
         residual,
         float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
         lag,
-        DecayingStart(float(coefficients[-1]), float(times[which])),
+        float(coefficients[-1]),
+        float(times[which]),
         float(design[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :])
         + coefficients[-2] / 2,
         float(coefficients[-2]),
@@ -117,9 +115,10 @@ def fit_loop(record: Record, left_out: BoolArray | None = None) -> LoopFit:
 
 def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
     """Return the samples to look at: the voltage's extremes all along, and readings, more early."""
-    evenly = readings[:: -(-readings.size // MOST_ROWS)]
-    early = readings[np.geomspace(1, readings.size, EARLY_ROWS).astype(np.int64) - 1]
-    size = -(-2 * voltage.size // MOST_ROWS)
+    most = 3000  # of each kind
+    evenly = readings[:: -(-readings.size // most)]
+    early = readings[np.geomspace(1, readings.size, 400).astype(np.int64) - 1]
+    size = -(-2 * voltage.size // most)
     blocks = voltage[: voltage.size // size * size].reshape(-1, size)
     first = size * np.arange(len(blocks))
     extremes = np.concatenate([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)])
@@ -131,7 +130,7 @@ def _lags(record: Record) -> FloatArray:
     smallest_turn = 0.1 * float(np.ptp(record.voltage))
     turns = turning_points(record.voltage, smallest_turn)
     slowest = 0.3 * record.interval * float(np.median(np.diff(turns)))
-    lags = np.geomspace(0.5 * record.interval, max(slowest, record.interval), LAGS)
+    lags = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
     return np.concatenate([[0.0], lags])
 
 

@@ -14,41 +14,19 @@ import numpy as np
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.frozen import SHORTEST_AT_END, Stuck, clipped, clipped_drive, held, repeated
+from bwbayes.diagnosis.frozen import Stuck, clipped, held, repeated
 from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     find_gross_outliers,
-    runs,
     scatter,
     spikes,
     turning_points,
 )
 
-__all__ = ["inspect", "isolated_outliers"]
+__all__ = ["inspect", "isolated_outliers", "settle_fix"]
 
-# What the voltage and the displacement of piezo actuators may be, and their quotient.
-VOLTS = (0.05, 2000.0)
-MICROMETRES = (0.01, 5000.0)
-GAINS = (1e-4, 1e3)  # um/V
-
-LEAST_READINGS = 100
-LEAST_A_TURN = 6  # samples from one turning point of the voltage to the next
-SAME_AMPLITUDE = 0.05  # the largest less the smallest swing of the voltage, over the usual one
-LEAST_EXPLAINED = 0.3  # part of the displacement's variance that the voltage must explain
-
-# A decay or a trend counts if it is as large, in sds of what the loops miss and as a part of
-# the displacement's range. A drive before the record leaves a decay too, of at most lag x velocity.
-DECAY_SDS, DECAY_PART, DECAY_LEFT_BY_DRIVE = 12.0, 0.1, 3.0
-START_SDS, START_PART = 20.0, 0.24
-TREND_SDS, TREND_PART, TREND_TOLD = 7.0, 0.05, 0.1
-LONG_DECAY = 0.13  # of the record: a decay that takes longer is a drift
-SPIKE_PART = 0.01  # of the range
-LEAST_OPENING = 0.004  # of a loop: its area over that of the rectangle around it
-MOST_WINDOWS = 5  # that a fix writes out
-# A start that holds more than this part of the drive's path is not left out.
-MOST_LEFT_OUT = 0.05
-SETTLE_FIRST = "measure again once the displacement has settled"
-MOST_SPIKES = 0.05  # of the readings: more are not outliers
+# A decay that takes longer, as a fraction of the record, is a drift.
+LONG_DECAY = 0.13
 
 
 def inspect(record: Record) -> tuple[Finding, ...]:
@@ -65,13 +43,14 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
     ['reversed sign']
     """
-    outliers = np.empty(0, dtype=np.int64)
+    spiky: list[Finding] = []
     if record.displacement is not None:
         outliers = isolated_outliers(record)
-    spiky = [*_spikes(record, outliers)]
-    # All else is said of the others.
-    record = record.without(outliers)
-    findings = [*_units(record), *_sampling(record), *_amplitude(record)]
+        if outliers.size:
+            spiky = [_spikes(record, outliers)]
+        # All else is said of the others.
+        record = record.without(outliers)
+    findings = [*_plausibility(record)]
     if record.displacement is None or record.readings < 3:
         return (*findings, *spiky)
     loop = fit_loop(record)
@@ -83,7 +62,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
             *(finding for finding in unlike if finding.kind == "no relation"),
             *spiky,
         )
-    unlike += [*_stuck(record), *_clipping(record), *_clipped_drive(record)]
+    unlike += [*_stuck(record), *_clipping(record)]
     findings += [*unlike, *spiky]
     if not unlike:
         findings += [*_transient(record, loop), *_drift(record, loop)]
@@ -105,41 +84,33 @@ def _extent(values: FloatArray) -> float:
     return float(high - low)
 
 
-def _units(record: Record) -> Iterator[Finding]:
-    """Find voltages and displacements that no piezo actuator has."""
-    volts = float(np.abs(record.voltage).max())
+def _plausibility(record: Record) -> Iterator[Finding]:
+    """Find what no piezo actuator does, and drives from which little is to be learnt."""
+    volts, span = float(np.abs(record.voltage).max()), float(np.ptp(record.voltage))
     names = "check the units in the names of the columns: voltage_V, voltage_mV, displacement_um, "
     names += "displacement_nm, displacement_m"
-    if not VOLTS[0] <= volts <= VOLTS[1]:
+    if not 0.05 <= volts <= 2000:
         yield _whole(record, "wrong units", f"voltages of up to {volts:.3g} V", names)
-    if record.displacement is None:
-        return
-    extent = _extent(_readings(record))
-    gain = extent / float(np.ptp(record.voltage))
-    if not MICROMETRES[0] <= extent <= MICROMETRES[1]:
-        yield _whole(record, "wrong units", f"a displacement that moves by {extent:.3g} um", names)
-    elif not GAINS[0] <= gain <= GAINS[1]:
-        yield _whole(record, "wrong units", f"{gain:.3g} um per volt", names)
-
-
-def _sampling(record: Record) -> Iterator[Finding]:
-    if record.displacement is not None and record.readings < LEAST_READINGS:
-        text = f"{record.readings} readings, some ten for each parameter"
-        yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
-    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
-    if turns.size >= 5:
-        a_turn = float(np.median(np.diff(turns)))
-        if a_turn < LEAST_A_TURN:
-            text = f"{2 * a_turn:.3g} samples a period of the drive, so its turns are not seen"
-            fix = "sample faster (20 samples a period or more), or drive more slowly"
-            yield _whole(record, "coarse sampling", text, fix)
-
-
-def _amplitude(record: Record) -> Iterator[Finding]:
-    """Find a drive whose swings are all alike, except for the unfinished ones at its ends."""
-    turns = turning_points(record.voltage, 0.02 * float(np.ptp(record.voltage)))
+    if record.displacement is not None:
+        extent = _extent(_readings(record))
+        if not 0.01 <= extent <= 5000:
+            text = f"a displacement that moves by {extent:.3g} um"
+            yield _whole(record, "wrong units", text, names)
+        elif not 1e-4 <= extent / span <= 1e3:
+            yield _whole(record, "wrong units", f"{extent / span:.3g} um per volt", names)
+        if record.readings < 100:
+            text = f"{record.readings} readings, some ten for each parameter"
+            yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
+    turns = turning_points(record.voltage, 0.1 * span)
+    spacing = float(np.median(np.diff(turns)))
+    if turns.size >= 5 and spacing < 6:
+        text = f"{2 * spacing:.3g} samples a period of the drive, so its turns are not seen"
+        fix = "sample faster (20 samples a period or more), or drive more slowly"
+        yield _whole(record, "coarse sampling", text, fix)
+    # All but the unfinished ones at the ends.
+    turns = turning_points(record.voltage, 0.02 * span)
     swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
-    if swings.size >= 3 and np.ptp(swings) < SAME_AMPLITUDE * np.median(swings):
+    if swings.size >= 3 and np.ptp(swings) < 0.05 * np.median(swings):
         text = f"every swing of the voltage is {np.median(swings):.4g} V"
         fix = (
             "vary the amplitude, since one loop does not tell d, alpha and beta apart (a sine that "
@@ -149,7 +120,7 @@ def _amplitude(record: Record) -> Iterator[Finding]:
 
 
 def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
-    """Return the samples whose readings are isolated outliers; none if they are too many.
+    """Return the samples whose readings are isolated outliers; none if they are more than 5 %.
 
     With `ends` also a first or last reading that may as well belong to a transient.
     """
@@ -161,26 +132,24 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     levels = np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    threshold = max(SPIKE_PART * extent, 6 * resolution)
+    threshold = max(0.01 * extent, 6 * resolution)
     near = spikes(displacement, drive, threshold, ends=ends)
     isolated = np.union1d(gross, others[near])
-    return rows[isolated] if isolated.size <= MOST_SPIKES * rows.size else rows[:0]
+    return rows[isolated] if isolated.size <= 0.05 * rows.size else rows[:0]
 
 
-def _spikes(record: Record, outliers: IntArray) -> Iterator[Finding]:
-    if not outliers.size:
-        return
+def _spikes(record: Record, outliers: IntArray) -> Finding:
     times = record.time[outliers]
     shown = ", ".join(map(record.clock, times[:5])) + (", ..." if times.size > 5 else "")
     plural = "" if times.size == 1 else "s"
     text = f"{times.size} isolated outlier{plural} of the displacement, at {shown} s"
     fix = "outliers = true under [model]"
-    yield Finding("spikes", text, fix, float(times[0]), float(times[-1]) + record.interval)
+    return Finding("spikes", text, fix, float(times[0]), float(times[-1]) + record.interval)
 
 
 def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that does not follow the voltage, or the wrong way."""
-    if loop.explained < LEAST_EXPLAINED:
+    if loop.explained < 0.3:
         text = f"the voltage explains {max(loop.explained, 0):.0%} of the displacement's variance"
         yield _whole(record, "no relation", text, "check the columns, the wiring and the amplifier")
         return
@@ -225,7 +194,7 @@ def _leads(record: Record) -> bool | None:
     opening = area / size
     usual = float(np.median(opening))
     error = scatter(opening) / np.sqrt(opening.size)
-    if abs(usual) < max(LEAST_OPENING, 4 * error):
+    if abs(usual) < max(0.004, 4 * error):
         return None
     return usual < 0
 
@@ -257,7 +226,7 @@ def _where(record: Record, rows: IntArray, kind: str, text: str, stuck: Stuck) -
         f"[{record.clock(a)}, {record.clock(b)}]" for a, b in zip(starts, stops, strict=True)
     ]
     text += f", first at {record.clock(starts[0])} s"
-    if len(windows) <= MOST_WINDOWS:
+    if len(windows) <= 5:
         fix = f"exclude = [{', '.join(windows)}] under [record]"
     elif kind == "clipping":
         fix = "use a wider range"
@@ -278,40 +247,21 @@ def _clipping(record: Record) -> Iterator[Finding]:
             yield _where(record, rows, "clipping", text + "voltage moves", stuck)
 
 
-def _clipped_drive(record: Record) -> Iterator[Finding]:
-    """Find a voltage at the end of its range while the displacement goes on."""
-    rows = np.flatnonzero(record.has_reading)
-    displacement = _readings(record)
-    for side, sign in (("largest", 1.0), ("smallest", -1.0)):
-        voltage = sign * record.voltage
-        at_end = voltage == voltage.max()
-        if runs(at_end)[1].max() < SHORTEST_AT_END or (~at_end[rows]).sum() < LEAST_READINGS:
-            continue
-        loop = fit_loop(record, at_end)
-        stuck = clipped_drive(voltage[rows], sign * displacement, scatter(loop.residual))
-        if stuck is not None:
-            text = (
-                f"{stuck.samples} voltages stay at the {side} value, "
-                f"{record.voltage[rows[stuck.first[0]]]:g} V, while the displacement goes on and "
-                f"returns, first at {record.clock(record.time[rows[stuck.first[0]]])} s"
-            )
-            yield _whole(record, "clipping", text, "record the voltage over its whole range")
-
-
 def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that comes from elsewhere at the start, whatever the voltage does."""
-    size, time = loop.decay
+    size, time = loop.decay, loop.decay_time
     usual, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
+    # A drive before the record leaves a decay too, of at most lag times velocity.
     velocity = float(np.quantile(steps, 0.99)) / record.interval
     lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
-    alone = max(DECAY_SDS * usual, DECAY_PART * extent, DECAY_LEFT_BY_DRIVE * lagged)
-    # With another hysteretic state at the start, which steps of the voltage do not show.
+    # Another hysteretic state at the start, which steps of the voltage do not show, is less sure.
     moving = np.count_nonzero(steps) > steps.size / 2
-    in_all = max(START_SDS * usual, START_PART * extent)
-    if abs(loop.start) > in_all and moving and abs(size) > usual:
+    if abs(loop.start) > max(20 * usual, 0.24 * extent) and moving and abs(size) > usual:
         size = loop.start
-    elif abs(size) < alone or time > LONG_DECAY * record.duration:
+    elif abs(size) < max(12 * usual, 0.1 * extent, 3 * lagged) or (
+        time > LONG_DECAY * record.duration
+    ):
         return
     begin = float(record.time[loop.rows[0]])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
@@ -322,19 +272,29 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         f"voltage would have it, and settles with a time constant of {time:.2g} s"
     )
     gone = int(np.searchsorted(record.time, over))
-    share = steps[:gone].sum() / steps.sum()
-    fix = SETTLE_FIRST if share > MOST_LEFT_OUT else f"start = {record.clock(over)} under [record]"
+    fix = settle_fix(record.voltage, gone, f"start = {record.clock(over)} under [record]")
     yield Finding("switch-on transient", text, fix, begin, over)
 
 
+def settle_fix(voltage: FloatArray, gone: int, leave_out: str) -> str:
+    """Return the line that leaves a start of ``gone`` samples out, unless it is too dear.
+
+    A start that holds more than a twentieth of the drive's path is not left out.
+    """
+    steps = np.abs(np.diff(voltage, prepend=voltage[0]))
+    if steps[:gone].sum() > 0.05 * steps.sum():
+        return "measure again once the displacement has settled"
+    return leave_out
+
+
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
+    """Find a trend, of which loops would imitate nine tenths at most."""
     usual, extent = scatter(loop.residual), _extent(_readings(record))
     size = loop.trend
-    if loop.decay.time > LONG_DECAY * record.duration:
-        size -= loop.decay.size * (1 - float(np.exp(-record.duration / loop.decay.time)))
+    if loop.decay_time > LONG_DECAY * record.duration:
+        size -= loop.decay * (1 - float(np.exp(-record.duration / loop.decay_time)))
     told = max(loop.trend_told, 1e-12)
-    threshold = max(TREND_SDS * usual / np.sqrt(told), TREND_PART * extent)
-    if told > TREND_TOLD and abs(size) > threshold:
+    if told > 0.1 and abs(size) > max(7 * usual / np.sqrt(told), 0.05 * extent):
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")

@@ -1,49 +1,18 @@
-"""Shapes in a series of numbers: turning points, runs, spikes, trends and decays.
-
-They know nothing of records: :mod:`bwbayes.diagnosis.record_checks` looks for them in voltages,
-displacements and the part of a displacement that the voltage does not explain; a fit's residual
-can be looked at in the same way.
-"""
+"""Shapes in a series of numbers: turning points, runs and spikes."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = [
-    "DecayingStart",
-    "decay",
-    "find_gross_outliers",
-    "runs",
-    "scatter",
-    "spikes",
-    "trend",
-    "turning_points",
-]
-
-# A normal distribution's sd over its median absolute deviation.
-NORMAL = 1.4826
+__all__ = ["find_gross_outliers", "runs", "scatter", "spikes", "turning_points"]
 
 # Samples in the median that a spike is held against: two beside each other are a spike still.
 NEIGHBORS = 5
-
-# Times the range of a line through the values, and of most residuals, that no actuator's
-# hysteresis, lag, creep or ringing lies off that line.
-GROSS = 2.0
-
-# Rounds of reweighting to the line of least absolute deviations.
-REWEIGHTED = 30
-
-
-class DecayingStart(NamedTuple):
-    """``size exp(-t / time)`` from the first sample on: size in the values' unit, time in s."""
-
-    size: float
-    time: float
 
 
 def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
@@ -55,7 +24,8 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
 
 def scatter(values: FloatArray) -> float:
     """Return the sd of values about their median, whatever a minority of them is."""
-    return NORMAL * float(np.median(np.abs(values - np.median(values))))
+    # A normal distribution's sd is 1.4826 times its median absolute deviation.
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def turning_points(values: FloatArray, least: float) -> IntArray:
@@ -128,11 +98,12 @@ def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
 
     They lie off the line of least absolute deviations through `values` over `drive` (samples,),
     which a minority does not move, by more than twice the range of that line and of the central
-    80% of the residuals. Ranges and fits are to be taken without them.
+    80% of the residuals: no actuator's hysteresis, lag, creep or ringing does. Ranges and fits are
+    to be taken without them.
     """
     line = np.stack([np.ones_like(drive), drive - drive.mean()])
     weights = np.ones_like(values)
-    for _ in range(REWEIGHTED):
+    for _ in range(30):
         # Sums, without the threads of a linear algebra library.
         products = np.einsum("in,n,jn->ij", line, weights, line)
         pulls = np.einsum("in,n,n->i", line, weights, values)
@@ -141,7 +112,7 @@ def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
         weights = 1 / np.maximum(off, 1e-6 * max(float(np.median(off)), 1e-300))
         weights /= weights.max()
     low, high = np.quantile(values - coefficients @ line, (0.1, 0.9))
-    far = off > GROSS * (abs(coefficients[1]) * np.ptp(drive) + high - low)
+    far = off > 2 * (abs(coefficients[1]) * np.ptp(drive) + high - low)
     first, length = runs(far)
     short = length <= NEIGHBORS // 2
     gross: IntArray = np.union1d(first[short], (first + length - 1)[short])
@@ -152,28 +123,3 @@ def _off_median(values: FloatArray, ends: bool) -> FloatArray:
     mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
     off: FloatArray = values - scipy.ndimage.median_filter(values, NEIGHBORS, mode=mode)
     return off
-
-
-def decay(time: FloatArray, values: FloatArray, longest: float) -> DecayingStart:
-    """Return the exponential decay from the first sample on that explains most of the values.
-
-    Parameters
-    ----------
-    time, values : arrays (samples,)
-        Times in s, not necessarily uniform; a constant in the values is taken out.
-    longest : float, s
-        Longest time constant to look for; the shortest is the first interval.
-    """
-    elapsed = time - time[0]
-    times = np.geomspace(max(elapsed[1], longest * 1e-6), longest, 40)
-    shapes = np.exp(-elapsed[:, np.newaxis] / times)
-    shapes -= shapes.mean(axis=0)
-    centered = values - values.mean()
-    sizes = shapes.T @ centered / (shapes**2).sum(axis=0)
-    best = int(np.argmax(sizes**2 * (shapes**2).sum(axis=0)))
-    return DecayingStart(float(sizes[best]), float(times[best]))
-
-
-def trend(time: FloatArray, values: FloatArray) -> float:
-    """Return how far a straight line through the values goes from the first to the last time."""
-    return float(np.polyfit(time - time.mean(), values, 1)[0] * np.ptp(time))

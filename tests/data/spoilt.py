@@ -155,11 +155,6 @@ def _clipped_tip(record: Record, g: Generator) -> Record:
     return _displaced(record, side * np.minimum(side * values, limit))
 
 
-def _clipped_voltage(record: Record, g: Generator) -> Record:
-    limit = np.max(record.voltage) - float(g.uniform(0.15, 0.3)) * np.ptp(record.voltage)
-    return replace(record, voltage=np.minimum(record.voltage, limit))
-
-
 def _drifting(record: Record, g: Generator) -> Record:
     values = _readings(record)
     size = float(g.choice([-1, 1])) * float(g.uniform(0.3, 0.6)) * np.ptp(values)
@@ -196,7 +191,6 @@ SPOILT: Mapping[str, Callable[[Record, Generator], Record]] = {
     "repeated samples": _dropped,
     "clipping": _clipped,
     "clipping of the tips": _clipped_tip,
-    "clipping of the voltage": _clipped_voltage,
     "drift": _drifting,
     "wrong units: mV": lambda record, _: replace(record, voltage=1e3 * record.voltage),
     "wrong units: nm": lambda record, _: _displaced(record, 1e3 * _readings(record)),

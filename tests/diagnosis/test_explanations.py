@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bwbayes.data import write_record
-from bwbayes.diagnosis import drive, model, noise, sensor
+from bwbayes.diagnosis import effects, model, noise
 from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.scene import Explanation, Scene
@@ -55,7 +55,7 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
     problem = problem_of(f'[record]\nfile = "record.h5"\nfrom_rest = true\n{LINEAR}', tmp_path)
     posterior, readings = problem.posterior, problem.posterior.only.readings.values
     along = np.linspace(0, 1, readings.size)
-    trend = sensor.columns(along[np.newaxis], 4.0)
+    trend = effects.add_shapes(along[np.newaxis], 4.0)
     lag = problem.record.interval * np.abs(np.subtract.outer(*2 * [np.arange(readings.size)]))
     covariance = 0.25 * np.exp(-lag / 0.2) + 0.09 * np.eye(readings.size)
     covariance += 0.09 * np.outer(problem.record.voltage, problem.record.voltage) + 25.0
@@ -80,11 +80,11 @@ def test_a_climb_ends_at_the_point_fit_with_its_laplace_evidence(tmp_path: Path)
 
 
 FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
-    "transient": sensor.transient,
-    "drift": sensor.drift,
-    "step": sensor.step,
-    "moving gain": sensor.moving_gain,
-    "delay": drive.delay,
+    "transient": effects.transient,
+    "drift": effects.drift,
+    "step": effects.step,
+    "moving gain": effects.moving_gain,
+    "delay": effects.delay,
     "outliers": noise.heavy_tails,
     "noise by speed": noise.growing_noise,
     "quadratic": model.nonlinearity,

@@ -1,0 +1,225 @@
+"""Effects beside the model: of the sensor, and of what lies between voltage and actuator.
+
+A sensor may add a drift, a transient, a step or an oscillation, have another sign, a gain that
+moves or a mount with backlash. An amplifier may be late, saturate, or be slow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import accumulate
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.laplace import Effect, Simulate, climb
+from bwbayes.diagnosis.record_checks import settle_fix
+from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.inference import pointfit
+
+__all__ = [
+    "add_shapes",
+    "backlash",
+    "delay",
+    "drift",
+    "moving_gain",
+    "oscillation",
+    "reversed_sign",
+    "saturation",
+    "slew_limit",
+    "step",
+    "transient",
+]
+
+# Prior sd of an addition to the displacement, as a fraction of its range.
+SIZE = 0.1
+
+
+def _add(shape: Callable[[FloatArray], FloatArray], starts: FloatArray) -> Effect:
+    """Add ``shape(sizes)`` (samples,), um, to the displacement."""
+    return Effect(lambda simulate, u, sizes: simulate(u) + shape(sizes)[: u.size], starts)
+
+
+def add_shapes(shapes: FloatArray, size: float) -> Effect:
+    """Add shapes (shapes, samples), each of a size whose prior sd is given, um."""
+    return _add(lambda sizes: size * (sizes @ shapes), np.zeros((1, len(shapes))))
+
+
+def _replace_voltage(
+    voltage: Callable[[FloatArray, FloatArray], FloatArray], starts: FloatArray
+) -> Effect:
+    """Drive the actuator with ``voltage(recorded, sizes)`` (samples,), V."""
+    return Effect(lambda simulate, u, sizes: simulate(voltage(u, sizes)), starts)
+
+
+def drift(scene: Scene) -> Iterator[Explanation]:
+    """Try A₁ t/T + A₂ (t/T)²."""
+    along = scene.time / scene.duration
+    fit = scene.extended(add_shapes(np.stack([along, along**2]), SIZE * scene.extent))
+    size = SIZE * scene.extent * float(np.sum(fit.sizes))
+    text = f"drift of the readings by {size:.2g} um"
+    yield scene.explained("drift", text, "measure again after a longer warm-up", fit, foreign=True)
+
+
+def transient(scene: Scene) -> Iterator[Explanation]:
+    """Try A exp(−t/τ); τ is a thirtieth of the record, within a factor of three."""
+
+    def decay(size: float) -> float:
+        return float(scene.duration / 30 * np.exp(1.1 * size))
+
+    def shape(sizes: FloatArray) -> FloatArray:
+        faded: FloatArray = np.exp(-scene.time / decay(sizes[1]))
+        return np.asarray(2 * SIZE * scene.extent * sizes[0] * faded)
+
+    fit = scene.extended(_add(shape, np.array([[0.0, z] for z in (-1.2, 0.0, 1.2)])))
+    size, time = 2 * SIZE * scene.extent * fit.sizes[0], decay(fit.sizes[1])
+    # Until a five-hundredth of the range is left of it.
+    until = time * np.log(max(abs(size) / (0.002 * scene.extent), 1.0))
+    text = f"transient of {size:.2g} um at the start that decays within {time:.2g} s"
+    window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
+    gone = int(np.searchsorted(scene.time[: scene.voltage.size], until))
+    fix = settle_fix(scene.voltage, gone, window)
+    yield scene.explained("transient", text, fix, fit, removes=True, foreign=True)
+
+
+def step(scene: Scene) -> Iterator[Explanation]:
+    """Try A from a time on: that of the largest innovation, whose choice is paid for."""
+    readings = scene.posterior.only.readings
+    white = np.abs(scene.innovations)
+    white[: max(white.size // 50, 1)] = 0.0
+    row = int(readings.rows[int(np.argmax(white))])
+    after = (np.arange(scene.time.size) >= row).astype(np.float64)
+    fit = scene.extended(add_shapes(after[np.newaxis], SIZE * scene.extent))
+    size, time = SIZE * scene.extent * fit.sizes[0], scene.clock(scene.time[row])
+    text = f"step of the offset by {size:.2g} um at {time} s"
+    cost = float(np.log(readings.rows.size))
+    yield scene.explained(
+        "step", text, f"fit one side: set train to end or begin at {time}", fit, cost
+    )
+
+
+def oscillation(scene: Scene) -> Iterator[Explanation]:
+    """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not."""
+    readings = scene.posterior.only.readings
+    length = 4 * readings.samples
+    values = np.zeros((2, readings.samples))
+    values[0, readings.rows] = scene.innovations
+    drive = scene.voltage[readings.rows]
+    values[1, readings.rows] = drive - np.mean(drive)
+    power = np.abs(np.fft.rfft(values * np.hanning(readings.samples), length)) ** 2
+    frequency = np.fft.rfftfreq(length, scene.interval)
+    # Not where the drive itself moves the displacement, at harmonics that a loop makes of it too.
+    main = frequency[int(np.argmax(power[1]))]
+    order = frequency / max(main, frequency[1])
+    near = np.abs(order - np.rint(order)) * main < 6 / scene.duration
+    power[0, near | (frequency < 3 * main)] = 0.0
+    best = float(frequency[int(np.argmax(power[0]))])
+    if not best:
+        return
+    phase = 2 * np.pi * best * scene.time
+    sd = SIZE * scene.extent / 10
+    fit = scene.extended(add_shapes(np.stack([np.sin(phase), np.cos(phase)]), sd))
+    text = f"oscillation of {sd * float(np.hypot(*fit.sizes)):.2g} um at {best:.4g} Hz"
+    fix = "look for the source: mains, ground loops, vibration"
+    cost = float(np.log(readings.rows.size / 2))
+    yield scene.explained("oscillation", text, fix, fit, cost)
+
+
+def moving_gain(scene: Scene) -> Iterator[Explanation]:
+    """Try x (1 + a t/T)."""
+    along = scene.time / scene.duration
+
+    def scaled(simulate: Simulate, voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+        return np.asarray(simulate(voltage) * (1 + SIZE * sizes[0] * along[: voltage.size]))
+
+    fit = scene.extended(Effect(scaled, np.zeros((1, 1))))
+    text = f"gain that changes by {100 * SIZE * fit.sizes[0]:.2g}% along the record (temperature)"
+    yield scene.explained("moving gain", text, "measure at a constant temperature", fit)
+
+
+def reversed_sign(scene: Scene) -> Iterator[Explanation]:
+    """Try −x, if the readings fall where the voltage rises."""
+    record = scene.posterior.only
+    readings, drive = record.readings, record.voltage[record.readings.rows]
+    if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) >= 0:
+        return
+    turned = scene.posterior.altered(displacement=-record.displacement)
+    fit = climb(turned, pointfit.fit(turned, scene.generator).mode)
+    text, fix = "reversed sign of the displacement", "change its sign in the file"
+    yield scene.explained("sign", text, fix, fit)
+
+
+def backlash(scene: Scene) -> Iterator[Explanation]:
+    """Try a play between actuator and sensor, of a twentieth of the range each way or so."""
+    scale = 0.05 * scene.extent
+
+    def followed(simulate: Simulate, voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+        # A sample later the sensor is where it was, held between low and high. To be held twice is
+        # to be held once, between other limits: these are found for 1, 2, 4 ... samples at a time.
+        moved, play = simulate(voltage), scale * abs(sizes[0])
+        low, high = moved - play, moved + play
+        held = 1
+        while held < voltage.size:
+            before, later = slice(None, -held), slice(held, None)
+            limits = [np.clip(end[:, before], low[:, later], high[:, later]) for end in (low, high)]
+            low[:, later], high[:, later] = limits
+            held *= 2
+        return np.clip(moved[:, :1], low, high)
+
+    fit = scene.extended(Effect(followed, np.array([[0.3], [1.0]])))
+    text = f"backlash of {2 * scale * abs(fit.sizes[0]):.2g} um in the mount"
+    yield scene.explained("backlash", text, "tighten the mount, or preload it", fit)
+
+
+def delay(scene: Scene) -> Iterator[Explanation]:
+    """Try u(t − δ); δ is a fiftieth of the time between reversals, give or take."""
+    scale = max(scene.turn_time / 50, scene.interval)
+
+    def shifted(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+        clock = scene.interval * np.arange(voltage.size)
+        return np.asarray(np.interp(clock - scale * sizes[0], clock, voltage))
+
+    fit = scene.extended(_replace_voltage(shifted, np.array([[0.0], [1.0]])))
+    text = f"delay of {1000 * scale * fit.sizes[0]:.2g} ms between voltage and displacement"
+    fix = "align the channels in the file, or set hold in [model] if the voltage is a command"
+    yield scene.explained("delay", text, fix, fit)
+
+
+def saturation(scene: Scene) -> Iterator[Explanation]:
+    """Try a voltage that ends at levels inside its recorded range."""
+    low, high = float(scene.voltage.min()), float(scene.voltage.max())
+
+    def limits(sizes: FloatArray) -> FloatArray:
+        depth = 0.2 * (high - low) * np.minimum(np.abs(sizes), 2.0)
+        return np.array([low + depth[0], high - depth[1]])
+
+    def clipped(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+        return np.clip(voltage, *limits(sizes))
+
+    starts = np.array([[0.0, 0.5], [0.5, 0.0], [0.5, 0.5]])
+    fit = scene.extended(_replace_voltage(clipped, starts))
+    lower, upper = limits(fit.sizes)
+    text = f"amplifier that saturates at {lower:.4g} and {upper:.4g} V"
+    fix = "record the amplifier's output voltage, or drive inside its range"
+    yield scene.explained("saturation", text, fix, fit)
+
+
+def slew_limit(scene: Scene) -> Iterator[Explanation]:
+    """Try a voltage that changes by no more than so many volts a second."""
+    fastest = float(np.max(np.abs(scene.rate)))
+
+    def limit(sizes: FloatArray) -> float:
+        return float(fastest * np.exp(-0.7 * abs(sizes[0])))
+
+    def limited(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+        step = limit(sizes) * scene.interval
+
+        def follow(reached: float, wanted: float) -> float:
+            return min(max(wanted, reached - step), reached + step)
+
+        return np.array([*accumulate(voltage.tolist(), follow)])
+
+    fit = scene.extended(_replace_voltage(limited, np.array([[0.3], [1.0], [2.0]])))
+    text = f"amplifier that follows no faster than {limit(fit.sizes):.3g} V/s"
+    fix = "record the amplifier's output voltage, or drive more slowly"
+    yield scene.explained("slew limit", text, fix, fit)
