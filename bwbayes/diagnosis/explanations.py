@@ -47,7 +47,7 @@ CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
 LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
 
-# Odds of twenty to one, nats: explanations nearer than this are both named.
+# Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))
 
 # A parameter that moves by more of its sds is another one.
@@ -59,13 +59,14 @@ def explain(
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
-    Unless ``thorough``, only the first of them, and all if any of these is worth anything.
+    Unless ``thorough``, only the first of them, and all if any of these leads by :data:`TIED`: of
+    few readings, which refuse nothing, an addition is worth next to nothing either way.
     ``watch`` is called with the share that is done.
     """
     explanations: list[Explanation] = []
     kinds = ADDITIONS + CHANGES
     for number, kind in enumerate(kinds):
-        if number == len(ADDITIONS) and not thorough and all(e.nats <= 0 for e in explanations):
+        if number == len(ADDITIONS) and not thorough and all(e.nats <= TIED for e in explanations):
             break
         explanations += kind(scene)
         watch((number + 1) / len(kinds))
