@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.wished import Reference
+from bwbayes.control.references import Reference
 from bwbayes.data.io.formats import write_record
 from bwbayes.data.record import Record
 from bwbayes.model.linear import HOLD_NAMES, Hold
@@ -112,20 +112,16 @@ class Compensation:
 
     ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
     ``smoothed``; ``reference`` is what was asked for; ``command`` says which of the two voltages
-    was taken; ``compensated`` is that command, ``linear`` the one without compensation;
-    ``difference`` the largest difference of the two voltages that could have been taken, V, and
-    ``other`` what the other one leaves, as ``Played.smoothed.expected``, um. ``limit`` is that of
-    the error, um, if there is one; ``hold`` what the command does between samples, and ``between``
-    how far the displacement leaves straight lines there, um. ``standing`` is how the validation of
-    the run came out that all of this builds on.
+    was taken; ``compensated`` is that command, ``linear`` the one without compensation. ``limit``
+    is that of the error, um, if there is one; ``hold`` what the command does between samples, and
+    ``between`` how far the displacement leaves straight lines there, um. ``standing`` is how the
+    validation of the run came out that all of this builds on.
     """
 
     reference: Reference
     command: Choice
     compensated: Played
     linear: Played
-    difference: float
-    other: float
     hold: Hold
     between: float
     from_rest: bool
@@ -177,10 +173,6 @@ class Compensation:
             "limit_um": self.limit,
             "compensated": self.compensated.numbers(self.limit),
             "uncompensated": self.linear.numbers(self.limit),
-            "other_command": {
-                "largest_difference_V": self.difference,
-                "to_smoothed_reference": {"expected_rms_um": self.other},
-            },
             "remarks": list(self.remarks),
         }
 
@@ -280,8 +272,12 @@ class Compensation:
         )
 
     @property
-    def _commands(self) -> dict[str, Played]:
-        return {"uncompensated": self.linear, "compensated": self.compensated}
+    def _commands(self) -> dict[str, Any]:
+        """The commands as their figures take them."""
+        from bwbayes.report.figures.compensation import Command  # noqa: PLC0415  # slow to load
+
+        played = {"uncompensated": self.linear, "compensated": self.compensated}
+        return {n: Command(p.voltage, p.bands, p.rms) for n, p in played.items()}
 
     def _promise(self) -> str:
         after, before = self.compensated, self.linear
@@ -317,7 +313,6 @@ class Compensation:
         )
 
     def _facts(self) -> list[tuple[str, str]]:
-        alternative: Choice = "expected" if self.command == "mean" else "mean"
         target, interval = self.asked, self.reference.interval
         return [
             (
@@ -326,13 +321,6 @@ class Compensation:
                 f"{target.size} samples every {interval:g} s",
             ),
             ("Command", COMMANDS[self.command]),
-            (
-                "The other command",
-                f"{COMMANDS[alternative]}: differs by up to {self.difference:.3g} V, and leaves "
-                f"{self.other:.4g} µm (rms expected over the draws, without the discrepancy, to "
-                "the reference as smoothed) where this one leaves "
-                f"{self.compensated.smoothed.expected:.4g} µm",
-            ),
             ("Voltage between samples", HOLDS[self.hold]),
             (
                 "Displacement between samples",

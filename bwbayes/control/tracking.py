@@ -17,7 +17,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Robustness, design
 from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, TrackingErrors, follow
-from bwbayes.control.references import SHAPES, reference
+from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.control.tracked import CONTROLLERS, Tracking
 from bwbayes.errors import InputError
@@ -107,10 +107,10 @@ def track(
     rise = _rise(mean)
     gains, satisfied = design(mean, draws, limits, stand.delay, robustness)
 
-    names = tuple(SHAPES)
+    names = tuple(TRACKED)
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(names), 1)))
     references = [
-        reference(frequency, actuator.interval, center, amplitude, rise)
+        tracking_signals(frequency, actuator.interval, center, amplitude, rise)
         for frequency in frequencies
     ]
     models = SampledModel.of(

@@ -15,7 +15,7 @@ from bwbayes.app.commands.compensate import compensate as command
 from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.predicted import FILES, Compensation
-from bwbayes.control.wished import shaped
+from bwbayes.control.references import shaped
 from bwbayes.errors import InputError
 
 VOLTAGE = (-100.0, 100.0)

@@ -20,7 +20,7 @@ from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
-from bwbayes.control.wished import Reference
+from bwbayes.control.references import Reference
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import LaserSensor, VirtualTestStand
 from bwbayes.data.waveforms import signal

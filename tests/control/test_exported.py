@@ -80,7 +80,7 @@ def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None
     np.testing.assert_allclose(displacement, expected, rtol=0, atol=1e-12 * np.ptp(expected))
 
 
-@every_actuator
+@pytest.mark.parametrize("name", ["bouc-wen with all", "linear, second-order, creep"])
 @every_hold
 def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     """scipy.signal simulates from the drive what the actuator does."""
@@ -101,7 +101,7 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
 
 
-@every_actuator
+@pytest.mark.parametrize("name", ["bouc-wen with all", "linear, second-order, creep"])
 def test_the_frequency_response_is_that_of_the_system(name: str) -> None:
     actuator = cases.actuator(name, "zero")
     theta = cases.theta(actuator, 2, name)
@@ -116,7 +116,7 @@ def test_the_frequency_response_is_that_of_the_system(name: str) -> None:
         np.testing.assert_allclose(row, np.sum(each, axis=(1, 2)), rtol=1e-10)
 
 
-@every_actuator
+@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, gain"])
 def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     made = of(name, "first")
     numbers = json.loads(json.dumps(made.numbers(), allow_nan=False))

@@ -9,7 +9,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.references import SHAPES, reference
+from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.tracked import CONTROLLERS, Tracking
 from bwbayes.control.tracking import track
 from bwbayes.errors import InputError
@@ -48,7 +48,7 @@ def test_feed_forward_and_feedback_together_beat_either_alone(tracking: Tracking
 
 def test_the_table_says_what_the_arrays_say(tracking: Tracking) -> None:
     frame = tracking.to_pandas()
-    assert len(CONTROLLERS) * len(SHAPES) * 3 == len(frame)
+    assert len(CONTROLLERS) * len(TRACKED) * 3 == len(frame)
     row = frame.query("signal == 'steps' and frequency_Hz == 10 and controller == 'PID'").iloc[0]
     errors = tracking.rms[2, 1, tracking.signals.index("steps")]
     assert errors.mean() == row["rms_um"]
@@ -88,17 +88,17 @@ def test_a_range_on_one_side_of_zero_is_approached_first() -> None:
 
 @pytest.mark.parametrize("frequency", [0.5, 20.0])
 def test_references_swing_by_their_amplitude_and_jump_in_time(frequency: float) -> None:
-    signals, begins = reference(frequency, 1e-3, 30.0, 10.0, rise=8)
+    signals, begins = tracking_signals(frequency, 1e-3, 30.0, 10.0, rise=8)
     assert 1000 == begins
     assert np.abs(np.diff(signals[:, :begins])).max() < 0.05
     swung = signals[:, begins:] - 30.0
     np.testing.assert_allclose(np.abs(swung).max(axis=1)[[0, 2]], 10.0, rtol=5e-3)
     assert (np.abs(swung) <= 10 + 1e-9).all()
-    jumps = np.flatnonzero(np.diff(swung[list(SHAPES).index("steps")]) != 0)
+    jumps = np.flatnonzero(np.diff(swung[list(TRACKED).index("steps")]) != 0)
     # A jump takes its samples, and no more.
     starts = np.flatnonzero(np.diff(jumps, prepend=-9) > 1)
     assert (np.diff(np.append(starts, jumps.size)) <= 8).all()
-    assert 0 == reference(frequency, 1e-3, 0.0, 10.0)[1]
+    assert 0 == tracking_signals(frequency, 1e-3, 0.0, 10.0)[1]
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from bwbayes.app.jobs.export import export
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.control.compensation import compensate
 from bwbayes.control.exported import exported
+from bwbayes.control.references import Reference, shaped
 from bwbayes.control.sampled import SampledModel
-from bwbayes.control.wished import Reference, shaped
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.errors import InputError
@@ -70,11 +70,22 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     np.testing.assert_allclose(compiled.run("inverse", 0.0, reference), command[:-1], atol=1e-6)
 
 
-# Operators that integrate take half a minute to find in which states a record may begin.
 @pytest.mark.parametrize(
     ("hysteresis", "from_rest"),
-    [(name, True) for name in HYSTERESIS]
-    + [(name, False) for name in HYSTERESIS if name not in ("jiles-atherton", "domain-wall")],
+    [
+        *(
+            (name, True)
+            if name in ("bouc-wen", "preisach")
+            else pytest.param(name, True, marks=pytest.mark.slow)
+            for name in HYSTERESIS
+        ),
+        *(
+            (name, False)
+            if name in ("bouc-wen", "plays")
+            else pytest.param(name, False, marks=pytest.mark.slow)
+            for name in HYSTERESIS
+        ),
+    ],
 )
 def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool) -> None:
     """At zero volts and 0 um, with every operator, whatever the sensor's offset."""
@@ -91,7 +102,7 @@ def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool
             np.testing.assert_allclose(edges, 0.0, atol=1e-6 if kind == "parameter" else spread)
 
 
-@pytest.mark.parametrize("name", cases.ACTUATORS)
+@pytest.mark.parametrize("name", ["bouc-wen with all", "maxwell-slip with all"])
 def test_a_sampled_model_stands_at_zero_at_zero_volts(name: str, tmp_path: Path) -> None:
     """Also with a gain about another voltage, and creep."""
     gain = PolynomialGain(("quadratic", "cubic"), Span(0.0, 80.0))

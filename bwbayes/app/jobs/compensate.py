@@ -18,7 +18,7 @@ from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.app.problem.problem import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.predicted import Choice, Compensation
-from bwbayes.control.wished import SHAPES, Reference, shaped
+from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.data.io.formats import read_reference
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.errors import InputError, suggestion
@@ -149,8 +149,8 @@ def reference_of(requested: Any, default: float, **options: Any) -> Reference:
     default
         Sampling interval, s, where neither the file nor ``options`` say it.
     options
-        ``interval``, ``smoothed`` and those of :func:`~bwbayes.control.wished.shaped`; what is None
-        is not given.
+        ``interval``, ``smoothed`` and those of :func:`~bwbayes.control.references.shaped`; what is
+        None is not given.
 
     Raises
     ------

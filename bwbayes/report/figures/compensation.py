@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,20 +32,12 @@ BAND_OF: Mapping[Kind, str] = {
 }
 
 
-class Command(Protocol):
-    """A command and what it does."""
+class Command(NamedTuple):
+    """A command, its bands of the displacement, and its rms errors (draws,), um."""
 
-    @property
-    def voltage(self) -> FloatArray:
-        """The command, (samples,), V."""
-
-    @property
-    def bands(self) -> Bands:
-        """Those of the displacement."""
-
-    @property
-    def rms(self) -> FloatArray:
-        """Rms error (draws,), um."""
+    voltage: FloatArray
+    bands: Bands
+    rms: FloatArray
 
 
 # By name: "uncompensated" and "compensated".
