@@ -5,7 +5,7 @@ residuals are, and whether the residuals lean to one side. What luck alone may d
 depends on how many independent readings a record is worth, and that is far fewer than it has: its
 discrepancy forgets slowly, and the parameters' error is one and the same all along. The bands
 themselves say how large each part is, so that the number follows from the model
-(:mod:`bwbayes.results.standard`). Validation fails where luck would do it in one of 5,000 good
+(:mod:`bwbayes.results.departures`). Validation fails where luck would do it in one of 5,000 good
 records, and is inconclusive where it would in one of a hundred, or where the record is worth too
 few readings. A fit is judged on its own readings too. There the noise model grows until it covers
 whatever the model misses, so that a fit fails when it misses more than a part of the displacement's
@@ -25,37 +25,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.data.io.grid import clock
 from bwbayes.diagnosis.explanations import followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.bands import Bands, titled
-from bwbayes.results.causes import LEAD_IN_ALARM, cause, goes_against
-from bwbayes.results.departures import (
-    ALARM,
-    coverage,
-    extremes,
-    leaning,
-    missed,
-    percent,
-    size,
-    too_wide,
-)
-from bwbayes.results.standard import Standard, standardized
+from bwbayes.results.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
+from bwbayes.results.departures import Standardized, percent
 from bwbayes.shown import brief
 
 __all__ = ["STATUSES", "Background", "Verdict", "assess"]
 
 # Worth fewer independent readings than this a record cannot show that bands hold.
-FEWEST = 5.0
-
-# The quantile of the discrepancy's time that the judgment goes by: rather too long than too short.
-LONG = 0.9
-
-# Part of the bands' variance that an offset from a lead-in of sufficient length has.
-SETTLED = 0.15
+MIN_EFFECTIVE_SIZE = 5.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +51,7 @@ class Background:
     memory
         Correlation time of the discrepancy, s; to be on the safe side, a high quantile of its
         posterior. Zero without a discrepancy.
-    unsure
+    noise_log_sd
         Sd of the logarithm of the noise's sd over the draws: how well its size is known.
     fitted
         Lowest and highest voltage that was fitted, V.
@@ -78,27 +62,28 @@ class Background:
     __repr__ = brief
 
     memory: float = 0.0
-    unsure: float = 0.0
+    noise_log_sd: float = 0.0
     fitted: tuple[float, float] = (-np.inf, np.inf)
     extent: float = 0.0
 
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
         """Return what a posterior and its draws (draws, free) say."""
-        memory, unsure = [], []
-        for _, alone, its in posterior.each(draws):
-            dataset = alone.only
-            noise = dataset.table.noise(alone.prior.theta(its))
-            memory.append(float(np.quantile(dataset.noise.memory(noise), LONG)))
+        memory, noise_log_sd = [], []
+        for _, single, record_draws in posterior.each(draws):
+            dataset = single.only
+            noise = dataset.table.noise(single.prior.theta(record_draws))
+            # Rather too long than too short.
+            memory.append(float(np.quantile(dataset.noise.memory(noise), 0.9)))
             sds = dataset.noise.marginal_sd(noise)
-            unsure.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
+            noise_log_sd.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
         datasets = posterior.datasets
         voltage = np.concatenate(
             [dataset.voltage[window] for dataset in datasets for window in dataset.training]
         )
         return cls(
             max(memory),
-            max(unsure),
+            max(noise_log_sd),
             (float(voltage.min()), float(voltage.max())),
             max(dataset.extent for dataset in datasets),
         )
@@ -195,36 +180,32 @@ def assess(
     judged[: bands.scored_from] = False
     if not judged.any():
         return None
-    standard = standardized(bands, judged, background.memory, background.unsure)
-    chances = [
-        *coverage(bands, judged, standard),
-        *size(standard),
-        *leaning(bands, judged, standard),
-    ]
-    reasons = [
-        *goes_against(bands, judged, background.fitted),
-        *(text for text, chance in chances if chance < ALARM),
-        *extremes(bands, judged, standard),
-        *(missed(bands, judged, background.extent) if bands.training else []),
-        *too_wide(standard),
-    ]
+    standard = Standardized.of(bands, judged, background.memory, background.noise_log_sd)
+    reasons = standard.reasons(background.fitted, background.extent)
     likely = likely_causes(explanations)
     verdict = Verdict(bands.name, bands.training, True, separate=bands.separate)
     verdict = replace(verdict, notes=_lead_in(bands))
     if reasons:
-        why = joined(likely) or cause(bands, judged, background.memory, background.fitted, beyond)
+        why = joined(likely) or (
+            REVERSED_SIGN
+            if reasons[0].startswith("the readings fall")
+            else cause(bands, judged, background.memory, beyond)
+        )
         return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
-    advice = _offset_advice(bands, judged, standard)
-    doubts = [f"{text}, which may be luck (p = {chance:.1g}){advice}" for text, chance in chances]
+    advice = _offset_advice(standard)
+    doubts = [
+        f"{text}, which may be luck (p = {chance:.1g}){advice}"
+        for text, chance in standard.chances()
+    ]
     followed = joined(followed_causes(explanations))
     if followed is not None:
         doubts.append(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
         )
-    if standard.worth < FEWEST:
+    if standard.effective_size < MIN_EFFECTIVE_SIZE:
         doubts.append(
-            f"effective sample size {standard.worth:.1f} is too small to validate the bands; "
-            f"use a record {FEWEST / standard.worth:.2g} times as long"
+            f"effective sample size {standard.effective_size:.1f} is too small to validate the "
+            f"bands; use a record {MIN_EFFECTIVE_SIZE / standard.effective_size:.2g} times as long"
         )
     if doubts:
         return replace(verdict, holds=None, reasons=tuple(doubts), cause=followed)
@@ -241,18 +222,19 @@ def _lead_in(bands: Bands) -> tuple[str, ...]:
     return (f"the lead-in of {span} s does not fit the model ({p_value})",)
 
 
-def _offset_advice(bands: Bands, judged: BoolArray, standard: Standard) -> str:
+def _offset_advice(standard: Standardized) -> str:
     """Name a large share of the offset in the variance, and the lead-in that makes it small."""
+    bands, small = standard.bands, 0.15
     lead = bands.lead_in
-    if lead is None or standard.common <= SETTLED:
+    if lead is None or standard.common <= small:
         return ""
     # The variance of a mean of correlated readings falls with their time.
-    length = (lead.stop - lead.start) * standard.common / SETTLED
-    half_duration = float(np.ptp(bands.time[judged])) / 2
+    length = (lead.stop - lead.start) * standard.common / small
+    half_duration = float(np.ptp(bands.time[standard.judged])) / 2
     longer = (
         f"lead_in = {length:.2g}" if length < half_duration else f"a record of {3 * length:.2g} s"
     )
     return (
         f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
-        f"{percent(standard.common)} of the band's variance; use {longer} for {percent(SETTLED)}"
+        f"{percent(standard.common)} of the band's variance; use {longer} for {percent(small)}"
     )
