@@ -10,15 +10,14 @@ by itself is looked at again.
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from bwbayes.app.running.lock import drafted, only_writer
+from bwbayes.app.running.folder import Folder
 from bwbayes.data.io.formats import SUFFIXES
 from bwbayes.errors import InputError
 
@@ -42,10 +41,10 @@ class Origin(BaseModel):
 
 
 @dataclass(frozen=True)
-class CampaignFolder:
+class CampaignFolder(Folder):
     """The files of one campaign, by what they are."""
 
-    path: Path
+    KIND: ClassVar[str] = "campaign"
 
     @property
     def config(self) -> Path:
@@ -107,9 +106,9 @@ class CampaignFolder:
             return existing
         if path.exists() and any(path.iterdir()) and not folder.mark.is_file():
             raise InputError(f"{path}: is not a campaign's folder; choose another")
-        with drafted(path, "campaign") as draft:
-            cls(draft).config.write_text(config, encoding="utf-8")
-            cls(draft).mark.write_text(origin.model_dump_json(), encoding="utf-8")
+        with folder.drafted() as draft:
+            draft.config.write_text(config, encoding="utf-8")
+            draft.mark.write_text(origin.model_dump_json(), encoding="utf-8")
         return folder
 
     @classmethod
@@ -149,10 +148,6 @@ class CampaignFolder:
             return (run / ENDED).read_text(encoding="utf-8") == ended(digest(file), run)
         except (OSError, UnicodeError):
             return False
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Hold the folder as its only writer, as :func:`only_writer` does."""
-        return only_writer(self.path, "campaign")
 
 
 def records_in(folder: Path) -> list[Path]:

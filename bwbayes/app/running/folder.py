@@ -1,6 +1,6 @@
-"""The folder of a run or a calibration: what is in it, who may write it, and how it comes to be.
+"""The folders of runs, calibrations and campaigns: what is in them, and who may write them.
 
-The folder appears in one step, with the resolved config and the records in it, so that its work can
+A folder appears in one step, with the resolved config and the records in it, so that its work can
 be continued from any moment on. It is never overwritten unless that is asked for, and a lock
 refuses a second writer.
 """
@@ -8,26 +8,83 @@ refuses a second writer.
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from filelock import FileLock, Timeout
+
 from bwbayes.app.config.config import dump, load
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.running.lock import drafted, only_writer
 from bwbayes.data import write_record
 from bwbayes.errors import InputError
 from bwbayes.results.standing import Standing
 
-__all__ = ["CalibrationFolder", "RunFolder"]
+__all__ = ["CalibrationFolder", "Folder", "RunFolder"]
 
 
 @dataclass(frozen=True)
-class RunFolder:
-    """The files of one run, by what they are."""
+class Folder:
+    """A folder of work that comes whole or not at all, and that one process at a time writes."""
 
     path: Path
+
+    KIND: ClassVar[str] = ""
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder as its only writer.
+
+        Raises
+        ------
+        InputError
+            Another process holds it, or it cannot be written.
+        """
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
+            ) from None
+        except OSError as error:
+            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @contextmanager
+    def drafted(self) -> Iterator[Self]:
+        """Give a draft of the folder, with ``records`` in it, that takes its place when whole.
+
+        Raises
+        ------
+        InputError
+            It cannot be written, or another process is writing the one that it replaces.
+        """
+        draft = self.path.absolute().with_name(f".{self.path.name}.partial")
+        try:
+            shutil.rmtree(draft, ignore_errors=True)
+            (draft / "records").mkdir(parents=True)
+            yield type(self)(draft)
+            if self.path.exists():
+                with self.locked():
+                    shutil.rmtree(self.path)
+            draft.rename(self.path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{self.path}: {reason}; choose another folder") from None
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class RunFolder(Folder):
+    """The files of one run, by what they are."""
 
     # What it holds, the file that only such a folder has at its start, and what begins and resumes
     # it.
@@ -94,13 +151,14 @@ class RunFolder:
             It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
         cls.require_free(path, overwrite)
-        with drafted(path, cls.KIND) as draft:
+        folder = cls(path)
+        with folder.drafted() as draft:
             for name, record in {**problem.records, **problem.others}.items():
-                write_record(record, draft / f"records/{name}.h5")
-            (draft / "config.toml").write_text(dump(problem.config), encoding="utf-8")
+                write_record(record, draft.path / f"records/{name}.h5")
+            draft.config.write_text(dump(problem.config), encoding="utf-8")
             if cls.MARK:
-                (draft / cls.MARK).write_bytes(mark)
-        return cls(path)
+                (draft.path / cls.MARK).write_bytes(mark)
+        return folder
 
     @classmethod
     def require_free(cls, path: Path, overwrite: bool) -> None:
@@ -144,10 +202,6 @@ class RunFolder:
         """Tell a run's folder from a calibration's, and from what is neither."""
         is_calibration = (self.path / CalibrationFolder.MARK).is_file()
         return self._has_records() and is_calibration == (self.MARK is not None)
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Hold the folder as its only writer, as :func:`only_writer` does."""
-        return only_writer(self.path, self.KIND)
 
 
 @dataclass(frozen=True)
