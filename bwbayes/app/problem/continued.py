@@ -8,8 +8,9 @@ together before anything else is done with them, and the fit is that of the whol
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,17 +21,6 @@ from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
 
 __all__ = ["joined"]
-
-# Sampling intervals that differ by less are one.
-ROUNDED = 1e-6
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A record's name, and how much later its samples are on the clock of the whole, s."""
-
-    name: str
-    shift: float
 
 
 def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[str, Record]]:
@@ -57,20 +47,28 @@ def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[
         return config, dict(records)
     wholes: dict[str, Record] = {}
     tables: dict[str, RecordConfig] = {}
-    parts: dict[str, tuple[str, float]] = {}
+    roots: dict[str, str] = {}
+    shifts: dict[str, float] = {}  # how much later a record is on the clock of its whole, s
     for root in records:
         if config.records[root].continues is not None:
             continue
-        chain, record = [_Part(root, 0.0)], records[root]
-        while (name := after.get(chain[-1].name)) is not None:
-            _require_next(config, chain[-1].name, name, records)
-            end = record.start + record.duration
-            chain.append(_Part(name, end - records[name].start))
-            record = _put_together(record, records[name])
-        wholes[root] = record
-        tables[root] = _table(config, chain, records)
-        parts |= {link.name: (root, link.shift) for link in chain}
-    validation = {name: _moved(held_out, parts) for name, held_out in config.validation.items()}
+        wholes[root], last = records[root], root
+        roots[root], shifts[root] = root, 0.0
+        while (name := after.get(last)) is not None:
+            _require_next(config, last, name, records)
+            roots[name] = root
+            shifts[name] = wholes[root].start + wholes[root].duration - records[name].start
+            wholes[root] = _put_together(wholes[root], records[name])
+            last = name
+        parts = {name: shifts[name] for name in roots if roots[name] == root}
+        tables[root] = _table(config, parts, records)
+    circle = [name for name in records if name not in roots]
+    if circle:
+        names = ", ".join([*circle, circle[0]])
+        raise InputError(f"{place_of(circle[0])}.continues: a circle ({names}); one is the first")
+    validation = {
+        name: _moved(held_out, roots, shifts) for name, held_out in config.validation.items()
+    }
     return config.model_copy(update={"record": tables, "validation": validation}), wholes
 
 
@@ -78,106 +76,87 @@ def _after(config: Config) -> dict[str, str]:
     """Return which record comes after which, by the name of the one before."""
     after: dict[str, str] = {}
     for name, source in config.records.items():
-        if source.continues is None:
+        before = source.continues
+        if before is None:
             continue
-        key, others = f"{place_of(name)}.continues", [n for n in config.records if n != name]
-        if source.continues == name:
-            raise InputError(f"{key}: the record itself; name the one measured before it")
-        if source.continues not in others:
-            hint = suggestion(source.continues, others) if others else "remove it"
-            raise InputError(f"{key}: no other record {source.continues!r}; {hint}")
-        if source.continues in after:
-            raise InputError(
-                f"{key}: {after[source.continues]} continues {source.continues} too; one record can"
-            )
-        if source.from_rest:
-            raise InputError(
-                f"{key}: it starts where {source.continues} ends; remove its from_rest"
-            )
-        if source.file is None:
-            raise InputError(f"{key}: the stand starts every signal at rest; give files")
-        after[source.continues] = name
-    for name in after.values():
-        visited, at = [name], config.records[name].continues
-        while at is not None and at not in visited:
-            visited.append(at)
-            at = config.records[at].continues
-        if at is not None:
-            circle = ", ".join([*visited[visited.index(at) :], at])
-            raise InputError(f"{place_of(name)}.continues: a circle ({circle}); one is the first")
+        others = [other for other in config.records if other != name]
+        hint = suggestion(before, others) if others else "remove it"
+        wrong = {
+            "the record itself; name the one measured before it": before == name,
+            f"no other record {before!r}; {hint}": before not in others,
+            f"{after.get(before)} continues {before} too; one record can": before in after,
+            f"it starts where {before} ends; remove its from_rest": source.from_rest,
+            "the stand starts every signal at rest; give files": source.file is None,
+        }
+        _refuse(name, wrong)
+        after[before] = name
     return after
+
+
+def _refuse(name: str, wrong: Mapping[str, bool]) -> None:
+    """Refuse what a record continues, for the first reason that is true."""
+    for reason, true in wrong.items():
+        if true:
+            raise InputError(f"{place_of(name)}.continues: {reason}")
 
 
 def _require_next(config: Config, before: str, name: str, records: Mapping[str, Record]) -> None:
     """Refuse a record that cannot go on where another ends."""
-    key, first, other = f"{place_of(name)}.continues", records[before], records[name]
-    if not np.isclose(first.interval, other.interval, rtol=ROUNDED, atol=0):
-        raise InputError(
-            f"{key}: sampled every {other.interval:g} s, {before} every {first.interval:g} s; "
-            "remove it, they are two records"
-        )
-    if first.voltage_is != other.voltage_is:
-        raise InputError(
-            f"{key}: its voltage is the {other.voltage_is}, that of {before} the "
-            f"{first.voltage_is}; see voltage_is, or remove it"
-        )
-    if config.records[before].stop is not None:
-        raise InputError(f"{key}: {before} is cut by its stop; remove one of them")
+    first, other = records[before], records[name]
     end = first.start + first.duration
     # A clock of its own begins where that of the record before did, or earlier.
     own_clock = other.start <= first.start + first.interval / 2
-    if not own_clock and abs(other.start - end) > first.interval / 2:
-        raise InputError(
-            f"{key}: begins at {other.start:g} s, {before} ends at {end:g} s; a record can only "
-            "be continued at once"
-        )
+    wrong = {
+        f"sampled every {other.interval:g} s, {before} every {first.interval:g} s; remove it, they "
+        "are two records": not np.isclose(first.interval, other.interval, rtol=1e-6, atol=0),
+        f"its voltage is the {other.voltage_is}, that of {before} the {first.voltage_is}; see "
+        "voltage_is, or remove it": first.voltage_is != other.voltage_is,
+        f"{before} is cut by its stop; remove one of them": config.records[before].stop is not None,
+        f"begins at {other.start:g} s, {before} ends at {end:g} s; a record can only be continued "
+        "at once": not own_clock and abs(other.start - end) > first.interval / 2,
+    }
+    _refuse(name, {reason: bool(true) for reason, true in wrong.items()})
 
 
 def _put_together(first: Record, other: Record) -> Record:
     """Return the record of two, the second right after the first."""
-    assert first.displacement is not None
-    assert other.displacement is not None
-    truth = None
-    if first.truth is not None and other.truth is not None:
-        truth = np.concatenate([first.truth, other.truth])
-    return replace(
-        first,
-        voltage=np.concatenate([first.voltage, other.voltage]),
-        displacement=np.concatenate([first.displacement, other.displacement]),
-        truth=truth,
-        origin=f"{first.origin}, then {other.origin}",
-    )
+    series: dict[str, Any] = {}
+    for name in ("voltage", "displacement", "truth"):
+        values = getattr(first, name), getattr(other, name)
+        series[name] = None if any(v is None for v in values) else np.concatenate(values)
+    return replace(first, **series, origin=f"{first.origin}, then {other.origin}")
 
 
-def _table(config: Config, chain: Sequence[_Part], records: Mapping[str, Record]) -> RecordConfig:
+def _table(
+    config: Config, shifts: Mapping[str, float], records: Mapping[str, Record]
+) -> RecordConfig:
     """Return what a config says of a whole: windows and outliers of all parts, on one clock."""
-    sources = [config.records[link.name] for link in chain]
+    sources = {name: config.records[name] for name in shifts}
     train = outliers = None
-    if any(source.train is not None for source in sources):
+    if any(source.train is not None for source in sources.values()):
         train = [
-            [edge + link.shift for edge in window]
-            for link, source in zip(chain, sources, strict=True)
-            for window in source.train or [list(whole(records[link.name]))]
+            [edge + shifts[name] for edge in window]
+            for name, source in sources.items()
+            for window in source.train or [list(whole(records[name]))]
         ]
-    if all(source.outliers is not None for source in sources):
+    if all(source.outliers is not None for source in sources.values()):
         outliers = [
-            time + link.shift
-            for link, source in zip(chain, sources, strict=True)
+            time + shifts[name]
+            for name, source in sources.items()
             for time in source.outliers or ()
         ]
-    remarks = [text for source in sources for text in source.remarks or ()] or None
+    remarks = [text for source in sources.values() for text in source.remarks or ()] or None
     changes = {"train": train, "outliers": outliers, "remarks": remarks, "continues": None}
-    return sources[0].model_copy(update=changes)
+    return next(iter(sources.values())).model_copy(update=changes)
 
 
 def _moved(
-    validation: ValidationConfig, parts: Mapping[str, tuple[str, float]]
+    validation: ValidationConfig, roots: Mapping[str, str], shifts: Mapping[str, float]
 ) -> ValidationConfig:
     """Return a validation of the whole for one of a part."""
     if validation.of is None:
         return validation
-    root, shift = parts[validation.of]
     window = validation.window
     if window is not None and not validation.another:
-        window = [[edge + shift for edge in edges] for edges in window]
-    return validation.model_copy(update={"of": root, "window": window})
+        window = [[edge + shifts[validation.of] for edge in edges] for edges in window]
+    return validation.model_copy(update={"of": roots[validation.of], "window": window})

@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -35,9 +36,6 @@ __all__ = [
     "place_of",
     "readings_of",
 ]
-
-# No parameter in the package's units is larger than this, or smaller than its inverse, but zero.
-LARGEST = 1e60
 
 
 def parameters_of(
@@ -100,14 +98,14 @@ def contexts_of(
         extents for extents in ranges.values() if extents.voltage > 0 and extents.displacement > 0
     ]
     if not varied:
-        (table,) = [place_of(name) for name in list(records)[:1]]
+        table = place_of(next(iter(records)))
         raise InputError(f"{table}.train: voltage or displacement is constant there; widen it")
     pooled = joined(varied)
-    contexts = {"": Context(pooled, dict(_stated(config)))}
+    contexts = {"": Context(pooled, _stated(config))}
     for name, extents in ranges.items():
         # A record whose voltage stands still says where its sensor is, and nothing else.
         extent = extents if extents in varied else replace(pooled, middle=extents.middle)
-        contexts[name] = Context(extent, dict(_stated(config, name)))
+        contexts[name] = Context(extent, _stated(config, name))
     return contexts
 
 
@@ -122,15 +120,16 @@ def readings_of(record: Record) -> FloatArray:
     return record.displacement
 
 
-def _stated(config: Config, record: str = "") -> Iterator[tuple[str, float | Distribution]]:
-    """Yield what the config states of parameters, also of a record's own: values, and priors."""
-    suffix = f"[{record}]"
+def _stated(config: Config, record: str = "") -> dict[str, float | Distribution]:
+    """Return what the config states of parameters, also of a record's own: values, and priors."""
+    values: dict[str, float | Distribution] = {}
     for name, stated in config.parameters.items():
-        plain = name.removesuffix(suffix)
+        plain = name.removesuffix(f"[{record}]")
         if stated.prior is not None:
-            yield plain, _distribution(name, stated.prior)
+            values[plain] = _distribution(name, stated.prior)
         elif stated.fixed is not None:
-            yield plain, stated.fixed
+            values[plain] = stated.fixed
+    return values
 
 
 def every_declaration() -> list[Declaration]:
@@ -138,23 +137,23 @@ def every_declaration() -> list[Declaration]:
     operators = (make().parameters for make in HYSTERESIS.values())
     filters = (make().parameters for make in DYNAMICS.values())
     noises = (make(interval=1.0).declarations for make in NOISES.values())
-    crept = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
-    others = PolynomialGain().parameters, crept.parameters, (OFFSET,)
-    return [d for declared in (*operators, *filters, *others, *noises) for d in declared]
+    creep = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
+    others = PolynomialGain().parameters, creep.parameters, (OFFSET,)
+    return [*chain.from_iterable((*operators, *filters, *others, *noises))]
 
 
 def _require_known(
     table: str, stated: Collection[str], declarations: Collection[Declaration]
 ) -> None:
+    """Refuse what is said of a parameter that the model does not have."""
+    names = list(dict.fromkeys(d.name for d in declarations))
     for name in stated:
-        if name not in {d.name for d in declarations}:
-            if name in {d.name for d in every_declaration()}:
-                raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-            aliases = {alias: d.name for d in declarations for alias in d.aliases}
-            names = list(dict.fromkeys(d.name for d in declarations))
-            raise InputError(
-                f"{table}.{name}: no such parameter here; {suggestion(name, names, aliases)}"
-            )
+        if name in names:
+            continue
+        if name in {d.name for d in every_declaration()}:
+            raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
+        hint = suggestion(name, names, {alias: d.name for d in declarations for alias in d.aliases})
+        raise InputError(f"{table}.{name}: no such parameter here; {hint}")
 
 
 def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Parameter:
@@ -172,16 +171,20 @@ def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Par
             prior = default
         else:
             fixed = default
-    _require_in_proportion(name, [fixed or 0.0, *(prior.arguments.values() if prior else ())])
+    for value in (fixed or 0.0, *(prior.arguments.values() if prior else ())):
+        # The model's products and quotients could not hold it.
+        if value and not 1e-60 < abs(value) < 1e60:
+            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
     unit = declared.unit_in(context.stated)
     if stated.unit is not None and re.sub("[µμ]", "u", stated.unit) != unit:
         raise InputError(
             f"parameters.{name}.unit: its numbers are in {unit}, not {stated.unit}; convert them"
         )
+    above = record.replace("_", r"\_")
     return Parameter(
         name,
         stated.unit or unit,
-        stated.label or labeled(declared.label, record),
+        stated.label or declared.label + (rf"^{{\mathrm{{{above}}}}}" if record else ""),
         stated.description or declared.description + (f" of {record}" if record else ""),
         prior,
         fixed,
@@ -190,18 +193,6 @@ def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Par
         declared,
         record,
     )
-
-
-def labeled(label: str, record: str) -> str:
-    """Return a label in LaTeX with the name of its record, if it has one, above."""
-    return rf"{label}^{{\mathrm{{{record.replace('_', chr(92) + '_')}}}}}" if record else label
-
-
-def _require_in_proportion(name: str, values: Collection[float]) -> None:
-    """Refuse numbers of which the model's products and quotients are too large or small to hold."""
-    for value in values:
-        if value and not 1 / LARGEST < abs(value) < LARGEST:
-            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
 
 
 def _distribution(name: str, prior: Mapping[str, str | float]) -> Distribution:

@@ -20,7 +20,7 @@ from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config, ParameterConfig, RecordConfig
 from bwbayes.app.problem.continued import joined
-from bwbayes.app.problem.model import actuator_of, explicit_model
+from bwbayes.app.problem.model import actuator_of, explicit_model, recoverable
 from bwbayes.app.problem.parameters import (
     as_config,
     contexts_of,
@@ -40,7 +40,6 @@ from bwbayes.app.problem.records import (
     unlike,
     windows_of,
 )
-from bwbayes.app.problem.stand import recoverable
 from bwbayes.arrays import IntArray
 from bwbayes.data import Record
 from bwbayes.diagnosis.extrapolation import beyond_training
@@ -48,7 +47,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
-from bwbayes.inference.engine import Engine, choose
+from bwbayes.inference.engine import choose
 from bwbayes.inference.noises import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
@@ -61,9 +60,6 @@ from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 
 __all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
-
-# What may be so of one of several records: the others make up for it.
-MADE_UP_FOR = ("one amplitude", "few readings")
 
 
 @dataclass(frozen=True)
@@ -101,12 +97,13 @@ class Problem:
 
     @cached_property
     def findings(self) -> dict[str, tuple[Finding, ...]]:
-        """What is wrong with each record that is fitted."""
+        """What is wrong with each record that is fitted, and not made up for by the others."""
+        made_up_for = ("one amplitude", "few readings") if len(self.records) > 1 else ()
         return {
             name: tuple(
                 finding
                 for finding in findings_of(record, [*chain(*self.windows(name).values())])
-                if len(self.records) == 1 or finding.kind not in MADE_UP_FOR
+                if finding.kind not in made_up_for
             )
             for name, record in self.records.items()
         }
@@ -234,27 +231,11 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             for name, validation in config.validation.items()
             if validation.another
         }
-    warned = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
-    noted = [text for source in config.records.values() for text in source.remarks or ()]
-    warned = list(dict.fromkeys([*noted, *warned]))
+    remarks = [text for source in config.records.values() for text in source.remarks or ()]
+    remarks += [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     aside = {name: source.outliers for name, source in config.records.items()}
-    unjudged = [name for name, times in aside.items() if times is None]
-    if config.model.outliers and unjudged:
-        # Their ranges would make the default priors, so these are made anew without them.
-        complete = dict(fitted)
-
-        def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
-            fitted.update({n: complete[n].without(rows[n]) for n in unjudged if n in rows})
-            return _posterior(config, fitted, windows)[0]
-
-        spoilt = outliers(
-            posterior_without,
-            generator(config.seed, "outliers"),
-            {name: isolated_outliers(complete[name], ends=True) for name in unjudged},
-        )
-        for name in unjudged:
-            aside[name] = complete[name].time[spoilt[name]].tolist()
-            fitted[name] = complete[name].without(spoilt[name])
+    if config.model.outliers:
+        aside |= _outliers(config, fitted, windows, [n for n, t in aside.items() if t is None])
     posterior, defaults = _posterior(config, fitted, windows)
     validations = {}
     for name, v in config.validation.items():
@@ -264,16 +245,40 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
             validations[name] = Validation((), others[name], start_of(config, name), judged, of)
         else:
             validations[name] = Validation(windows[of].held_out[name], of=of)
-    simulated = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
-    truth = simulated | config.truth
-    return Problem(
-        _explicit(config, posterior, truth, aside, warned),
-        fitted,
-        posterior,
-        _plan(config, posterior),
-        validations,
-        defaults,
+    truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
+    plan = _plan(config, posterior)
+    explicit = _explicit(config, posterior, aside, list(dict.fromkeys(remarks)))
+    sampling = {"walkers": plan.walkers, "engine": posterior.engine}
+    truth |= config.truth
+    known = {p.name: truth.get(p.name, truth.get(p.plain)) for p in posterior.prior.parameters}
+    changes = {
+        "sampling": config.sampling.model_copy(update=sampling),
+        "truth": {name: value for name, value in known.items() if value is not None},
+    }
+    explicit = explicit.model_copy(update=changes)
+    return Problem(explicit, fitted, posterior, plan, validations, defaults)
+
+
+def _outliers(
+    config: Config, records: dict[str, Record], windows: Mapping[str, Windows], names: list[str]
+) -> dict[str, list[float]]:
+    """Leave isolated outliers out of the ``records`` of these names; return their times, s.
+
+    Their ranges would make the default priors, so these are made anew without them.
+    """
+    complete = dict(records)
+
+    def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
+        records.update({n: complete[n].without(rows[n]) for n in names if n in rows})
+        return _posterior(config, records, windows)[0]
+
+    rows = outliers(
+        posterior_without,
+        generator(config.seed, "outliers"),
+        {name: isolated_outliers(complete[name], ends=True) for name in names},
     )
+    records.update({name: complete[name].without(rows[name]) for name in names})
+    return {name: complete[name].time[rows[name]].tolist() for name in names}
 
 
 def _posterior(
@@ -302,26 +307,21 @@ def _posterior(
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
-    named = [
-        (replace(column.declaration, name=column.name), contexts[column.record])
-        for column in table.layout
-    ]
     defaults: dict[str, Distribution] = {}
-    for declared, context in named:
-        defaults |= default_priors([declared], context)
+    for column in table.layout:
+        named = replace(column.declaration, name=column.name)
+        defaults |= default_priors([named], contexts[column.record])
     engine = choose(config.sampling.engine)
     return Posterior(tuple(datasets), prior, engine, table), defaults
 
 
-# Walkers by default: halves of an ensemble then fill the compiled engine's lanes.
-WALKERS: Mapping[Engine, int] = {"numba": 64, "numpy": 32}
-
-
 def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
     settings, prior = config.sampling, posterior.prior
-    # Six more than the least: complementary halves must span all directions.
     fewest = 2 * prior.dimensions
-    walkers = settings.walkers or max(fewest + 6, WALKERS[posterior.engine])
+    # Halves of an ensemble fill the compiled engine's lanes; with six more than the fewest
+    # complementary halves span all directions.
+    usual = 64 if posterior.engine == "numba" else 32
+    walkers = settings.walkers or max(fewest + 6, usual)
     if walkers < fewest:
         raise InputError(
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
@@ -345,12 +345,10 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
 def _explicit(
     config: Config,
     posterior: Posterior,
-    truth: Mapping[str, float],
     outliers: Mapping[str, list[float] | None],
     remarks: list[str],
 ) -> Config:
-    """Return the config with every choice made, its records as files beside it."""
-    prior = posterior.prior
+    """Return the config with records, model and parameters made explicit, and files beside it."""
     records = {
         name: RecordConfig(
             file=f"records/{name}.h5",
@@ -362,30 +360,16 @@ def _explicit(
         )
         for name, source in config.records.items()
     }
+    as_read = dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs"))
     validation = {
-        name: v.model_copy(
-            update={
-                "file": f"records/{name}.h5",
-                **dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs")),
-            }
-        )
-        if v.another
-        else v
+        name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()
     }
     return config.model_copy(
         update={
             "record": records[ALONE] if isinstance(config.record, RecordConfig) else records,
             "model": explicit_model(config.model, posterior.datasets[0].actuator),
-            "parameters": {p.name: as_config(p) for p in prior.parameters},
-            "sampling": config.sampling.model_copy(
-                update={"walkers": _plan(config, posterior).walkers, "engine": posterior.engine}
-            ),
+            "parameters": {p.name: as_config(p) for p in posterior.prior.parameters},
             "validation": validation,
-            "truth": {
-                p.name: truth.get(p.name, truth.get(p.plain, 0.0))
-                for p in prior.parameters
-                if p.name in truth or p.plain in truth
-            },
         }
     )

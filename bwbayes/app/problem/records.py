@@ -16,21 +16,13 @@ from bwbayes.app.config.config import (
     SignalConfig,
     ValidationConfig,
 )
+from bwbayes.app.problem.model import planned, stand_of
 from bwbayes.app.problem.parameters import place_of
-from bwbayes.app.problem.stand import planned, stand_of
 from bwbayes.data import Record, read_record
 from bwbayes.data.io.formats import require_readable
 from bwbayes.data.record import Window
 from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import (
-    Carrier,
-    Decay,
-    Sine,
-    Staircase,
-    Triangle,
-    Waveform,
-    signal,
-)
+from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
@@ -51,9 +43,6 @@ __all__ = [
     "windows_of",
 ]
 
-# Times of outliers that a remark lists.
-MOST_TIMES = 10
-
 
 @dataclass(frozen=True)
 class Windows:
@@ -72,18 +61,13 @@ def sampled_waveform(drive: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config describes."""
     if isinstance(drive, str):
         return signal(drive)
-    carrier: Carrier
+    carrier: Staircase | Sine | Triangle
     if drive.shape == "steps":
         carrier = Staircase(tuple(drive.levels or ()), drive.dwell or 0.0)
     else:
         shape = Sine if drive.shape == "sine" else Triangle
         carrier = shape(drive.amplitude or 0.0, drive.frequency or 0.0)
-    return Waveform(
-        carrier,
-        drive.duration,
-        drive.start,
-        Decay(drive.decay_from, drive.decay),
-    )
+    return Waveform(carrier, drive.duration, drive.start, Decay(drive.decay_from, drive.decay))
 
 
 def training_records(
@@ -91,53 +75,55 @@ def training_records(
 ) -> tuple[dict[str, Record], VirtualTestStand | None]:
     """Return the training records by name, and the stand that made some, if one did.
 
-    ``given`` are those that are in memory, by name.
+    ``in_memory`` are those that need not be read, by name; files are relative to ``folder``.
     """
-    read: dict[str, Record] = {}
-    commands: dict[str, Waveform] = {}
+    records: dict[str, Record] = {}
+    signals: dict[str, str | SignalConfig] = {}
     for name, source in config.records.items():
-        if source.file is not None:
-            read[name] = _read(source, folder, in_memory.get(name), place_of(name))
+        if source.signal is None:
+            records[name] = _read(source, folder, in_memory.get(name), place_of(name))
         else:
-            assert source.signal is not None
-            commands[name] = sampled_waveform(source.signal)
-            read[name] = planned(config, commands[name], source.stop)
-    stand = stand_of(config, list(read.values())) if commands else None
-    for name, waveform in commands.items():
+            signals[name] = source.signal
+            rate = config.stand.sample_rate
+            records[name] = planned(sampled_waveform(source.signal), rate, source.stop)
+    stand = stand_of(config, list(records.values())) if signals else None
+    for name, drive in signals.items():
         assert stand is not None
         purpose = "record" if name == ALONE else f"record {name}"
-        simulated = stand.run(waveform, generator(config.seed, purpose))
-        read[name] = _named(simulated, config.records[name].signal)
-    records = {
-        name: _cut(config.records[name], record, place_of(name)) for name, record in read.items()
-    }
-    for name, record in records.items():
-        require_readable(record, place_of(name))
+        records[name] = _measured(stand, drive, generator(config.seed, purpose))
+    for name, source in config.records.items():
+        records[name] = _cut(source, records[name], place_of(name))
+        require_readable(records[name], place_of(name))
     return records, stand
+
+
+def _measured(
+    stand: VirtualTestStand, drive: str | SignalConfig, rng: np.random.Generator
+) -> Record:
+    record = stand.run(sampled_waveform(drive), rng)
+    name = drive if isinstance(drive, str) else drive.shape
+    return replace(record, origin=f"{record.origin}, {name} signal")
 
 
 def _cut(source: RecordConfig, record: Record, table: str) -> Record:
     """Leave out the readings that a config leaves out."""
+    end = record.start + record.duration
     if source.outliers:
         rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
         if rows.min() < 0 or rows.max() >= record.samples:
-            end = record.start + record.duration
             raise InputError(f"{table}.outliers: a time outside of {record.start:g} to {end:g} s")
         record = record.without(rows.astype(np.int64))
     if source.exclude is not None:
-        record = record.exclude([(window[0], window[1]) for window in source.exclude])
+        record = record.exclude([(start, stop) for start, stop in source.exclude])
     if source.start is not None or source.stop is not None:
-        end = record.start + record.duration if source.stop is None else source.stop
-        record = record.upto(end, source.start)
-    if source.decimate > 1:
-        record = record.decimate(source.decimate)
-    return record
+        record = record.upto(end if source.stop is None else source.stop, source.start)
+    return record.decimate(source.decimate) if source.decimate > 1 else record
 
 
 def _read(
     source: RecordConfig | ValidationConfig, folder: Path, in_memory: Record | None, table: str
 ) -> Record:
-    """Return the record that is given, or else read the source's file."""
+    """Return the record that is in memory, or else read the source's file."""
     if in_memory is not None:
         return replace(in_memory, voltage_is=source.voltage_is or in_memory.voltage_is)
     assert source.file is not None
@@ -161,29 +147,24 @@ def other_record(
     in_memory: Record | None,
 ) -> Record:
     """Return the record of a validation: from memory, a file, or the virtual stand."""
-    source = config.validation[name]
-    if source.file is not None:
-        record = _read(source, folder, in_memory, f"validation.{name}")
-        if in_memory is not None:
-            require_readable(record, f"validation.{name}")
+    source, table = config.validation[name], f"validation.{name}"
+    if source.signal is None:
+        record = _read(source, folder, in_memory, table)
     else:
-        assert source.signal is not None
-        waveform = sampled_waveform(source.signal)
         stand = stand_of(config, list(training.values()))
-        record = _named(
-            stand.run(waveform, generator(config.seed, f"record {name}")), source.signal
-        )
-        require_readable(record, f"validation.{name}")
+        record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))
+    if source.file is None or in_memory is not None:
+        require_readable(record, table)
     # Said now: it would be a pity after the sampling.
     try:
         start_of(config, name).window(record)
     except InputError as error:
-        raise InputError(f"validation.{name}.lead_in: {error}") from None
-    if source.window is not None:
-        try:
-            record.window_slice(*source.window[0])
-        except InputError as error:
-            raise InputError(f"validation.{name}.{error}") from None
+        raise InputError(f"{table}.lead_in: {error}") from None
+    try:
+        for start, stop in source.window or ():
+            record.window_slice(start, stop)
+    except InputError as error:
+        raise InputError(f"{table}.{error}") from None
     return record
 
 
@@ -197,11 +178,6 @@ def start_of(config: Config, name: str) -> Start:
         source.lead_in_from,
         None if hold == "auto" else hold,
     )
-
-
-def _named(record: Record, drive: str | SignalConfig | None) -> Record:
-    name = drive.shape if isinstance(drive, SignalConfig) else drive
-    return replace(record, origin=f"{record.origin}, {name} signal")
 
 
 def whole(record: Record) -> Window:
@@ -218,40 +194,34 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
     InputError
         A window outside of the record, windows that overlap, or one without a reading.
     """
-    source, table = config.records[name], place_of(name)
-    held_out = {
-        f"validation.{n}.window": sorted((window[0], window[1]) for window in v.window)
-        for n, v in config.validation.items()
-        if v.window and not v.another and v.of in (name, None)
-    }
-    if source.train is None:
-        train = [whole(record)]
-    else:
-        train = [(window[0], window[1]) for window in source.train]
-    named = {f"{table}.train": train, **held_out}
-    for where, window in [(key, window) for key in named for window in named[key]]:
+    train, table = config.records[name].train, place_of(name)
+    windows = {f"{table}.train": [whole(record)] if train is None else [(a, b) for a, b in train]}
+    names = []
+    for other, validation in config.validation.items():
+        if validation.window and not validation.another and validation.of in (name, None):
+            names.append(other)
+            windows[f"validation.{other}.window"] = sorted((a, b) for a, b in validation.window)
+    slices = {}
+    for where, pairs in windows.items():
         try:
-            record.window_slice(*window)
+            slices[where] = tuple(record.window_slice(*pair) for pair in pairs)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
+    trained, *held_out = windows.values()
     try:
-        split = record.split(train, [window for windows in held_out.values() for window in windows])
+        split = record.split(trained, [pair for pairs in held_out for pair in pairs])
     except InputError as error:
         raise InputError(str(error).replace("record.train", f"{table}.train")) from None
-    slices = {
-        where: tuple(record.window_slice(*window) for window in windows)
-        for where, windows in held_out.items()
-    }
-    for where, parts in {f"{table}.train": split.training, **slices}.items():
-        for stretch in parts:
-            if not record.has_reading[stretch].any():
-                begin, end = record.time[stretch][[0, -1]]
+    for where, cuts in slices.items():
+        for cut in cuts:
+            if not record.has_reading[cut].any():
+                start, stop = record.time[cut][[0, -1]]
                 raise InputError(
-                    f"{where}: no readings from {record.clock(begin)} to {record.clock(end)} s; "
+                    f"{where}: no readings from {record.clock(start)} to {record.clock(stop)} s; "
                     f"choose another window, or see start, exclude and decimate in [{table}]"
                 )
-    names = [where.removeprefix("validation.").removesuffix(".window") for where in slices]
-    return Windows(split.training, dict(zip(names, slices.values(), strict=True)))
+    _, *held = slices.values()
+    return Windows(split.training, dict(zip(names, held, strict=True)))
 
 
 def require_different(records: Mapping[str, Record], windows: Mapping[str, Windows]) -> None:
@@ -262,13 +232,13 @@ def require_different(records: Mapping[str, Record], windows: Mapping[str, Windo
     InputError
         The same measurement is fitted twice, in windows that overlap.
     """
-    for (name, first), (other, second) in combinations(records.items(), 2):
+    for name, other in combinations(records, 2):
         overlap = any(
             a.start < b.stop and b.start < a.stop
             for a in windows[name].training
             for b in windows[other].training
         )
-        if overlap and first.sha256 == second.sha256:
+        if overlap and records[name].sha256 == records[other].sha256:
             raise InputError(
                 f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
                 "would count twice; remove one, or give them other windows"
@@ -291,18 +261,18 @@ def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]
 def unlike(name: str, record: Record) -> Iterator[str]:
     """Yield what is wrong with a record that is predicted."""
     for finding in inspect(record):
-        if finding.kind == "switch-on transient":
+        fix = finding.fix
+        if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_from = {record.clock(finding.stop)} under [validation.{name}]"
-            finding = replace(finding, fix=fix)  # noqa: PLW2901  # nothing here is fitted
         if finding.kind not in ("one amplitude", "few readings"):
-            yield f"{name}: {finding}"
+            yield f"{name}: {replace(finding, fix=fix)}"
 
 
 def set_aside(times: Sequence[float], record: Record) -> str:
-    """Say which readings were set aside as outliers."""
+    """Say which readings were set aside as outliers, the first ten by their times."""
     if not times:
         return "no reading is an isolated outlier: none was set aside"
-    first = ", ".join(record.clock(time) for time in times[:MOST_TIMES])
-    more = f" and {len(times) - MOST_TIMES} more" if len(times) > MOST_TIMES else ""
+    listed = ", ".join(record.clock(time) for time in times[:10])
+    more = f" and {len(times) - 10} more" if len(times) > 10 else ""
     plural = "s" if len(times) > 1 else ""
-    return f"{len(times)} reading{plural} set aside as isolated outliers, at {first} s{more}"
+    return f"{len(times)} reading{plural} set aside as isolated outliers, at {listed} s{more}"
