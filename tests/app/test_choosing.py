@@ -78,12 +78,3 @@ def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     again = Console(file=io.StringIO(), width=200)
     resume(folder, again, workers=1, steps=100, files=False)
     assert "noise:" not in again.file.getvalue()  # type: ignore[attr-defined]
-
-
-def test_a_noise_that_is_given_stays(tmp_path: Path) -> None:
-    write_record(thinned(records(2)[0]), tmp_path / "record.h5")
-    config = parse(f'{CONFIG}[model]\nnoise = "white"\n[sampling]\nsteps = 50\n', "config")
-    console = Console(file=io.StringIO(), width=200)
-    fit = resume(start(config, tmp_path, tmp_path / "run"), console, workers=1, files=False)
-    assert fit.problem.config.model.noise == "white"
-    assert "noise:" not in console.file.getvalue()  # type: ignore[attr-defined]

@@ -6,10 +6,8 @@ import os
 import re
 from pathlib import Path
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.config.keywords import config_of
@@ -28,17 +26,6 @@ def refused(text: str) -> str:
     assert "\n" not in said
     assert said.startswith("my.toml: ")
     return said.removeprefix("my.toml: ")
-
-
-def test_two_lines_are_a_config() -> None:
-    result = parse(RECORD, "my.toml")
-    assert result.records["record"].file == "record.csv"
-    assert (1, "lag", "auto", "discrepancy") == (
-        result.seed,
-        result.model.dynamics,
-        result.model.hold,
-        result.model.noise,
-    )
 
 
 @pytest.mark.parametrize(
@@ -140,50 +127,32 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
     ("text", "path"),
     [
         ("seed = '1'\n" + RECORD, "seed"),
-        ("seed = 1.5\n" + RECORD, "seed"),
         ("seed = -1\n" + RECORD, "seed"),
-        ("seed = true\n" + RECORD, "seed"),
         ("name = ''\n" + RECORD, "name"),
         ("record = 3", "record"),
-        ("record = []", "record"),
-        ("", "record"),
-        ("[record]\nfile = 3", "record.file"),
         (RECORD + "start = 1979-05-27", "record.start"),
         (RECORD + "train = [1.0, 2.0, 3.0]", "record.train"),
-        (RECORD + "train = [[1.0, 2.0], 3.0]", "record.train"),
         (RECORD + "train = []", "record.train"),
-        (RECORD + "train = [[1.0, 2.0, 3.0]]", "record.train"),
-        (RECORD + "train = [[1.0]]", "record.train"),
         (RECORD + "decimate = 0", "record.decimate"),
         (RECORD + "voltage_is = 'both'", "record.voltage_is"),
-        ("[record]\nsignal = 3", "record.signal"),
         (
             "[record]\nsignal = {amplitude = -1.0, frequency = 1.0, duration = 1.0}",
             "record.signal.amplitude",
         ),
-        ("[record]\nsignal = {amplitude = 1.0, frequency = 1.0}", "record.signal.duration"),
         ("[record]\nsignal = {amplitude = 1.0, duration = 1.0}", "record.signal"),
-        ("[record]\nsignal = {shape = 'steps', levels = [1.0], duration = 1.0}", "record.signal"),
         (
             "[record]\nsignal = {shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0, "
             "duration = 1.0}",
             "record.signal",
         ),
-        (RECORD + "[stand]\ndiscrepancy = 'some'", "stand.discrepancy"),
-        (RECORD + "[stand]\nsample_rate = 0.0", "stand.sample_rate"),
         (RECORD + "[model]\nhold = 'second'", "model.hold"),
-        (RECORD + "[parameters]\nd = 0.7", "parameters.d"),
         (RECORD + "[parameters.d]\nprior = 'normal'", "parameters.d.prior"),
-        (RECORD + "[parameters.d]\nprior = {mean = 1.0}", "parameters.d"),
         (RECORD + "[parameters.d]\nprior = {distribution = 3}", "parameters.d"),
         (RECORD + "[parameters.d]\nfixed = 1.0\nprior = {distribution = 'beta'}", "parameters.d"),
         (RECORD + "[sampling]\nwalkers = 7", "sampling.walkers"),
-        (RECORD + "[sampling]\nensembles = 2", "sampling.ensembles"),
         (RECORD + "[sampling]\ness = 0", "sampling.ess"),
         (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window"),
         (RECORD + "[validation.'a/b']\nwindow = [1.0, 2.0]", "validation.a/b"),
-        (RECORD + "[validation.'']\nwindow = [1.0, 2.0]", "validation"),
-        (RECORD + "[validation.'..']\nwindow = [1.0, 2.0]", "validation..."),
         (RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in = 0.0", "validation.a.lead_in"),
         (RECORD + "[truth]\nd = 'large'", "truth.d"),
     ],
@@ -195,31 +164,19 @@ def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
     assert said.endswith("; correct the config")
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("value", ["nan", "-inf"])
 @pytest.mark.parametrize(
     "text",
     [
-        RECORD + "start = {}",
         RECORD + "train = [[0.0, {}]]",
         "[record]\nsignal = {{amplitude = 1.0, frequency = 1.0, duration = {}}}",
         RECORD + "[parameters.d]\nfixed = {}",
-        RECORD + "[parameters.d]\nlower = {}",
         RECORD + "[parameters.d]\nprior = {{distribution = 'normal', mean = {}, sd = 1.0}}",
         RECORD + "[sampling]\ness = {}",
-        RECORD + "[validation.a]\nwindow = [0.0, {}]",
-        RECORD + "[truth]\nd = {}",
     ],
 )
 def test_number_that_is_not_finite_is_refused(text: str, value: str) -> None:
     assert "finite" in refused(text.format(value))
-
-
-def test_a_window_of_another_record_is_what_is_judged() -> None:
-    text = f'{RECORD}[validation.a]\nfile = "a.csv"\nwindow = [1.0, 2.0]\nlead_in_from = 0.5'
-    result = parse(text, "").validation["a"]
-    assert result.another
-    assert [[1.0, 2.0]] == result.window
-    assert 0.5 == result.lead_in_from
 
 
 @pytest.mark.parametrize(
@@ -228,9 +185,6 @@ def test_a_window_of_another_record_is_what_is_judged() -> None:
         "[record",
         "seed = 1\nseed = 2\n" + RECORD,
         RECORD + RECORD,
-        "seed 1",
-        "file: a.csv",
-        "seed = 01",
         "a = " + 5000 * "[",
         "\0",
         "seed = " + 5000 * "9",
@@ -252,20 +206,11 @@ def test_unknown_key_of_any_length_is_one_short_line() -> None:
     assert len(text) < 700
 
 
-@pytest.mark.parametrize("bom", [b"", b"\xef\xbb\xbf"])
-def test_file_may_start_with_a_byte_order_mark(tmp_path: Path, bom: bytes) -> None:
-    path = tmp_path / "my.toml"
-    path.write_bytes(bom + RECORD.encode())
-    assert load(path) == parse(RECORD, "")
-
-
 @pytest.mark.parametrize(
     ("content", "why"),
     [
         (b"", "record: "),
-        (b"# nothing\n", "record: "),
         (b"\xff\xfe[\0r\0", "is not UTF-8 text"),
-        (RECORD.encode() + b"# \xb5m", "is not UTF-8 text"),
         (b"\x89HDF\r\n\x1a\n", "is not UTF-8 text"),
     ],
 )
@@ -301,28 +246,6 @@ def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:
 def test_dumped_config_is_the_same_config(result: Config) -> None:
     assert result == parse(dump(result), "")
     assert dump(result) == dump(parse(dump(result), ""))
-
-
-@settings(deadline=None)
-@given(
-    st.floats(allow_nan=False, allow_infinity=False),
-    st.floats(min_value=0, exclude_min=True, allow_infinity=False),
-    st.text(min_size=1, max_size=30),
-    st.integers(min_value=0, max_value=2**63 - 1),
-)
-def test_numbers_and_texts_survive_to_the_last_digit(
-    value: float, positive: float, text: str, seed: int
-) -> None:
-    made = parse(RECORD, "")
-    changed = made.model_copy(
-        update={
-            "name": text,
-            "seed": seed,
-            "truth": {"d": value},
-            "sampling": made.sampling.model_copy(update={"ess": positive}),
-        }
-    )
-    assert changed == parse(dump(changed), "")
 
 
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "runs").glob("*.toml")))

@@ -56,9 +56,3 @@ def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: 
     artist.draw(run)
     assert list(drawings(run)) == list(artist.pictures(run, tmp_path))
     assert interactive.made(run) == artist.plots(run)
-
-
-@pytest.mark.parametrize(("workers", "asked"), [(1, True), (2, False)])
-def test_one_worker_draws_by_itself(workers: int, asked: bool) -> None:
-    with beside(workers, enabled=asked) as artist:
-        assert artist is None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import re
-import shlex
 import signal
 import socket
 import subprocess
@@ -19,11 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import numpy as np
 import pytest
 
-from bwbayes.app.jobs import calibrate
 from bwbayes.app.running import cluster as cluster_module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
@@ -31,13 +27,9 @@ from bwbayes.app.running.workers import executor, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.sampling.chain import Chain, draws
-from bwbayes.sampling.ensemble import advance
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.app import small
-from tests.app.test_calibrate import assert_same_end as assert_same_calibration
-from tests.app.test_calibrate import begun as begun_calibration
-from tests.examples import lines_of_shell, typed, with_files
 from tests.inference.problems import short_posterior
 
 distributed = pytest.importorskip("distributed", reason="bwbayes[dask] is not installed")
@@ -198,44 +190,6 @@ def _kill_at_first_block(folder: RunFolder, process: Any) -> None:
     process.kill()
 
 
-@pytest.mark.slow
-def test_the_readmes_commands_for_a_cluster_work_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On this machine, with one worker, and without the dashboard's port."""
-    monkeypatch.chdir(tmp_path)
-    first, second, third = [line for line in lines_of_shell() if re.search(r"^dask |dask://", line)]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    scheduling = f"{first} --host 127.0.0.1 --port {address.partition(':')[2]} --no-dashboard"
-    working = second.replace("HOST:8786", address).replace("auto", "1") + " --no-dashboard"
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-m", *shlex.split(line)],
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for line in (scheduling, working)
-    ]
-    try:
-        with_files(third, tmp_path, tmp_path)
-        typed(third.replace("HOST:8786", address))
-    finally:
-        for process in reversed(started):  # the worker's nanny ends its worker
-            process.terminate()
-            process.wait(PATIENCE)
-
-
-@pytest.mark.slow
-def test_a_calibration_on_a_cluster_is_the_same(tmp_path: Path) -> None:
-    for how in ("threads", "dask"):
-        folder = begun_calibration(tmp_path / how)
-        calibrate.resume(folder, small.quiet(), workers=2, backend=how)
-    assert_same_calibration(tmp_path / "threads", tmp_path / "dask")
-
-
 def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -289,9 +243,3 @@ def _interrupted() -> None:
     with executor(1, backend="processes") as pool:
         pool.submit(time.sleep, PATIENCE)
         raise KeyboardInterrupt
-
-
-def test_a_block_is_the_unit_that_is_sent() -> None:
-    """What an executor is given besides the posterior is a block's state, some kilobytes."""
-    state = chain().ends[0]
-    assert len(cloudpickle.dumps((advance, state))) < 20_000

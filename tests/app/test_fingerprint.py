@@ -15,7 +15,6 @@ from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running import assembling, cache
 from bwbayes.app.running.fingerprint import (
-    UNSAID,
     fingerprint,
     require_same,
     version_remarks,
@@ -24,7 +23,6 @@ from bwbayes.app.running.fingerprint import (
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
-from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 
@@ -66,6 +64,7 @@ def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], obj
         ('hold = "auto"', 'hold = "first"', "model.hold"),
         ("fixed = 0.0172", "fixed = 0.0173", "parameters.gamma.fixed"),
         ("seed = 3", "seed = 4", "seed"),
+        ("block = 25", "block = 30", "sampling.block"),
     ],
 )
 def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key: str) -> None:
@@ -76,14 +75,6 @@ def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key:
     changed = parse(text.replace(old, new), "")
     with pytest.raises(InputError, match=f"x: {key} was .* when the chain was sampled, is "):
         require_same(fingerprint(load(run / "config.toml")), changed, Path("x"))
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_a_validation_may_be_taken_out(copy: RunFolder) -> None:
-    config = load(copy.config)
-    others = {"held-out": config.validation["held-out"]}
-    copy.config.write_text(dump(config.model_copy(update={"validation": others})))
-    assert ["training", "held-out"] == [bands.name for bands in redraw(copy).result.bands]
 
 
 @pytest.mark.parametrize("use", [redraw, resumed])
@@ -109,30 +100,6 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     remarks = finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
-
-
-def test_a_chain_from_before_models_had_parts_goes_on_with_todays_default(copy: RunFolder) -> None:
-    config = load(copy.config)
-    noted = json.loads(fingerprint(config))
-    earlier = {k: v for k, v in noted.items() if k not in UNSAID}
-    assert len(noted) == len(earlier) + len(UNSAID)
-    require_same(json.dumps(earlier), config, copy.chain)
-    model = config.model.model_copy(update={"gain": ["quadratic"]})
-    with pytest.raises(InputError, match=r"model\.gain was \[\] when the chain was sampled"):
-        require_same(json.dumps(earlier), config.model_copy(update={"model": model}), copy.chain)
-
-
-@pytest.mark.parametrize("use", [redraw, resumed])
-def test_edited_block_is_refused(copy: RunFolder, use: Callable[[RunFolder], object]) -> None:
-    """It once wrote rows of zeros into the chain, and said converged."""
-    text = copy.config.read_text()
-    assert "block = 25" in text
-    copy.config.write_text(text.replace("block = 25", "block = 30"))
-    before = ChainFile.read(copy.chain).steps("sampling")
-    with pytest.raises(InputError, match=r"sampling.block was 25 .* is 30; undo the edit"):
-        use(copy)
-    assert before == ChainFile.read(copy.chain).steps("sampling")
-    assert copy.summary.exists()
 
 
 def test_a_bound_and_all_else_that_differs_are_named(run: Path) -> None:

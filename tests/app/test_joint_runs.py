@@ -24,9 +24,6 @@ from bwbayes.app.running.run import resume, start
 from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.report.figures import drawings
-from bwbayes.report.priors import priors_table
-from bwbayes.report.report import Report
-from bwbayes.report.screen import as_text
 from bwbayes.results.replicates import replicate
 from tests.app import small
 
@@ -229,13 +226,6 @@ def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: Ru
         bwbayes.open_run(finished.path).design("offset[step]")
 
 
-def test_parameters_of_a_record_are_shown_by_their_whole_name() -> None:
-    """Square brackets are no mark-up of the screen."""
-    text = as_text(Report(title="", blocks=[priors_table(problem().posterior.prior)]), width=120)
-    assert "offset[loops]" in text
-    assert "initial[step]" in text
-
-
 def test_replicates_make_all_records_anew() -> None:
     """Each with its own readings; the loop is measured in the record that has one."""
     common = experiment(problem(("ess = 150", "ess = 100")))
@@ -350,14 +340,6 @@ def test_what_several_records_cannot_be_is_refused(
         problem(change)
 
 
-def test_an_initial_state_cannot_be_shared_from_rest_and_not() -> None:
-    with pytest.raises(InputError, match="initial cannot be shared by records of which some"):
-        problem(
-            ("from_rest = true\ndecimate", "decimate"),
-            ('dynamics = "none"', 'dynamics = "none"\nshared = ["initial"]'),
-        )
-
-
 def test_files_in_another_unit_and_of_another_interval(tmp_path: Path) -> None:
     """Intervals may differ; what is not displacement is refused in one line, with status 2."""
     write_record(measured(1), tmp_path / "a.h5")
@@ -382,9 +364,3 @@ def test_readings_do_not_count_twice(tmp_path: Path) -> None:
         resolve(parse(text, ""), tmp_path)
     apart = text.replace("[record.b]", "train = [0.0, 1.0]\n[record.b]") + "train = [1.0, 2.0]\n"
     assert 2 == len(resolve(parse(apart, ""), tmp_path).records)
-
-
-def test_another_record_cannot_stand_for_several(tmp_path: Path) -> None:
-    write_record(measured(1), tmp_path / "a.h5")
-    with pytest.raises(InputError, match="the config has several \\(loops, step\\)"):
-        config().with_record(tmp_path / "a.h5")

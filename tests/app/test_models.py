@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bwbayes.app.config.config import ModelConfig
-from bwbayes.app.config.models import models_of, slug
+from bwbayes.app.config.models import models_of
 from bwbayes.errors import InputError
 
 BASE = ModelConfig(gain=["cubic"], creep=True, dynamics="none", hold="first", passive=False)
@@ -26,18 +26,6 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
     assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")
 
 
-def test_options_may_be_lists_and_several() -> None:
-    (one,) = models_of("maxwell-slip(thresholds = [5.0, 20.0]) + cubic", BASE).values()
-    assert one.thresholds == [5.0, 20.0]
-    (one,) = models_of('bouc-wen-asymmetric(terms=["b4", "b5"])', BASE).values()
-    assert one.terms == ["b4", "b5"]
-
-
-def test_an_operator_from_outside_goes_by_its_path() -> None:
-    (one,) = models_of("my_module:MyOperator + quadratic", BASE).values()
-    assert (one.hysteresis, one.gain) == ("my_module:MyOperator", ["quadratic"])
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -56,7 +44,3 @@ def test_what_cannot_be_read_is_refused_in_a_line(text: str, said: str) -> None:
         models_of(text, BASE)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_a_folder_is_named_by_the_model() -> None:
-    assert slug("maxwell-slip(thresholds=4) + quadratic") == "maxwell-slip-thresholds-4-quadratic"

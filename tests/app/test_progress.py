@@ -64,19 +64,6 @@ def test_the_eta_counts_down_between_checks_and_does_not_climb_at_them(watched: 
     assert [120 - 10 * i for i in range(len(seen))] == seen
 
 
-def test_blocks_that_become_slower_do_not_make_it_climb_before_the_next_check(
-    watched: Watched,
-) -> None:
-    for _ in range(4):
-        watched.block(10.0)
-    seen = [watched.check(200, 500)]
-    for _ in range(4):
-        watched.block(25.0)
-        seen.append(watched.eta)
-    assert sorted(seen, reverse=True) == seen
-    assert 20 == seen[-1]
-
-
 def test_while_ensembles_disagree_there_is_no_eta(watched: Watched) -> None:
     """More draws may not cure that: a time that is put off at each check would climb."""
     for _ in range(4):
@@ -84,13 +71,6 @@ def test_while_ensembles_disagree_there_is_no_eta(watched: Watched) -> None:
     assert np.inf == watched.check(200, 2500, rhat=1.2)
     assert 120 == watched.check(200, 500)
     assert np.inf == watched.check(200, 500, stuck=1)
-
-
-def test_a_run_that_goes_on_has_an_eta_after_its_first_block(watched: Watched) -> None:
-    assert np.inf == watched.check(200, 500)
-    watched.block(10.0, ensembles=1)
-    # A quarter of a block of 50 steps in 2.5 s, and 600 steps less that to go.
-    assert round(2.5 / 12.5 * (600 - 12.5)) == pytest.approx(watched.eta, abs=1)
 
 
 def test_each_step_after_the_sampling_counts_down_by_itself(

@@ -116,12 +116,6 @@ def test_a_part_is_held_out_whose_drive_the_rest_covers(write: Write) -> None:
     assert 6.0 == (made.config.records["record"].train or [])[-1][1]
 
 
-def test_nothing_is_held_out_where_the_rest_would_not_do(write: Write) -> None:
-    made = proposed(_drive(write, lambda t: 50 * np.sin(9 * t), 110))
-    assert {} == made.config.validation
-    assert "Too little of the record can be left out" in made.text
-
-
 # What is wrong
 
 

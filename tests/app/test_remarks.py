@@ -7,26 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from bwbayes.app.fit.opening import finished
-from bwbayes.app.jobs.check import check
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import Report
 from bwbayes.report.screen import as_text
-from tests.app import small
-
-
-def test_check_says_that_a_prior_may_be_in_another_unit(tmp_path: Path) -> None:
-    """And nothing of good ones."""
-    prior = 'd = { prior = { distribution = "lognormal", median = 700.0, sigma = 0.5 } }'
-    odd = small.config(("[parameters]", f"[parameters]\n{prior}"))
-    said, silent = (
-        as_text(check(config, tmp_path, tmp_path / "check")[1], width=200)
-        for config in (odd, small.config())
-    )
-    assert "note: d: its prior's median, 700 um/V, is 7e+02 times what the record's" in said
-    assert "note:" not in silent
 
 
 def test_run_says_it_too(run: Path) -> None:

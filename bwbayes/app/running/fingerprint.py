@@ -24,38 +24,26 @@ from bwbayes.inference.parameters import COORDINATES
 
 __all__ = ["fingerprint", "require_its_own", "require_same", "version_remarks", "versions"]
 
-PACKAGES = ("bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py")
-
 # Keys of a config that a chain does not depend on; of tables, everything in them. The record is
 # compared by its readings, not by its file's name.
-FREE_TO_CHANGE = (
-    "name",
-    "stand",
-    "truth",
-    "validation",
-    "sampling.engine",
-    "sampling.ess",
-    "sampling.steps",
-    "sampling.pilot_steps",
+FREE_TO_CHANGE = re.compile(
+    r"(name|stand|truth|validation|sampling\.(engine|ess|steps|pilot_steps)"
+    r"|record\.([^.]+\.)?(file|remarks|signal)|parameters\..*\.(label|description))(\..*)?"
 )
-# Of each record: where it comes from.
-SOURCE = re.compile(r"record\.([^.]+\.)?(file|remarks|signal)(\..*)?")
-NAMES_FOR_PEOPLE = ("label", "description")
-
-# What chains were sampled with before a config could say it.
-UNSAID: Mapping[str, object] = {
-    "model.hysteresis": "bouc-wen",
-    "model.gain": [],
-    "model.creep": False,
-    "model.creep_growth": False,
-    "model.per_record": [],
-    "model.shared": [],
-}
 
 
 def fingerprint(config: Config) -> str:
     """Return what a chain notes of a resolved config: its keys and values, as JSON."""
-    return json.dumps(_values(config))
+    values = dict(_flat(config.model_dump(exclude_none=True)))
+    kept = {key: value for key, value in values.items() if not FREE_TO_CHANGE.fullmatch(key)}
+    return json.dumps({"coordinates": COORDINATES, **kept})
+
+
+def require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
+    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
+    if noted.get("data_sha256") != problem.sha256:
+        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
+    require_same(noted.get("posterior"), problem.config, path)
 
 
 def require_same(noted: object, config: Config, chain: Path) -> None:
@@ -77,26 +65,24 @@ def require_same(noted: object, config: Config, chain: Path) -> None:
     """
     if noted is None:
         raise InputError(
-            f"{chain}: does not say which priors and settings it was sampled with, as chains of "
-            "earlier versions did not, so nothing can be read from it safely; start a new run"
+            f"{chain}: does not say which priors and settings it was sampled with; start a new run"
         )
-    before: dict[str, object] = {**UNSAID, **json.loads(str(noted))}
-    # As JSON gives them back: no tuples.
+    before: dict[str, object] = json.loads(str(noted))
     now: dict[str, object] = json.loads(fingerprint(config))
-    differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-    if not differing:
-        return
-    first, *others = differing
-    also = f" (also {', '.join(others)})" if others else ""
-    raise InputError(
-        f"{chain}: {first} was {_shown(before.get(first))} when the chain was sampled, is "
-        f"{_shown(now.get(first))}{also}; undo the edit or start a new run"
-    )
+    differing = [key for key in before | now if before.get(key) != now.get(key)]
+    if differing:
+        first, *others = differing
+        also = f" (also {', '.join(others)})" if others else ""
+        raise InputError(
+            f"{chain}: {first} was {_shown(before.get(first))} when the chain was sampled, is "
+            f"{_shown(now.get(first))}{also}; undo the edit or start a new run"
+        )
 
 
 def versions(engine: Engine = "numpy") -> dict[str, str]:
     """Return the versions of what computed a result."""
-    packages = (*PACKAGES, "numba") if engine == "numba" else PACKAGES
+    packages = ["bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py"]
+    packages += ["numba"] if engine == "numba" else []
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
@@ -106,31 +92,20 @@ def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:
     changed = [
         f"{name} {before[name]}, now {now[name]}"
         for name in now
-        if name in before and before[name] != now[name]
+        if before.get(name, now[name]) != now[name]
     ]
     if not changed:
         return ()
     return (f"the chain was begun with other versions: {'; '.join(changed)}",)
 
 
-def _values(config: Config) -> dict[str, object]:
-    return {"coordinates": COORDINATES} | {
-        key: value
-        for key, value in _flat(config.model_dump(exclude_none=True))
-        if not any(key == free or key.startswith(f"{free}.") for free in FREE_TO_CHANGE)
-        and not SOURCE.fullmatch(key)
-        and not (key.startswith("parameters.") and key.endswith(NAMES_FOR_PEOPLE))
-    }
-
-
 def _flat(table: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yield keys with their tables' names before them, and values; a prior counts as one."""
     for name, value in table.items():
-        key = f"{prefix}{name}"
         if isinstance(value, Mapping) and name != "prior":
-            yield from _flat(value, f"{key}.")
+            yield from _flat(value, f"{prefix}{name}.")
         else:
-            yield key, value
+            yield f"{prefix}{name}", value
 
 
 def _shown(value: object) -> str:
@@ -139,10 +114,3 @@ def _shown(value: object) -> str:
         arguments = ", ".join(f"{k} {v}" for k, v in value.items() if k != "distribution")
         return f"{value['distribution']} ({arguments})" if "distribution" in value else arguments
     return "not set" if value is None else str(value)
-
-
-def require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
-    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
-    if noted.get("data_sha256") != problem.sha256:
-        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
-    require_same(noted.get("posterior"), problem.config, path)

@@ -21,12 +21,9 @@ from bwbayes.sampling.plan import SamplingPlan
 
 __all__ = ["CountProgress", "Progress", "StepProgress"]
 
-# Seconds between lines where there is no terminal.
-PAUSE = 10.0
-
 
 class _Line:
-    """A line that is kept up to date on a terminal, and printed now and then elsewhere."""
+    """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -47,7 +44,7 @@ class _Line:
         now = time.monotonic()
         if self.live:
             self.live.update(Text(line))
-        elif printed and now - self.printed >= PAUSE:
+        elif printed and now - self.printed >= 10.0:
             self.printed = now
             self.console.print(line, highlight=False, soft_wrap=True)
 
@@ -101,28 +98,27 @@ class Progress(_Line):
     def __init__(self, console: Console, plan: SamplingPlan) -> None:
         super().__init__(console)
         self.plan = plan
-        self.done = 0
+        self.steps = 0.0  # of all ensembles together, since this was made
         self.check: Check | None = None
-        self.since = 0  # blocks of ensembles since the check
         self.end: float | None = None  # when it will be done, by the check; of a monotonic clock
 
     def __call__(self, phase: Phase, check: Check | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
-        self.done += check is None
-        self.since += check is None
-        if check is not None:
-            self.check, self.since, self.end = check, 0, None
-        if self.end is None:
-            self.end = self._forecast()
+        if check is None:
+            self.steps += self.plan.block / self.plan.ensembles
+        else:
+            self.check, self.end = check, self._forecast(check)
         self.show(self.line(phase), printed=check is not None)
 
     def line(self, phase: Phase) -> str:
         """Return the line that is shown."""
         elapsed = max(time.monotonic() - self.begun, 1e-9)
-        steps = self.done * self.plan.block / self.plan.ensembles
-        rate = steps * self.plan.ensembles * self.plan.walkers / elapsed
+        rate = self.steps * self.plan.ensembles * self.plan.walkers / elapsed
         if self.check is None:
-            return f"{phase:9} {steps:6.0f} steps   {rate:6.0f} models/s   ensembles are converging"
+            return (
+                f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} models/s   "
+                "ensembles are converging"
+            )
         check = self.check
         fewest = float(np.min([check.ess_bulk, check.ess_tail]))
         # It counts down to the end that was forecast at the last check.
@@ -135,25 +131,22 @@ class Progress(_Line):
             f"{cover}"
         )
 
-    def _forecast(self) -> float | None:
+    def _forecast(self, check: Check) -> float | None:
         """Guess the end from the effective draws per step so far and the autocorrelation time.
 
         There is none while the draws disagree, which more of them may or may not cure; and a run
-        that goes on is judged before its first step.
+        that goes on is checked before its first step.
         """
-        if self.check is None or not self.done or self.check.disagreements():
+        fewest = float(np.min([check.ess_bulk, check.ess_tail]))
+        if not self.steps or check.disagreements() or not fewest > 0:
             return None
-        fewest = float(np.min([self.check.ess_bulk, self.check.ess_tail]))
-        needed = self.check.steps * self.plan.ess / fewest if fewest > 0 else np.inf
-        needed = max(needed, LENGTH * float(np.max(self.check.autocorrelation)))
+        needed = check.steps * self.plan.ess / fewest
+        needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
         if not np.isfinite(needed):
             return None
-        steps_a_block = self.plan.block / self.plan.ensembles
-        remaining = (
-            min(needed, self.plan.most_steps) - self.check.steps - self.since * steps_a_block
-        )
+        remaining = max(min(needed, self.plan.most_steps) - check.steps, 0)
         now = time.monotonic()
-        return now + max(remaining, 0) * (now - self.begun) / (self.done * steps_a_block)
+        return now + remaining * (now - self.begun) / self.steps
 
 
 def _minutes(seconds: float) -> str:
