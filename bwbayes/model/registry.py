@@ -17,12 +17,11 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
+from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 

@@ -14,9 +14,7 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
-from bwbayes.model.operators.domain_wall import DomainWall
-from bwbayes.model.operators.jiles_atherton import JilesAtherton
-from bwbayes.model.operators.pinned import Pinned
+from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.inference.test_gain_and_creep import GAIN, PARTS
 from tests.inference.test_likelihood import moving
 from tests.inference.test_stages import OPERATORS, models

@@ -22,9 +22,8 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import FormulaType
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.domain_wall import DomainWall
-from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.memory import RemembersExtrema
+from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 

@@ -12,7 +12,8 @@ each model follows them, with an error below 1e-6 of the range of the displaceme
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,9 +23,21 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import OneState, StateMemory, initial
-from bwbayes.model.operators.walls import Solver, Walls
+from bwbayes.model.operators.rosenbrock import STAGES
+from bwbayes.model.operators.walls import (
+    KNOTS,
+    LINES,
+    Walls,
+    at_rest,
+    curve,
+    first_step,
+    integrate,
+    interpolate,
+    irreversible,
+    moves_from,
+)
 
-__all__ = ["Pinned"]
+__all__ = ["DomainWall", "JilesAtherton", "Pinned"]
 
 # Samples that one stretch is followed for: a number that does not depend on the batch.
 LONGEST = 2048
@@ -34,10 +47,10 @@ LONGEST = 2048
 WEAKEST, STRONGEST = 1e-3, 0.98
 
 
-class Pinned(OneState, Solver):
+class Pinned(OneState):
     """Hysteresis by pinned walls, with an error below 1e-6 of the range.
 
-    The displacement P in um follows the voltage u in V by
+    The displacement P in um follows the voltage u in V, to which the field is proportional, by
 
         P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
         dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
@@ -56,6 +69,8 @@ class Pinned(OneState, Solver):
     With 0 ≤ η < 1 nothing is polarized by itself, |P_an − P_irr| stays below k d (1 − η), and the
     denominator keeps its sign.
     """
+
+    spins: ClassVar[bool]
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -165,8 +180,8 @@ class Pinned(OneState, Solver):
         """Return how far behind (2, models) sweeps through the span leave the walls, um."""
         walls, behind = self.walls(column), []
         for fixed in self.swept(column, voltage, span):
-            p = self.at_rest(walls, fixed, np.full_like(fixed, voltage))
-            level, _ = self.curve((voltage + walls.coupling * p) / walls.field)
+            p = at_rest(self.spins, walls, fixed, np.full_like(fixed, voltage))
+            level, _ = curve(self.spins, (voltage + walls.coupling * p) / walls.field)
             behind.append(np.clip(walls.saturation * level - fixed, -walls.lag, walls.lag))
         return np.stack(behind)
 
@@ -178,7 +193,8 @@ class Pinned(OneState, Solver):
         walls = self.walls(column)
         reversible = walls._replace(reversible=np.ones_like(behind))
         elsewhere = voltage - walls.coupling * (1 - walls.reversible) * behind
-        return self.at_rest(reversible, np.zeros_like(behind), elsewhere) - behind
+        whole = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
+        return np.asarray(whole - behind)
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
@@ -186,17 +202,44 @@ class Pinned(OneState, Solver):
         """Return the displacement P (models, samples), and P_irr at the end."""
         walls = self.walls(column)
         result = np.empty((state.size, voltage.size))
-        result[:, :1] = self.at_rest(walls.columns(), state[:, np.newaxis], voltage[np.newaxis, :1])
+        result[:, 0] = at_rest(self.spins, walls, state, np.full_like(state, voltage[0]))
         for first, last, s in monotone_stretches(voltage, LONGEST):
             # The mirrored models rise.
-            along, state = self.rise(walls, s * state, s * voltage[first : last + 1])
-            result[:, first + 1 : last + 1], state = s * along, s * state
+            along, state = self._rise(walls, s * state, s * voltage[first : last + 1])
+            result[:, first + 1 : last + 1], state = s * along[:, 1:], s * state
         return result, state
+
+    def _rise(
+        self, walls: Walls, fixed: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return P (models, points) along rising voltages (points,), and P_irr at the end.
+
+        ``fixed`` is P_irr (models,) at the first.
+        """
+        # From where P_an reaches P_irr, walls move forward until the voltage turns.
+        here = np.clip(moves_from(self.spins, walls, fixed), u[0], u[-1])
+        resting = int(np.searchsorted(u, np.max(here, initial=u[0]), side="right"))
+        along = np.empty((fixed.size, u.size))
+        columns = Walls(*(values[:, np.newaxis] for values in walls))
+        along[:, :resting] = at_rest(self.spins, columns, fixed[:, np.newaxis], u[:resting])
+        moving = here < u[-1]
+        p, step = at_rest(self.spins, walls, fixed, here), first_step(walls)
+        scale = np.minimum(walls.saturation, walls.slope * np.where(moving, u[-1] - here, 1.0))
+        stages, knots = np.zeros((STAGES, fixed.size)), np.empty((KNOTS, LINES, fixed.size))
+        while (here < u[-1]).any():
+            start = here
+            here, p, step, count = integrate(
+                self.spins, walls, start, p, step, u[-1], scale, stages, knots
+            )
+            for model in np.flatnonzero(start < here):
+                steps = knots[:count, :, model]
+                interpolate(steps, start[model], here[model], u, along[model])
+        return along, np.where(moving, irreversible(self.spins, walls, p, u[-1]), fixed)
 
     def walls(self, column: Values) -> Walls:
         """Return the numbers of the equation."""
         bare = column["d"] * (1 - column["coupling"])
-        field = self.slope_at_zero * column["saturation"] / bare
+        field = self._slope_at_zero * column["saturation"] / bare
         return Walls(
             column["saturation"],
             field,
@@ -207,11 +250,16 @@ class Pinned(OneState, Solver):
             column["d"],
         )
 
+    @property
+    def _slope_at_zero(self) -> float:
+        """L′(0)."""
+        return 1.0 if self.spins else 1 / 3
+
     def _pinning_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
         if not {"d", "saturation", "coupling"} <= set(earlier):
             return 0.0, np.inf
         bare = earlier["d"] * (1 - earlier["coupling"])
-        return WEAKEST * self.slope_at_zero * earlier["saturation"] / bare, np.inf
+        return WEAKEST * self._slope_at_zero * earlier["saturation"] / bare, np.inf
 
 
 def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
@@ -219,3 +267,35 @@ def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
         return -np.inf, np.inf
     bound = earlier["pinning"] * earlier["d"] * (1 - earlier["coupling"])
     return -bound, bound
+
+
+@dataclass(frozen=True)
+class JilesAtherton(Pinned):
+    """Jiles-Atherton hysteresis: pinned walls with L(y) = coth y − 1/y, to 1e-6 of the range.
+
+    Made for ferromagnets and used for ferroelectrics: the field is the voltage, the magnetization
+    the displacement. Equation and parameters are those of :class:`Pinned`, with L′(0) = 1/3.
+
+    Notes
+    -----
+    D. C. Jiles, D. L. Atherton, Theory of ferromagnetic hysteresis, Journal of Magnetism and
+    Magnetic Materials 61, 48-60 (1986), doi:10.1016/0304-8853(86)90066-1.
+    """
+
+    spins = False
+
+
+@dataclass(frozen=True)
+class DomainWall(Pinned):
+    """Domain wall hysteresis: pinned walls with L(y) = tanh y, to 1e-6 of the range.
+
+    The displacement is proportional to the polarization. Equation and parameters are those of
+    :class:`Pinned`, with L′(0) = 1.
+
+    Notes
+    -----
+    R. C. Smith, Z. Ounaies, A domain wall model for hysteresis in piezoelectric materials, Journal
+    of Intelligent Material Systems and Structures 11, 62-79 (2000); the paper's reference 19.
+    """
+
+    spins = True

@@ -1,4 +1,4 @@
-"""What solves the equation of pinned walls along a rising voltage, for any anhysteretic curve.
+"""The equation of pinned walls along a rising voltage, and what integrates it.
 
 The displacement P in um follows the voltage u in V by
 
@@ -9,16 +9,19 @@ and P_irr stays elsewhere. There, P follows from an implicit equation, which is 
 from where P_an reaches P_irr, which is known in closed form, an implicit method of order five
 (:mod:`~bwbayes.model.operators.rosenbrock`) takes over, with steps of its own for each model: walls
 that are hardly pinned follow P_an within a voltage k that is small against all others.
+
+All is written once, of what :mod:`bwbayes.model.elementwise` says: for arrays of models, and
+compiled for one. ``spins`` says which curve L is: tanh, or that of Langevin.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
+from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.operators.rosenbrock import (
     BETWEEN,
     COUPLINGS,
@@ -30,235 +33,200 @@ from bwbayes.model.operators.rosenbrock import (
     WEIGHTS,
 )
 
-__all__ = ["Solver", "Walls"]
+__all__ = [
+    "KNOTS", "LINES", "Walls", "at_rest", "curve", "field_at", "first_step", "integrate",
+    "interpolate", "irreversible", "moves_from",
+]  # fmt: skip
 
-# Error of a step, in units of the displacement along the stretch.
-TOLERANCE = 1e-8
-
-# How much a step may grow or shrink, and what part of the best step is taken.
-GROW, SHRINK, SAFE = 5.0, 0.2, 0.9
-
-# The first step of walls that begin to move, as a part of the voltage that they lag behind.
-FIRST = 0.1
-
-# Steps are at most the field's scale, or this part of the way to its zero: a longer one could jump
-# over the bend of the curve, from saturation to saturation. They are so many notches to an octave:
-# on a grid what is rounding in an estimated error does not grow from step to step.
-NOTCHES = 4
-FARTHEST = 0.25
-
-# Closer to saturation than this the field at which P_an reaches P_irr is not sharp; walls are
-# followed from a smaller one on, and do not move before it.
-SATURATED = 1 - 1e-6
-
-# Newton's method has converged when a step is below this part of the field's scale.
-CONVERGED, ROUNDS = 1e-15, 200
+# Steps that are remembered at a time, and what of each: where it begins, V, how long it is, the
+# displacement there, how much it changes, and the bend in between, um.
+KNOTS, LINES = 128, 7
 
 
 class Walls(NamedTuple):
-    """Models by the numbers of the equation, each (models,) or (models, 1).
+    """The numbers of the equation, each a number, (models,) or (models, 1).
 
     ``saturation`` P_s, um; ``field`` E₀, V; ``coupling`` a, V/um; ``pinning`` k, V; ``reversible``
     c; ``lag`` is the largest that |P_an − P_irr| can get, um; ``slope`` that of the anhysteretic
     displacement at zero, with the coupling, um/V.
     """
 
-    saturation: FloatArray
-    field: FloatArray
-    coupling: FloatArray
-    pinning: FloatArray
-    reversible: FloatArray
-    lag: FloatArray
-    slope: FloatArray
-
-    def rows(self, which: IntArray) -> Walls:
-        """Return some of the models."""
-        return Walls(*(values[which] for values in self))
-
-    def columns(self) -> Walls:
-        """Return the models with an axis for points."""
-        return Walls(*(values[:, np.newaxis] for values in self))
+    saturation: Any
+    field: Any
+    coupling: Any
+    pinning: Any
+    reversible: Any
+    lag: Any
+    slope: Any
 
 
-class Solver(ABC):
-    """Pinned walls behind an anhysteretic curve L, L(±∞) = ±1, that is steepest at zero."""
-
-    @property
-    @abstractmethod
-    def slope_at_zero(self) -> float:
-        """L′(0)."""
-
-    @abstractmethod
-    def curve(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return L and L′ at fields in units of E₀, of any shape."""
-
-    @abstractmethod
-    def bend(self, y: FloatArray, level: FloatArray, slope: FloatArray) -> FloatArray:
-        """Return L″ at fields at which :meth:`curve` is known."""
-
-    @abstractmethod
-    def field_at(self, level: FloatArray) -> FloatArray:
-        """Return the field in units of E₀ at which L is ``level``, between −1 and 1."""
-
-    def rise(self, walls: Walls, fixed: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return P (models, points - 1) along rising voltages (points,), and P_irr at the end.
-
-        ``fixed`` is P_irr (models,) at the first.
-        """
-        # From where P_an reaches P_irr, walls move forward until the voltage turns.
-        level = np.clip(fixed / walls.saturation, -SATURATED, SATURATED)
-        free = walls.field * self.field_at(level) - walls.coupling * fixed
-        since = np.maximum(free, u[0])
-        resting = int(np.searchsorted(u, np.max(since, initial=u[0]), side="right"))
-        along = np.empty((fixed.size, u.size))
-        along[:, :resting] = self.at_rest(
-            walls.columns(), fixed[:, np.newaxis], u[np.newaxis, :resting]
-        )
-        moving = np.flatnonzero(since < u[-1])
-        if moving.size == 0:
-            return along[:, 1:], fixed
-        movers = walls.rows(moving)
-        path, begin = along[moving], since[moving]
-        start = self.at_rest(movers, fixed[moving], begin)
-        end = self._move(movers, begin, start, u, path)
-        along[moving] = path
-        after = fixed.copy()
-        after[moving] = self._irreversible(movers, end, float(u[-1]))
-        return along[:, 1:], after
-
-    def at_rest(self, walls: Walls, fixed: FloatArray, u: FloatArray) -> FloatArray:
-        """Solve P = c P_an + (1 − c) P_irr for P (models, points), by Newton's method.
-
-        In the effective field x = u + a P. From a start beyond the root, seen from zero, the steps
-        never leave its side. An element that has converged stays, whatever the others do.
-        """
-        ws, e0, a, _, c, _, _ = walls
-        base = u + a * (1 - c) * fixed
-        share = a * c * ws
-        near = np.abs(base) / (1 - share * self.slope_at_zero / e0)
-        x = np.copysign(np.minimum(near, np.abs(base) + share), base)
-        for _ in range(ROUNDS):
-            level, slope = self.curve(x / e0)
-            step = (x - base - share * level) / (1 - share * slope / e0)
-            going = np.abs(step) > CONVERGED * (np.abs(x) + e0)
-            if not going.any():
-                break
-            x = x - np.where(going, step, 0.0)
-        return c * ws * self.curve(x / e0)[0] + (1 - c) * fixed
-
-    def _irreversible(self, walls: Walls, p: FloatArray, u: float) -> FloatArray:
-        """Return P_irr (models,) of a displacement."""
-        level, _ = self.curve((u + walls.coupling * p) / walls.field)
-        fixed: FloatArray = (p - walls.reversible * walls.saturation * level) / (
-            1 - walls.reversible
-        )
-        return fixed
-
-    def _slope(self, walls: Walls, u: FloatArray, p: FloatArray) -> FloatArray:
-        """Return f = dP/du (models,) while walls move forward under a rising voltage."""
-        ws, e0, a, k, c, lag_limit, _ = walls
-        level, slope = self.curve((u + a * p) / e0)
-        behind = np.clip((ws * level - p) / (1 - c), 0.0, lag_limit)
-        slope = slope * ws / e0
-        forward: FloatArray = (c * slope + (1 - c) * behind / (k - a * behind)) / (
-            1 - a * c * slope
-        )
-        return forward
-
-    def _slopes(
-        self, walls: Walls, u: FloatArray, p: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return f, f_u and f_p (models,)."""
-        ws, e0, a, k, c, lag_limit, _ = walls
-        y = (u + a * p) / e0
-        level, slope = self.curve(y)
-        bend = self.bend(y, level, slope) * ws / e0**2
-        behind = np.clip((ws * level - p) / (1 - c), 0.0, lag_limit)
-        slope = slope * ws / e0
-        feedback, moving = 1 - a * c * slope, k - a * behind
-        forward = (c * slope + (1 - c) * behind / moving) / feedback
-        # How f grows as walls lag further behind P_an.
-        pull = k / (moving**2 * feedback)
-        along = c * (1 + a * forward) / feedback * bend + pull * slope
-        return forward, along, a * along - pull
-
-    def _move(
-        self,
-        walls: Walls,
-        u: FloatArray,
-        p: FloatArray,
-        points: FloatArray,
-        along: FloatArray,
-    ) -> FloatArray:
-        """Let walls move from voltages u and displacements p (models,) to the last point.
-
-        Fills in P ``along`` (models, points) after u, and returns the last. Every model has its own
-        steps, so that it does not depend on the others.
-        """
-        u, p, end = u.copy(), p.copy(), points[-1]
-        scale = TOLERANCE * np.minimum(walls.saturation, walls.slope * (end - u))
-        step = FIRST * (walls.pinning - walls.coupling * walls.lag)
-        rows = np.arange(u.size)
-        while rows.size:
-            subset = walls.rows(rows)
-            at, now = u[rows], p[rows]
-            away = np.abs(at + subset.coupling * now) / (1 + subset.coupling * subset.slope)
-            largest = np.maximum(FARTHEST * away / subset.field, 1.0)
-            notch = np.floor(NOTCHES * np.log2(np.minimum(step[rows] / subset.field, largest)))
-            best = subset.field * np.exp2(notch / NOTCHES)
-            last = best >= end - at
-            h = np.where(last, end - at, best)
-            slope, drift, jacobian = self._slopes(subset, at, now)
-            shifted, stages = 1 / (SHIFT * h) - jacobian, list[FloatArray]()
-            for stage in range(STAGES):
-                if stage > 0:
-                    near = now + _weighted(WEIGHTS[stage], stages)
-                    slope = self._slope(subset, at + PLACES[stage] * h, near)
-                coupled = _weighted(COUPLINGS[stage], stages) / h
-                stages.append((slope + DRIFTS[stage] * h * drift + coupled) / shifted)
-            change = _weighted(END, stages)
-            inner = [_weighted(weights, stages) for weights in BETWEEN]
-            # In between it is as good as the slope in the middle says that it is.
-            midpoint = now + 0.5 * change + 0.25 * (inner[0] + 0.5 * (inner[1] + 0.5 * inner[2]))
-            off = (
-                self._slope(subset, at + 0.5 * h, midpoint)
-                - (change + 0.25 * (inner[1] + inner[2])) / h
-            )
-            error = np.maximum(np.abs(stages[-1]), np.abs(off / shifted)) / scale[rows]
-            good = error <= 1
-            with np.errstate(divide="ignore"):
-                step[rows] = h * np.clip(SAFE * error**-0.2, SHRINK, GROW)
-            done, arrived = rows[good], np.where(last, end, at + h)
-            u[done], p[done] = arrived[good], (now + change)[good]
-            terms = [term[good] for term in (change, *inner)]
-            _fill(along, points, done, at[good], arrived[good], now[good], terms)
-            rows = rows[~(good & last)]
-        return p
+def curve(spins: bool, y: Any) -> tuple[Any, Any]:
+    """Return L and L′: tanh y, or coth y − 1/y and 1/y² − 1/sinh² y."""
+    size = np.abs(y)
+    decay = np.exp(-2.0 * size)
+    if spins:
+        return np.tanh(y), 4.0 * decay / (1.0 + decay) ** 2
+    level, slope = 0.0 * size, 0.0 * size
+    if anywhere(size < 1.0):
+        # L(y)/y is a quotient of polynomials of y², its continued fraction cut off: to 4e-14.
+        near = np.minimum(size, 1.0)
+        square = near * near
+        above = ((square + 594.0) * square + 45045.0) * square + 675675.0
+        below = ((36.0 * square + 6930.0) * square + 270270.0) * square + 2027025.0
+        quotient = above / below
+        level = near * quotient
+        slope = 1.0 - level * level - 2.0 * quotient
+    if anywhere(size >= 1.0):
+        inverse = 1.0 / np.maximum(size, 1.0)
+        ratio = 2.0 * decay / np.maximum(1.0 - decay, 0.5)
+        level = select(size < 1.0, level, 1.0 + ratio - inverse)
+        far = inverse * inverse - 2.0 * ratio / np.maximum(1.0 - decay, 0.5)
+        slope = select(size < 1.0, slope, far)
+    return np.copysign(level, y), slope
 
 
-def _weighted(weights: FloatArray, stages: list[FloatArray]) -> FloatArray:
-    """Return the weighted sum of stages (models,), term by term, so that no row sees another."""
-    total = np.zeros(())
-    for weight, stage in zip(weights, stages, strict=False):
-        total = total + weight * stage
+def field_at(spins: bool, level: Any) -> Any:
+    """Return the field in units of E₀ at which L is ``level``, between −1 and 1."""
+    if spins:
+        return np.arctanh(level)
+    size = np.abs(level)
+    y = size * (3.0 - size * size) / (1.0 - size * size)  # within 5 %
+    for _ in range(4):
+        reached, slope = curve(spins, y)
+        y = y - (reached - size) / slope
+    return np.copysign(y, level)
+
+
+def at_rest(spins: bool, walls: Any, fixed: Any, u: Any) -> Any:
+    """Return P at voltages u while P_irr is ``fixed``, um.
+
+    By Newton's method in the effective field x = u + a P. From a start beyond the root, seen from
+    zero, the steps never leave its side. An element that has converged stays, whatever the others
+    do.
+    """
+    saturation, field, coupling, _, reversible, _, _ = walls
+    base = u + coupling * (1.0 - reversible) * fixed
+    share = coupling * reversible * saturation
+    near = np.abs(base) / (1.0 - share * (1.0 if spins else 1.0 / 3.0) / field)
+    x = np.copysign(np.minimum(near, np.abs(base) + share), base)
+    for _ in range(200):
+        level, slope = curve(spins, x / field)
+        step = (x - base - share * level) / (1.0 - share * slope / field)
+        going = np.abs(step) > 1e-15 * (np.abs(x) + field)
+        if not anywhere(going):
+            break
+        x = x - select(going, step, 0.0)
+    level, _ = curve(spins, x / field)
+    return reversible * saturation * level + (1.0 - reversible) * fixed
+
+
+def irreversible(spins: bool, walls: Any, p: Any, u: Any) -> Any:
+    """Return P_irr, um, of a displacement at a voltage."""
+    level, _ = curve(spins, (u + walls[2] * p) / walls[1])
+    return (p - walls[4] * walls[0] * level) / (1.0 - walls[4])
+
+
+def moves_from(spins: bool, walls: Any, fixed: Any) -> Any:
+    """Return the voltage from which walls move forward, V: where P_an reaches P_irr."""
+    # Closer to saturation that field is not sharp: walls are followed from a smaller one on.
+    sharp = 1.0 - 1e-6
+    level = np.minimum(np.maximum(fixed / walls[0], -sharp), sharp)
+    return walls[1] * field_at(spins, level) - walls[2] * fixed
+
+
+def first_step(walls: Any) -> Any:
+    """Return the first step of walls that begin to move, a part of the voltage they lag behind."""
+    return 0.1 * (walls[3] - walls[2] * walls[5])
+
+
+def slopes(spins: bool, walls: Any, u: Any, p: Any) -> tuple[Any, Any, Any]:
+    """Return f = dP/du while walls move forward under a rising voltage, f_u and f_p."""
+    saturation, field, coupling, pinning, reversible, lag, _ = walls
+    y = (u + coupling * p) / field
+    level, slope = curve(spins, y)
+    bend = -2.0 * level * slope
+    if not spins:
+        # Where the rest is rounding, the first term of the series is left.
+        small = np.abs(y) < 1e-4
+        safe = select(small, 1.0, y)
+        bend = select(small, -2.0 * y / 15.0, bend - 2.0 * (slope - level / safe) / safe)
+    behind = np.minimum(np.maximum((saturation * level - p) / (1.0 - reversible), 0.0), lag)
+    slope, bend = slope * saturation / field, bend * saturation / field**2
+    feedback, moving = 1.0 - coupling * reversible * slope, pinning - coupling * behind
+    forward = (reversible * slope + (1.0 - reversible) * behind / moving) / feedback
+    # How f grows as walls lag further behind P_an.
+    pull = pinning / (moving * moving * feedback)
+    along = reversible * (1.0 + coupling * forward) / feedback * bend + pull * slope
+    return forward, along, coupling * along - pull
+
+
+def weighted(weights: Any, stages: Any, count: int) -> Any:
+    """Return a weighted sum of the first stages, term by term, so that no model sees another."""
+    total = 0.0 * stages[0]
+    for stage in range(count):
+        total = total + weights[stage] * stages[stage]
     return total
 
 
-def _fill(
-    along: FloatArray,
-    points: FloatArray,
-    rows: IntArray,
-    first: FloatArray,
-    last: FloatArray,
-    start: FloatArray,
-    terms: list[FloatArray],
+def integrate(
+    spins: bool, walls: Any, u: Any, p: Any, step: Any, end: Any, scale: Any, stages: Any,
+    knots: Any,
+) -> tuple[Any, Any, Any, int]:  # fmt: skip
+    """Let walls move from voltages u and displacements p to a voltage ``end``, or near.
+
+    Every model has its own steps, the next of which is ``step``, with an error of 1e-8 of the
+    ``scale``. They are written to ``knots`` (KNOTS, LINES, ...), for :func:`interpolate`;
+    ``stages`` (STAGES, ...) are zeros to work on. Return u, p, step and the number of knots.
+    """
+    _, field, coupling, _, _, _, steepest = walls
+    count = 0
+    while count < len(knots) and anywhere(u < end):
+        active = u < end
+        # At most the field's scale, or a part of the way to its zero: a longer one could jump over
+        # the bend of the curve. On a grid what is rounding in an error does not grow.
+        away = np.abs(u + coupling * p) / (1.0 + coupling * steepest)
+        largest = np.maximum(0.25 * away / field, 1.0)
+        notch = np.floor(4.0 * np.log2(np.minimum(step / field, largest)))
+        best = field * np.exp2(notch / 4.0)
+        last = best >= end - u
+        h = select(active & last, end - u, best)
+        slope, drift, jacobian = slopes(spins, walls, u, p)
+        shifted = 1.0 / (SHIFT * h) - jacobian
+        for stage in range(STAGES):
+            if stage > 0:
+                near = p + weighted(WEIGHTS[stage], stages, stage)
+                slope, _, _ = slopes(spins, walls, u + PLACES[stage] * h, near)
+            coupled = weighted(COUPLINGS[stage], stages, stage) / h
+            stages[stage] = (slope + DRIFTS[stage] * h * drift + coupled) / shifted
+        change = weighted(END, stages, STAGES)
+        first = weighted(BETWEEN[0], stages, STAGES)
+        second = weighted(BETWEEN[1], stages, STAGES)
+        third = weighted(BETWEEN[2], stages, STAGES)
+        # In between it is as good as the slope in the middle says that it is.
+        middle = p + 0.5 * change + 0.25 * (first + 0.5 * (second + 0.5 * third))
+        slope, _, _ = slopes(spins, walls, u + 0.5 * h, middle)
+        off = np.abs((slope - (change + 0.25 * (second + third)) / h) / shifted)
+        error = np.maximum(np.abs(stages[STAGES - 1]), off) / (1e-8 * scale)
+        good = active & (error <= 1.0)
+        # A step that failed stands before the one that did not, and counts for nothing.
+        knots[count, 0], knots[count, 1], knots[count, 2] = u, h, p
+        knots[count, 3], knots[count, 4] = change, first
+        knots[count, 5], knots[count, 6] = second, third
+        factor = 0.9 * np.maximum(error, 1e-12) ** -0.2
+        step = select(active, h * np.minimum(np.maximum(factor, 0.2), 5.0), step)
+        u, p = select(good, select(last, end, u + h), u), select(good, p + change, p)
+        count += 1
+    return u, p, step, count
+
+
+def interpolate(
+    knots: FloatArray, start: float, stop: float, points: FloatArray, out: FloatArray
 ) -> None:
-    """Fill in the points of a step from ``first`` to ``last`` (rows,), by its polynomial."""
-    low, high = (np.searchsorted(points, ends, side="right") for ends in (first, last))
-    counts = high - low
-    which = np.repeat(np.arange(rows.size), counts)
-    column = np.arange(which.size) - np.repeat(np.cumsum(counts) - counts - low, counts)
-    fraction = (points[column] - first[which]) / (last - first)[which]
-    change, *inner = (term[which] for term in terms)
-    between = (1 - fraction) * (inner[0] + fraction * (inner[1] + fraction * inner[2]))
-    along[rows[which], column] = start[which] + fraction * (change + between)
+    """Write one model's displacements ``out`` (points,) at voltages between start and stop."""
+    first = np.searchsorted(points, start, side="right")
+    last = np.searchsorted(points, stop, side="right")
+    row = np.searchsorted(knots[:, 0], points[first:last], side="left") - 1
+    fraction = (points[first:last] - knots[:, 0][row]) / knots[:, 1][row]
+    bend = knots[:, 4][row] + fraction * (knots[:, 5][row] + fraction * knots[:, 6][row])
+    inner = knots[:, 3][row] + (1.0 - fraction) * bend
+    out[first:last] = knots[:, 2][row] + fraction * inner

@@ -13,11 +13,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.domain_wall import DomainWall
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.jiles_atherton import JilesAtherton
 from bwbayes.model.operators.one_state import OneState
-from bwbayes.model.operators.pinned import Pinned
+from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.model.operators.differential import RANGES, SPAN, prior_draws, w_of
 
 OPERATORS: dict[str, OneState] = {
