@@ -31,10 +31,9 @@ from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.noise import WhiteNoise
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.rough import DiscrepancyNoise, SteadyState
 from bwbayes.results.calibration import LIMIT, Calibration, judge
 from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.measured import keep
@@ -163,9 +162,13 @@ def test_white_noise_model_fails_the_bands() -> None:
 class WrongCorrelation(DiscrepancyNoise):
     """Noise whose correlation decays three times as fast as its correlation time says."""
 
-    def steady_state(self, theta: FloatArray) -> SteadyState:
-        """Return the filter of a third of the correlation time."""
-        return super().steady_state(theta * [1, 1, 1 / 3])
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return that of a third of the correlation time."""
+        return super().transition(theta * [1, 1, 1 / 3], readings)
+
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return that of a third of the correlation time."""
+        return super().fresh(theta * [1, 1, 1 / 3], readings)
 
 
 @dataclass(frozen=True)

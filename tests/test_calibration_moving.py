@@ -43,7 +43,7 @@ from bwbayes.app.running.workers import one_thread
 from bwbayes.data.io.formats import write_record
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.results.calibration import Calibration, judge

@@ -25,7 +25,7 @@ from bwbayes.app.running.run import resume, start
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
-from bwbayes.inference.noises import NOISES, noise_model
+from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.elementwise import select

@@ -25,7 +25,7 @@ from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.monitor import Outcome
 from tests.reference.make import digest, from_cube
@@ -167,9 +167,13 @@ def test_twin_draws_that_are_too_narrow_are_found(
 class Slower(DiscrepancyNoise):
     """Noise that takes readings to be half as far apart again."""
 
-    def at(self, interval: float) -> DiscrepancyNoise:
-        """Return the noise for another interval."""
-        return DiscrepancyNoise(1.5 * interval)
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return that of half as many readings more."""
+        return super().transition(theta, 1.5 * np.asarray(readings))
+
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return that of half as many readings more."""
+        return super().fresh(theta, 1.5 * readings)
 
 
 def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> None:

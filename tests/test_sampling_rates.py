@@ -19,7 +19,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
-from bwbayes.inference.smooth import SmoothNoise
+from bwbayes.inference.noise import SmoothNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.prediction import predict_record
 from bwbayes.results.start import Start

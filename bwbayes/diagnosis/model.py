@@ -12,7 +12,7 @@ import numpy as np
 
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import pointfit
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 
 __all__ = ["creep", "dynamics", "hold", "nonlinearity", "operator", "smooth"]
 

@@ -18,8 +18,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.noise import LOG_TWO_PI, Noise
+from bwbayes.inference.noise import Noise
 from bwbayes.inference.readings import Readings
+from bwbayes.inference.state_space import LOG_TWO_PI
 from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.shown import brief
@@ -234,7 +235,7 @@ class Likelihood:
         model, noise = self.table.actuator(theta), self.table.noise(theta)
         if displacement is None:
             displacement = self._simulated(model)[:, readings.where]
-        responses = self._responses(model, spaced.log_decay(noise))
+        responses = self._responses(model, noise)
         audible = responses.shape[2]
         series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
         series[:, 0] = readings.values - displacement
@@ -308,27 +309,22 @@ class Likelihood:
 
     def _moments(self, theta: FloatArray) -> Moments:
         """Do it with NumPy for one batch of models."""
-        readings = self.readings
+        readings, spaced = self.readings, self.spaced
         model, noise = self.table.actuator(theta), self.table.noise(theta)
-        simulated = self._simulated(model)
-        residual = (readings.values - simulated[:, readings.where])[:, np.newaxis]
-        spaced = self.spaced
-        responses = self._responses(model, spaced.log_decay(noise))
-        skipped, audible = readings.skipped, responses.shape[2]
-        parts = []
-        # A few models at a time: what is whitened then stays in the cache.
-        for batch in batches(len(theta), readings.rows.size, CACHED):
-            white, log_determinant = spaced.whiten(noise[batch], residual[batch], skipped)
-            pulls, _ = spaced.whiten(noise[batch], responses[batch], skipped[:audible])
-            series = [white[:, 0], *np.moveaxis(pulls, 1, 0)]
-            parts.append((_products(series, audible), log_determinant))
-        return Moments(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        residual = readings.values - self._simulated(model)[:, readings.where]
+        responses = self._responses(model, noise)
+        audible = responses.shape[2]
+        white, log_determinant = spaced.whiten(noise, residual[:, np.newaxis], readings.skipped)
+        pulls, _ = spaced.whiten(noise, responses, readings.skipped[:audible])
+        return Moments(
+            _products([white[:, 0], *np.moveaxis(pulls, 1, 0)], audible), log_determinant
+        )
 
-    def _responses(self, model: FloatArray, log_decay: FloatArray) -> FloatArray:
+    def _responses(self, model: FloatArray, noise: FloatArray) -> FloatArray:
         """Unknowns' responses (models, unknowns, readings), as long as the noise hears of them.
 
-        An offset stays; a free response dies out with the dynamics, and the filter of the noise
-        (``log_decay`` per reading) forgets it.
+        An offset stays; a free response dies out with the dynamics, and the noise's filter forgets
+        it.
         """
         rows = self.readings.rows
         sections = self.actuator.sections(self.actuator.columns(model))
@@ -336,11 +332,10 @@ class Likelihood:
         if self.offset_sd:
             audible = rows.size
         elif unknowns:
-            with np.errstate(divide="ignore"):
-                slowest = max(float(np.max(np.log(sections.remembered))), -FORGOTTEN)
+            nothing = np.exp(-FORGOTTEN)
+            slowest = np.log(max(float(np.max(sections.remembered)), nothing))
+            decay = np.log(max(float(np.max(self.spaced.decay(noise))), nothing))
             forgotten = FORGOTTEN + rows * slowest < 0
-            # White noise decays at once: its rate is infinite.
-            decay = max(float(np.max(log_decay)), -FORGOTTEN)
             forgotten &= FORGOTTEN + np.arange(rows.size) * decay < 0
             audible = int(np.argmax(forgotten)) if forgotten[-1] else rows.size
         else:

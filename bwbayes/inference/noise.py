@@ -1,105 +1,23 @@
-"""The residual's noise: sensor noise, and honest discrepancy.
+"""The noises: white, with a rough discrepancy, with a smooth one, or one's own by its import path.
 
-The residual of a Bouc-Wen fit to a measured record is correlated over many samples: most of it is
-what the model does not know about the actuator. Calling it white makes the parameters look several
-times better known than they are. So the residual is the sum of two parts,
-
-    r(t) = x(t) + e(t),   x the discrepancy (sd σ, correlation time τ),   e white (s),
-
-and a Kalman filter turns it into independent innovations, whatever readings are missing. Its log
-density is theirs. The discrepancy is rough (:mod:`bwbayes.inference.rough`), smooth
-(:mod:`bwbayes.inference.smooth`), or there is none.
+Each is a :class:`~bwbayes.inference.state_space.Noise` that says how its discrepancy goes on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Declaration, lognormal
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.registry import made
 
-__all__ = [
-    "DISCREPANCY_SD",
-    "DISCREPANCY_TIME",
-    "SENSOR_SD",
-    "Noise",
-    "WhiteNoise",
-    "log_density",
-]
-
-LOG_TWO_PI = float(np.log(2 * np.pi))
-
-
-@runtime_checkable
-class Noise(Protocol):
-    """A Gaussian model of the residual between a reading and the forward model."""
-
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """Its parameters, in the order of θ's columns."""
-
-    def whiten(
-        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Turn series (models, series, readings) of each model into independent innovations.
-
-        ``theta`` is (models, parameters); ``skipped`` (readings,) counts the readings that are
-        missing just before each one, by default none, as in
-        :class:`~bwbayes.inference.readings.Readings`. Returns the innovations over their sds,
-        shaped as the series, and the log determinant (models,) of the covariance: with V = L Lᵀ
-        these are L⁻¹ series and log det V.
-        """
-
-    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
-        """Log density (models,) of residuals (models, samples) in um at θ (models, parameters)."""
-
-    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sd of the discrepancy and of the sensor, each (models,), um."""
-
-    def sized(
-        self,
-        theta: FloatArray,
-        missed: Callable[[], float],
-        readings: int,
-        generator: np.random.Generator,
-    ) -> FloatArray:
-        """Return θ (models, parameters) with the discrepancy's size where nothing was fitted.
-
-        ``missed`` returns the mean square, um², of what the models' mean misses of so many
-        fitted readings.
-        """
-
-    def memory(self, theta: FloatArray) -> FloatArray:
-        """Correlation time of the discrepancy (models,), s; zero without one."""
-
-    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return F, what is left of the discrepancy after so many readings.
-
-        It is the first of two states, both of the discrepancy's sd, and independent at one time.
-        (models, 2, 2) after one number of readings, (models, numbers, 2, 2) after some (numbers,).
-        """
-
-    def log_decay(self, theta: FloatArray) -> FloatArray:
-        """Return the logarithm of what the filter keeps over a reading, at most, (models,)."""
-
-    def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
-        """One-sided amplitude spectral density (frequencies,), um/√Hz, at one θ (1, parameters)."""
-
-    def coefficients(self, theta: FloatArray) -> dict[str, FloatArray]:
-        """Return the compiled filter's parameters (models,), by their names there."""
-
-    def draw(
-        self, theta: FloatArray, samples: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
-        """Draw the discrepancy and the sensor's noise, (samples,), um, at one θ (1, parameters)."""
-
-    def at(self, interval: float) -> Noise:
-        """Return the same noise for readings ``interval`` seconds apart."""
-
+__all__ = ["NOISES", "DiscrepancyNoise", "Noise", "SmoothNoise", "WhiteNoise", "noise_model"]
 
 SENSOR_SD = Declaration(
     "sensor_sd",
@@ -129,26 +47,42 @@ DISCREPANCY_TIME = Declaration(
     lambda context: lognormal(0.5 * context.ranges.time, 0.8),
     floor=0.0,
 )
+# What swings knows hardly anything at low frequencies: it takes a slow misfit for the parameters'.
+DISCREPANCY_QUALITY = Declaration(
+    "discrepancy_quality",
+    "",
+    "Q",
+    "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
+    lambda _: Distribution("uniform", {"lower": 0.0, "upper": 0.5}),
+    floor=0.0,
+)
 
-
-def log_density(white: FloatArray, log_determinant: FloatArray) -> FloatArray:
-    """Log density (models,) of what was whitened (models, 1, readings)."""
-    readings = white.shape[2]
-    squares = np.sum(white[:, 0] ** 2, axis=1)
-    density: FloatArray = -0.5 * (squares + log_determinant + readings * LOG_TWO_PI)
-    return density
+# The integral over a time, by Gauss and Legendre, where the fast rate times it is below one.
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True)
-class WhiteNoise:
+class WhiteNoise(Noise):
     """Sensor noise alone, independent normal errors of sd s. Right only if the model is."""
 
-    interval: float = 1.0
+    states: ClassVar[int] = 0
 
     @property
     def declarations(self) -> tuple[Declaration, ...]:
         """The sensor's sd."""
         return (SENSOR_SD,)
+
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Nothing is left."""
+        return np.zeros((len(theta), *np.shape(readings), 2, 2))
+
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:  # noqa: ARG002
+        """Nothing is gained."""
+        return np.zeros((len(theta), 2, 2))
+
+    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """No discrepancy; sd of the sensor."""
+        return np.zeros(len(theta)), theta[:, 0]
 
     def whiten(
         self,
@@ -156,55 +90,182 @@ class WhiteNoise:
         series: FloatArray,
         skipped: FloatArray | None = None,  # noqa: ARG002  # nothing is remembered over a gap
     ) -> tuple[FloatArray, FloatArray]:
-        """Divide by the sensor's sd; shapes as in :class:`Noise`."""
-        sensor = theta[:, 0]
-        log_determinant: FloatArray = 2 * series.shape[2] * np.log(sensor)
-        return series / sensor[:, np.newaxis, np.newaxis], log_determinant
+        """Divide by the sensor's sd."""
+        log_determinant: FloatArray = 2 * series.shape[2] * np.log(theta[:, 0])
+        return series / theta[:, :1, np.newaxis], log_determinant
 
-    def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
-        """Return Σ log N(r; 0, s²); shapes as in :class:`Noise`."""
-        return log_density(*self.whiten(theta, residual[:, np.newaxis]))
+    def correlation_time(self, theta: FloatArray) -> FloatArray:
+        """Zero."""
+        return np.zeros(len(theta))
+
+
+@dataclass(frozen=True)
+class DiscrepancyNoise(Noise):
+    """A rough discrepancy, an Ornstein-Uhlenbeck process, which forgets exponentially.
+
+    It claims the least of what a model misses: that two readings have less in common the farther
+    they are apart, exp(−t/τ). It has one state.
+
+    Notes
+    -----
+    G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion, Physical Review 36,
+    823-841 (1930), doi:10.1103/PhysRev.36.823.
+    """
+
+    states: ClassVar[int] = 1
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Sds of sensor and discrepancy, and the discrepancy's correlation time."""
+        return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
 
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Nothing is left."""
-        return np.zeros((len(theta), *np.shape(readings), 2, 2))
+        """Return exp(−t/τ), alone."""
+        return _alone(np.exp(-np.multiply.outer(self.interval / theta[:, 2], readings)))
 
-    def log_decay(self, theta: FloatArray) -> FloatArray:
-        """Nothing is kept."""
-        return np.full(len(theta), -np.inf)
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return σ² (1 − exp(−2t/τ)), alone."""
+        return _alone(-(theta[:, 1] ** 2) * np.expm1(-2 * readings * self.interval / theta[:, 2]))
 
-    def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
-        """Return √(2 Δ) s at all frequencies."""
-        return np.full(frequency.size, np.sqrt(2 * self.interval) * theta[0, 0])
+    def decay(self, theta: FloatArray) -> FloatArray:
+        """Return φ s²/(p + s²), with φ = exp(−Δ/τ) and p the predicted variance in the long run.
 
-    def coefficients(self, theta: FloatArray) -> dict[str, FloatArray]:
-        """Nothing is remembered: innovations are the residuals."""
-        return {"variance": theta[:, 0] ** 2}
+        That is the positive root of p² + p (1 − φ²)(s² − σ²) = (1 − φ²) σ² s².
+        """
+        sensor, process, time = theta.T
+        fresh = -np.expm1(-2 * self.interval / time)
+        half = fresh * (sensor**2 - process**2) / 2
+        root = np.sqrt(half**2 + fresh * (process * sensor) ** 2)
+        p = np.maximum(root - half, 0)
+        decay: FloatArray = np.exp(-self.interval / time) * sensor**2 / (p + sensor**2)
+        return decay
 
-    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """No discrepancy; sd of the sensor."""
-        return np.zeros(theta.shape[0]), theta[:, 0]
 
-    def sized(
+def _alone(values: FloatArray) -> FloatArray:
+    """Return matrices (..., 2, 2) of the first state alone."""
+    matrices = np.zeros((*values.shape, 2, 2))
+    matrices[..., 0, 0] = values
+    return matrices
+
+
+@dataclass(frozen=True)
+class SmoothNoise(Noise):
+    """A smooth discrepancy, a driven oscillator: what a model misses of an actuator has no corners.
+
+    An Ornstein-Uhlenbeck process is rough at every scale, so that at high sampling rates it takes
+    slow misfit for something unlikely, and the answer depends on the rate. The process here has a
+    quality Q besides:
+
+        ẍ + (ω/Q) ẋ + ω² x = white noise,   ω = 1/(τ Q),   τ = ∫₀^∞ ρ(t) dt.
+
+    Q = 1/2 is a Matérn process of order 3/2; for Q → 0 it becomes an Ornstein-Uhlenbeck process of
+    the same σ and τ, and beyond 1/2 it swings. The states are x and ẋ/ω. With the rates a ≤ b that
+    solve λ² − λ ω/Q + ω² = 0, and S(t) = (e^(−a t) − e^(−b t))/(b − a):
+
+        F(t) = [[e^(−a t) + a S,  ω S], [−ω S,  e^(−b t) − a S]].
+
+    Notes
+    -----
+    As :class:`DiscrepancyNoise`; as a kernel in D. Foreman-Mackey, E. Agol, S. Ambikasaran,
+    R. Angus, Fast and scalable Gaussian process modeling with applications to astronomical time
+    series, The Astronomical Journal 154, 220 (2017), doi:10.3847/1538-3881/aa9332.
+    """
+
+    states: ClassVar[int] = 2
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Sds of sensor and discrepancy, the discrepancy's correlation time and quality."""
+        return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME, DISCREPANCY_QUALITY)
+
+    def for_new_readings(
         self,
         theta: FloatArray,
-        missed: Callable[[], float],  # noqa: ARG002
-        readings: int,  # noqa: ARG002
-        generator: np.random.Generator,  # noqa: ARG002
+        missed: Callable[[], float],
+        readings: int,
+        generator: np.random.Generator,
     ) -> FloatArray:
-        """Return θ as it is."""
-        return theta
+        """Take the discrepancy's size from the residuals, not from the kernel.
 
-    def memory(self, theta: FloatArray) -> FloatArray:
-        """No memory."""
-        return np.zeros(theta.shape[0])
+        Readings fix how the process moves at high frequencies, σ²/τ³; what σ adds at low ones is an
+        extrapolation, often of several times what was seen. So a draw's variance is the mean
+        square of the residuals less the sensor's, times ν/χ²(ν): over a time T they are worth
+        ν = T/∫ρ² = T/(τ (1 + Q²)) independent ones, or two at least.
+        """
+        _, _, time, quality = theta.T
+        worth = np.maximum(readings * self.interval / (time * (1 + quality**2)), 2.0)
+        seen = np.maximum(missed() - theta[:, 0] ** 2, 0.0)
+        sized = theta.copy()
+        sized[:, 1] = np.sqrt(seen * worth / generator.chisquare(worth))
+        return sized
 
-    def draw(
-        self, theta: FloatArray, samples: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
-        """Draw no discrepancy, and independent normal errors."""
-        return np.zeros(samples), theta[0, 0] * generator.standard_normal(samples)
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return F over the time of so many readings."""
+        return _oscillation(theta, readings * self.interval)
 
-    def at(self, interval: float) -> WhiteNoise:
-        """Return the same noise for readings ``interval`` seconds apart."""
-        return replace(self, interval=interval)
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return Q, over a short time as the integral of what the noise becomes.
+
+        White noise drives the second state.
+        """
+        _, process, time, quality = theta.T
+        fast = (1 + np.sqrt(np.maximum(1 - 4 * quality**2, 0))) / (2 * time * quality**2)
+        fast = np.maximum(fast, 1 / (time * quality))
+        kept, passed = self.transition(theta, readings), readings * self.interval
+        fresh = np.eye(2) - kept @ np.swapaxes(kept, 1, 2)
+        short = fast * passed < 1
+        if short.any():
+            pushed = _oscillation(theta[short], passed * (1 + NODES) / 2)[..., 1]
+            total = np.einsum("mti,mtj,t->mij", pushed, pushed, WEIGHTS)
+            scale = passed / (time * quality**2)[short]
+            fresh[short] = scale[:, np.newaxis, np.newaxis] * total
+        fresh *= (process**2)[:, np.newaxis, np.newaxis]
+        return fresh
+
+
+def _oscillation(theta: FloatArray, time: float | FloatArray) -> FloatArray:
+    """Return F (models, times, 2, 2) over times (times,), s; (models, 2, 2) over one."""
+    shape = (-1, *[1] * np.ndim(time))
+    memory, quality = (theta[:, column].reshape(shape) for column in (2, 3))
+    frequency = 1 / (memory * quality)
+    middle = frequency / (2 * quality)
+    # At Q = 1/2 both rates are the same.
+    apart = np.maximum(np.sqrt(np.abs(1 - 4 * quality**2)) * middle, 1e-150)
+    fast = middle + apart
+    slow = frequency**2 / fast
+    lasting = np.exp(-slow * time)
+    swelled = -lasting * np.expm1(-2 * apart * time) / (2 * apart)
+    first, last = lasting + slow * swelled, np.exp(-fast * time) - slow * swelled
+    swings = quality > 0.5
+    if swings.any():
+        decay, angle = np.exp(-middle * time), apart * time
+        sine, cosine = decay * np.sin(angle) / apart, decay * np.cos(angle)
+        first = np.where(swings, cosine + middle * sine, first)
+        last = np.where(swings, cosine - middle * sine, last)
+        swelled = np.where(swings, sine, swelled)
+    across = frequency * swelled
+    rows = np.stack([first, across, -across, last], axis=-1)
+    return rows.reshape(*first.shape, 2, 2)
+
+
+NOISES: Mapping[str, Callable[..., Noise]] = {
+    "discrepancy": DiscrepancyNoise,
+    "smooth": SmoothNoise,
+    "white": WhiteNoise,
+}
+
+
+def noise_model(kind: str, interval: float) -> Noise:
+    """Return the noise of that name (or import path) for readings ``interval`` seconds apart.
+
+    Raises
+    ------
+    InputError
+        No noise goes by that name.
+
+    Examples
+    --------
+    >>> [declared.name for declared in noise_model("discrepancy", 1e-3).declarations]
+    ['sensor_sd', 'discrepancy_sd', 'discrepancy_time']
+    """
+    return made("noise", kind, NOISES, {"interval": interval}, Noise)

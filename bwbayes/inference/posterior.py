@@ -249,7 +249,9 @@ class Posterior:
             return float(np.mean((readings.values - total / len(theta)) ** 2))
 
         parameters = self.only.table.noise(theta)
-        return self.likelihood.spaced.sized(parameters, missed, readings.rows.size, generator)
+        return self.likelihood.spaced.for_new_readings(
+            parameters, missed, readings.rows.size, generator
+        )
 
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""

@@ -19,7 +19,7 @@ from bwbayes.data.io.grid import clock
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.noise import tail_nats
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.drive import rate
 from bwbayes.results.bands import KINDS, Bands
 

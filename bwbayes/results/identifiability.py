@@ -16,10 +16,10 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.model.drive import monotone_stretches, turning_points
 
 __all__ = ["LEFT_OPEN", "combined", "percent", "spectrum", "stretches_once", "undetermined"]

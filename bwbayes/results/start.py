@@ -227,7 +227,7 @@ def started(
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
     span = _voltages(posterior, record)
     actuator = replace(posterior.only.actuator, interval=record.interval, hold=hold, span=span)
-    memory = posterior.only.noise.memory(posterior.only.table.noise(theta))
+    memory = posterior.only.noise.correlation_time(posterior.only.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
     whole = _likelihood(posterior, actuator, record, start, window)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)

@@ -74,7 +74,7 @@ class Background:
             dataset = single.only
             noise = dataset.table.noise(single.prior.theta(record_draws))
             # Rather too long than too short.
-            memory.append(float(np.quantile(dataset.noise.memory(noise), 0.9)))
+            memory.append(float(np.quantile(dataset.noise.correlation_time(noise), 0.9)))
             sds = dataset.noise.marginal_sd(noise)
             noise_log_sd.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
         datasets = posterior.datasets

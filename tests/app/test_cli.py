@@ -14,7 +14,7 @@ import pytest
 
 from bwbayes.app.commands import cli
 from bwbayes.data import read_record, write_record
-from bwbayes.inference.noises import NOISES
+from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 from tests.app import small

@@ -23,7 +23,7 @@ from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracked import Tracking
 from bwbayes.control.tracking import track
 from bwbayes.inference import pointfit
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.population.population import population

@@ -21,7 +21,7 @@ MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bw
 COMPILED = """
 import numpy as np
 from bwbayes.inference.compiled import moments
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)

@@ -25,7 +25,7 @@ from bwbayes.data.record import Record
 from bwbayes.data.teststand import LaserSensor, VirtualTestStand
 from bwbayes.data.waveforms import signal
 from bwbayes.inference import pointfit
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.results.bands import LEVELS
 from bwbayes.results.prediction import thinned

@@ -22,7 +22,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import ranges_of
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Dataset, Posterior

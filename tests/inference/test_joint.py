@@ -17,7 +17,7 @@ from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior

@@ -12,9 +12,8 @@ from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.noise import WhiteNoise
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.rough import DiscrepancyNoise
 from tests.inference.problems import INTERVAL, short_posterior, single, truth
 
 

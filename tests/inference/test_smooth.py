@@ -15,10 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.rough import DiscrepancyNoise
-from bwbayes.inference.smooth import SmoothNoise
 from bwbayes.results.carried import carried
 from bwbayes.results.innovations import Innovations
 from tests.inference.problems import INTERVAL, short_posterior

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.inference import pointfit
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.results.agreement import Agreement, _cost, agreements, disagreements, numbers

@@ -11,8 +11,8 @@ from scipy import stats
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.results.bands import Bands
 from bwbayes.results.carried import Carried, carried
 from bwbayes.results.prediction import Start, forecast, predict_record, predict_windows

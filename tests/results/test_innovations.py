@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.rough import DiscrepancyNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.results.innovations import Innovations, departures, innovations
 from tests.inference import problems
 

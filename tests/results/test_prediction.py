@@ -12,10 +12,10 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.rough import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.results import prediction

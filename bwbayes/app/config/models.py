@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from bwbayes.app.config.config import ModelConfig
 from bwbayes.app.config.keys import one_line
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.noises import NOISES
+from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 

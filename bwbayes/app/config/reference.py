@@ -19,7 +19,7 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.config.keys import ANY, Key, keys, synonyms
 from bwbayes.data.waveforms import signal_names
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.noises import NOISES
+from bwbayes.inference.noise import NOISES
 from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import FAMILIAR

@@ -34,7 +34,7 @@ from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import screening_evidence
 from bwbayes.data import Record
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.table import ParameterTable
 from bwbayes.results.replicates import as_done
 from bwbayes.results.standing import Standing

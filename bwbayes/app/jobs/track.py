@@ -85,7 +85,7 @@ def track(
     alone = posterior.alone(dataset.name)
     parameters = alone.noise_of_new(simulated, generator(seed, "noise"))
     discrepancy, sensor = dataset.noise.marginal_sd(parameters)
-    memory = dataset.noise.memory(parameters)
+    memory = dataset.noise.correlation_time(parameters)
     # A white noise has no discrepancy, so that any time will do.
     noise = LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0))
     tracking = tracked(

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import joined, ranges_of
-from bwbayes.inference.noises import NOISES
+from bwbayes.inference.noise import NOISES
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.table import Column, JointTable
 from bwbayes.model.actuator import OFFSET

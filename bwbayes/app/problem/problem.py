@@ -48,7 +48,7 @@ from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import choose
-from bwbayes.inference.noises import noise_model
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior

@@ -12,33 +12,14 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled import parts, physics
-from bwbayes.inference.compiled.lanes import (
-    A1,
-    A2,
-    B0,
-    B1,
-    B2,
-    LAG,
-    LANES,
-    LEVEL,
-    PARAMETERS,
-    STATE,
-    TRUE_X1,
-    TRUE_X2,
-    X1,
-    X2,
-)
-from bwbayes.inference.compiled.parts import creep, polynomial
+from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, X2
+from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
 
 __all__ = ["Walk", "walk"]
-
-# Samples that pass stage and dynamics together.
-PIECE = 64
 
 
 class Walk:
@@ -124,30 +105,16 @@ def walk(
         row = LANES * PARAMETERS.index(name)
         state[:, row : row + LANES] = values[at].reshape(-1, LANES)
     moving, *crept = actuator.sections(column).begin(unrest)
-    dynamics = (X1, X2) if actuator.creep is None else (TRUE_X1, TRUE_X2)
-    rows = dict(zip(dynamics, moving.T, strict=False))
+    rows = dict(zip((X1, X2), moving.T, strict=False))
     rows |= {LAG + LANES * k: lag[:, 0] for k, lag in enumerate(crept)}
     for row, values in rows.items():
         state[:, row : row + LANES] = values[at].reshape(-1, LANES)
-    return Walk(stage, parts(actuator, voltage), state, voltage, drive)
+    return Walk(stage, shared(actuator, voltage), state, voltage, drive)
 
 
 def _lanes(models: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     """Return the model of each lane; lanes to spare repeat the last one."""
     return np.minimum(np.arange(-(-models // LANES) * LANES), models - 1)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
-def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
-    """Let the dynamics follow the drive's distance from rest, and put the displacement there."""
-    for t in range(samples):
-        row = t * LANES
-        for i in range(LANES):
-            w = drive[row + i]
-            x = state[B0 + i] * w + state[X1 + i]
-            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
-            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
-            drive[row + i] = state[LEVEL + i] + x
 
 
 @njit(nogil=True, cache=True)
@@ -171,11 +138,7 @@ def _walk(
         for now in range(first, last, PIECE):
             end = min(now + PIECE, last)
             drive_of(kind, groups[group], plan, voltage, now, end, drive)
-            if curve.size > 0:
-                polynomial(state[group], curve, now, end, drive)
-            if lags.size > 0:
-                creep(state[group], lags, growth, now, end, drive)
-            _follow(state[group], end - now, drive)
+            displace(state[group], curve, lags, growth, now, end, drive)
             for i in range(models):
                 for t in range(now, end):
                     displacement[group * LANES + i, t - first] = drive[(t - now) * LANES + i]

@@ -1,0 +1,284 @@
+"""The noise's Kalman filter for ``LANES`` models side by side, and the sums its density needs.
+
+Most of a record passes :func:`follow`: each sample has a reading, and the filter has settled. Where
+readings are missing, or it has not settled, or still hears of the start of the dynamics, readings
+pass :func:`take` one by one. Where ``second`` is None, the second state of the noise is left out
+when it is compiled.
+
+An offset never dies out, and the slowest lags of the creep hardly do. But a response r that keeps
+the part ρ of itself from reading to reading has, once the filter has settled and forgotten how r
+began, estimates c r and c₂ r, so that its innovation is (1 − c) r: nothing is filtered for it then.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bwbayes.arrays import FloatArray, IntArray
+
+# isort: off
+# fmt: off
+from bwbayes.inference.compiled.lanes import (
+    CHANGE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FRESH, GAIN, GAIN_2,
+    GAP, INNOVATION, INVERSE, KEPT, KEPT_12, KEPT_22, LANES, LATEST, LOG, PRODUCTS, RATIO, RESPONSE,
+    SENSOR, SQUARES, VALUE,
+)
+# fmt: on
+# isort: on
+
+__all__ = ["follow", "gather", "is_settled", "is_tracked", "skip", "take", "take_logs"]
+
+# A covariance that changes by less of itself over a reading has settled.
+SETTLED = 2e-15
+
+# An estimate that follows its response to this part of it does not do so better.
+ROUNDING = 1e-13
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def follow(
+    state: FloatArray,
+    second: bool | None,
+    readings: FloatArray,
+    displacement: FloatArray,
+    decays: FloatArray,
+    series: IntArray,
+) -> None:
+    """Let a filter that has settled go on along readings (samples,) that are all there.
+
+    ``displacement`` is that of the models. ``decays`` is ρ of each response that is heard still,
+    and ``series`` says which they are: as their innovations follow them, only Σ ρᵗ η of the
+    residual's innovations η has to be added up.
+    """
+    count = series.size
+    for k in range(count):
+        for i in range(LANES):
+            state[INNOVATION + series[k] * LANES + i] = 0.0
+    weight = np.ones(count)
+    for t in range(readings.size):
+        y, row = readings[t], t * LANES
+        for i in range(LANES):
+            estimate = state[ESTIMATE + i]
+            innovation = y - displacement[row + i] - estimate
+            if second is None:
+                state[ESTIMATE + i] = state[KEPT + i] * estimate + state[GAIN + i] * innovation
+            else:
+                other, across = state[ESTIMATE_2 + i], state[KEPT_12 + i]
+                state[ESTIMATE + i] = (
+                    state[KEPT + i] * estimate + across * other + state[GAIN + i] * innovation
+                )
+                state[ESTIMATE_2 + i] = (
+                    state[KEPT_22 + i] * other - across * estimate + state[GAIN_2 + i] * innovation
+                )
+            state[SQUARES + i] += innovation * innovation
+            state[LATEST + i] = innovation
+        for k in range(count):
+            factor, at = weight[k], INNOVATION + series[k] * LANES
+            for i in range(LANES):
+                state[at + i] += factor * state[LATEST + i]
+            weight[k] *= decays[k]
+    if count:
+        _fold(state, second, readings.size, weight, decays, series)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fold(
+    state: FloatArray,
+    second: bool | None,
+    samples: int,
+    weight: FloatArray,
+    decays: FloatArray,
+    series: IntArray,
+) -> None:
+    """Add what a number of samples brought to the products, and move the responses on.
+
+    ``weight`` is what remains of each response after them; products of two are geometric sums.
+    """
+    count = series.size
+    for k in range(count):
+        at, rho = series[k] * LANES, decays[k]
+        for i in range(LANES):
+            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - _part(state, second, i, rho))
+        row = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
+        for i in range(LANES):
+            pull = state[VALUE + at + i] * state[INNOVATION + at + i]
+            state[row + i] += pull * state[INVERSE + i]
+        for j in range(k + 1):
+            other, product = series[j] * LANES, rho * decays[j]
+            total = float(samples)
+            if product < 1.0:
+                total = (1.0 - weight[k] * weight[j]) / (1.0 - product)
+            for i in range(LANES):
+                both = state[VALUE + at + i] * state[VALUE + other + i]
+                state[row + other + i] += both * total * state[INVERSE + i]
+    for k in range(count):
+        at = series[k] * LANES
+        for i in range(LANES):
+            response = state[RESPONSE + at + i] * weight[k]
+            state[RESPONSE + at + i] = response
+            state[ESTIMATE + at + i] = response * _part(state, second, i, decays[k])
+            if second is not None:
+                state[ESTIMATE_2 + at + i] = response * _part_2(state, i, decays[k])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _part(state: FloatArray, second: bool | None, i: int, rho: float) -> float:
+    """Return c, the estimate of a response that keeps ρ of itself, over the response."""
+    if second is None:
+        return float(state[GAIN + i] / (rho - state[KEPT + i] + state[GAIN + i]))
+    gain, across = state[GAIN + i], state[KEPT_12 + i]
+    left, pull = rho - state[KEPT_22 + i], state[GAIN_2 + i]
+    total = (rho - state[KEPT + i] + gain) * left + across * (across + pull)
+    return float((gain * left + across * pull) / total)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _part_2(state: FloatArray, i: int, rho: float) -> float:
+    """Return c₂, that of the second state."""
+    gain, across = state[GAIN + i], state[KEPT_12 + i]
+    first, pull = rho - state[KEPT + i], state[GAIN_2 + i]
+    total = (first + gain) * (rho - state[KEPT_22 + i]) + across * (across + pull)
+    return float((first * pull - across * gain) / total)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def is_tracked(
+    state: FloatArray, second: bool | None, decays: FloatArray, series: IntArray
+) -> bool:
+    """Tell whether the estimates of all those responses only follow them, to their rounding."""
+    for k in range(series.size):
+        at, rho = series[k] * LANES, decays[k]
+        for i in range(LANES):
+            response = state[RESPONSE + at + i]
+            size = ROUNDING * abs(response)
+            if not abs(state[ESTIMATE + at + i] - response * _part(state, second, i, rho)) <= size:
+                return False
+            if second is not None:
+                part = _part_2(state, i, rho)
+                gap = abs(state[ESTIMATE_2 + at + i] - response * part)
+                if not gap <= size * (1.0 + abs(part)):
+                    return False
+    return True
+
+
+@njit(nogil=True, cache=True)
+def is_settled(state: FloatArray) -> bool:
+    """Tell whether no model's covariance changed by the last reading."""
+    settled = True
+    for i in range(LANES):
+        settled &= state[CHANGE + i] <= SETTLED
+    return settled
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def take(state: FloatArray, second: bool | None, series: int) -> None:
+    """Take a reading of each series, and go on to the next."""
+    _gain(state, second)
+    pair = PRODUCTS
+    for k in range(series):
+        at = k * LANES
+        for i in range(LANES):
+            innovation = state[VALUE + at + i] - state[ESTIMATE + at + i]
+            state[INNOVATION + at + i] = innovation
+        _estimate(state, second, KEPT, at)
+        for i in range(LANES):
+            state[ESTIMATE + at + i] += state[GAIN + i] * state[INNOVATION + at + i]
+            if second is not None:
+                state[ESTIMATE_2 + at + i] += state[GAIN_2 + i] * state[INNOVATION + at + i]
+        for j in range(k + 1):
+            other = j * LANES
+            for i in range(LANES):
+                product = state[INNOVATION + at + i] * state[INNOVATION + other + i]
+                state[pair + i] += product * state[INVERSE + i]
+            pair += LANES
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _gain(state: FloatArray, second: bool | None) -> None:
+    """Take the covariance to the next reading, with the gain of this one on the way."""
+    for i in range(LANES):
+        p, sensor = state[COVARIANCE + i], state[SENSOR + i]
+        variance = p + sensor
+        inverse = 1.0 / variance
+        state[INVERSE + i] = inverse
+        state[RATIO + i] *= variance / (state[FRESH + i] + sensor)
+        if second is None:
+            state[GAIN + i] = state[KEPT + i] * (p * inverse)
+            state[COVARIANCE + i] = p * (sensor * inverse)
+        else:
+            across, rest = state[COVARIANCE_12 + i], sensor * inverse
+            g, g_2 = p * inverse, across * inverse
+            state[GAIN + i] = state[KEPT + i] * g + state[KEPT_12 + i] * g_2
+            state[GAIN_2 + i] = state[KEPT_22 + i] * g_2 - state[KEPT_12 + i] * g
+            state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * rest, across * rest
+            state[COVARIANCE_22 + i] -= across * g_2
+        # What it was, to be held against.
+        state[CHANGE + i] = p
+    _predict(state, second, KEPT)
+    for i in range(LANES):
+        p = state[CHANGE + i]
+        state[CHANGE + i] = abs(state[COVARIANCE + i] - p) / max(p, 1e-300)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _predict(state: FloatArray, second: bool | None, step: int) -> None:
+    """Take the covariance on by a step, whose rows begin there."""
+    for i in range(LANES):
+        a, p = state[step + i], state[COVARIANCE + i]
+        fresh = state[step + 3 * LANES + i]
+        if second is None:
+            state[COVARIANCE + i] = a * a * p + fresh
+        else:
+            b, d = state[step + LANES + i], state[step + 2 * LANES + i]
+            p_12, p_22 = state[COVARIANCE_12 + i], state[COVARIANCE_22 + i]
+            top, bottom = a * p + b * p_12, a * p_12 + b * p_22
+            low, end = d * p_12 - b * p, d * p_22 - b * p_12
+            state[COVARIANCE + i] = a * top + b * bottom + fresh
+            state[COVARIANCE_12 + i] = d * bottom - b * top + state[step + 4 * LANES + i]
+            state[COVARIANCE_22 + i] = d * end - b * low + state[step + 5 * LANES + i]
+
+
+@njit(nogil=True, cache=True)
+def _estimate(state: FloatArray, second: bool | None, step: int, at: int) -> None:
+    """Take the estimates of a series on by a step, whose rows begin there."""
+    for i in range(LANES):
+        estimate = state[ESTIMATE + at + i]
+        state[ESTIMATE + at + i] = state[step + i] * estimate
+        if second is not None:
+            across, other = state[step + LANES + i], state[ESTIMATE_2 + at + i]
+            state[ESTIMATE + at + i] += across * other
+            state[ESTIMATE_2 + at + i] = state[step + 2 * LANES + i] * other - across * estimate
+
+
+@njit(nogil=True, cache=True)
+def skip(state: FloatArray, second: bool | None, step: FloatArray, series: int) -> None:
+    """Pass over missing readings by the filter's step (rows,) over them."""
+    take_logs(state)
+    for i in range(step.size):
+        state[GAP + i] = step[i]
+    _predict(state, second, GAP)
+    for k in range(series):
+        _estimate(state, second, GAP, k * LANES)
+
+
+@njit(nogil=True, cache=True)
+def take_logs(state: FloatArray) -> None:
+    """Move the product of variances to the sum of logs, before it gets too large."""
+    for i in range(LANES):
+        state[LOG + i] += math.log(state[RATIO + i])
+        state[RATIO + i] = 1.0
+
+
+@njit(nogil=True, cache=True)
+def gather(state: FloatArray, readings: int) -> None:
+    """Add to the sums what so many readings with one variance brought."""
+    if readings == 0:
+        return
+    for i in range(LANES):
+        state[PRODUCTS + i] += state[SQUARES + i] * state[INVERSE + i]
+        state[SQUARES + i] = 0.0
+        typical = state[FRESH + i] + state[SENSOR + i]
+        state[LOG + i] -= readings * math.log(state[INVERSE + i] * typical)

@@ -1,0 +1,143 @@
+"""From the operator's drive to the displacement, for ``LANES`` models side by side.
+
+The gain adds to the drive, the dynamics follow it, and the lags of the creep beside them. All of
+them see the drive's distance from that of the first sample, at which they may have been at rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from bwbayes.arrays import FloatArray
+
+# isort: off
+# fmt: off
+from bwbayes.inference.compiled.lanes import (
+    A1, A2, B0, B1, B2, CUBIC, DRIVE, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC, STRENGTH,
+    X1, X2,
+)
+# fmt: on
+# isort: on
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
+
+__all__ = ["PIECE", "displace", "physics", "shared"]
+
+# Samples that pass the stages together: their drives fit into the first cache.
+PIECE = 64
+
+
+def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what gain and creep of all models have in common, as :func:`displace` takes it."""
+    curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.empty(0)
+    if actuator.gain is not None:
+        x = actuator.gain.scaled(voltage)
+        curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
+    if actuator.creep is not None:
+        recursions = actuator.creep.recursions(1, actuator.interval, actuator.hold)
+        lags = np.array(
+            [[*recursion.numerator[0], -recursion.denominator[0, 1]] for recursion in recursions]
+        )
+        if actuator.creep.growing:
+            growth = actuator.creep.size(voltage)
+    return curve, lags, growth
+
+
+def physics(
+    actuator: Actuator, column: Values, equilibrium: FloatArray, voltage: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what models (models,) are without a noise, by the names of ``PARAMETERS``.
+
+    ``equilibrium`` (models,) is w₀ without gain, um.
+    """
+    sections = actuator.sections(column)
+    if actuator.gain is not None:
+        equilibrium = equilibrium + actuator.gain.displacement(column, voltage[:1])[:, 0]
+    level = column["offset"] + equilibrium
+    if actuator.creep is not None:
+        crept = actuator.creep.drive(column, equilibrium[:, np.newaxis], voltage[:1])[:, 0]
+        level = level + crept * np.sum(sections.gains[1:], axis=0)
+    dynamics = sections.recursions[0]
+    rows = dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
+    rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
+    rows |= {f"strength_{k}": gain for k, gain in enumerate(sections.gains[1:], 1)}
+    rows |= {"level": level, "equilibrium": equilibrium}
+    others = {"growth": "creep_growth", "quadratic": "quadratic", "cubic": "cubic"}
+    return rows | {row: column[name] for row, name in others.items() if name in column}
+
+
+@njit(nogil=True, cache=True)
+def displace(
+    state: FloatArray,
+    curve: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
+) -> None:
+    """Put the displacement where the drive's distance from rest is, of samples first to last.
+
+    ``curve`` (samples, 2) are x² − x₀² and x³ − x₀³ of the gain, or empty; ``lags`` (times, 3) each
+    lag's two coefficients of the drive and the part that it keeps of itself; ``growth`` (samples,)
+    is |u| / U, or empty.
+    """
+    if curve.size > 0:
+        _bend(state, curve, first, last, drive)
+    if lags.size == 0:
+        _follow(state, last - first, drive)
+    else:
+        _creep(state, lags, growth, first, last, drive)
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _bend(state: FloatArray, curve: FloatArray, first: int, last: int, drive: FloatArray) -> None:
+    """Add q₂ (x² − x₀²) + q₃ (x³ − x₀³)."""
+    for t in range(first, last):
+        square, cube = curve[t, 0], curve[t, 1]
+        row = (t - first) * LANES
+        for i in range(LANES):
+            drive[row + i] += square * state[QUADRATIC + i] + cube * state[CUBIC + i]
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
+    """Let the dynamics follow."""
+    for t in range(samples):
+        row = t * LANES
+        for i in range(LANES):
+            w = drive[row + i]
+            x = state[B0 + i] * w + state[X1 + i]
+            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
+            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
+            drive[row + i] = state[LEVEL + i] + x
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _creep(
+    state: FloatArray,
+    lags: FloatArray,
+    growth: FloatArray,
+    first: int,
+    last: int,
+    drive: FloatArray,
+) -> None:
+    """Let dynamics and creep follow."""
+    for t in range(first, last):
+        row = (t - first) * LANES
+        size = 1.0 if growth.size == 0 else growth[t]
+        size_0 = 1.0 if growth.size == 0 else growth[0]
+        for i in range(LANES):
+            w_0, more = state[EQUILIBRIUM + i], state[GROWTH + i]
+            total = (drive[row + i] + w_0) * (1.0 + more * size)
+            state[DRIVE + i] = total - w_0 * (1.0 + more * size_0)
+        _follow(state, 1, drive[row : row + LANES])
+        for k in range(lags.shape[0]):
+            now, next_, keep = lags[k, 0], lags[k, 1], lags[k, 2]
+            at = k * LANES
+            for i in range(LANES):
+                w = state[DRIVE + i]
+                x = now * w + state[LAG + at + i]
+                state[LAG + at + i] = next_ * w + keep * x
+                drive[row + i] += state[STRENGTH + at + i] * x
