@@ -3,7 +3,6 @@
     python -m tests.benchmarks              # all of it: tables on the screen, and benchmarks.json
     python -m tests.benchmarks --quick      # fewer rounds, no NumPy run
     python -m tests.benchmarks waits --against ../before    # what a person waits for
-    python -m tests.benchmarks.replicates --against ../before      # short records, two checkouts
     python -m tests.benchmarks.campaigns        # a campaign of a thousand short records
 
 Timings depend on the machine and on what else it does; no test passes or fails by them.

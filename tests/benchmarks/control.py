@@ -16,8 +16,7 @@ from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from tests.benchmarks.cases import Effort
-from tests.benchmarks.tables import Cell, Table
-from tests.benchmarks.timing import interleaved
+from tests.benchmarks.measuring import Cell, Table, interleaved
 from tests.control import cases
 
 SAMPLES = 16_000

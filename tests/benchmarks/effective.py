@@ -38,8 +38,7 @@ from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, problem
 from tests.benchmarks.likelihood import speed_up
-from tests.benchmarks.tables import Cell, Table
-from tests.benchmarks.timing import Cost, interleaved
+from tests.benchmarks.measuring import Cell, Cost, Table, interleaved
 
 WORKERS = 2
 PARTS = ("point fit", "pilot", "tuning", "sampling", "checks")

@@ -10,8 +10,7 @@ import numpy as np
 
 from bwbayes.inference.posterior import Posterior
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, trial, with_parts
-from tests.benchmarks.tables import Cell, Table
-from tests.benchmarks.timing import interleaved
+from tests.benchmarks.measuring import Cell, Table, interleaved
 
 Call = Callable[[], object]
 

@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 
 from bwbayes.app.config.config import dump
 from tests.benchmarks.cases import ROOT, Effort, config
-from tests.benchmarks.tables import Cell, Table
-from tests.benchmarks.timing import interleaved, timed
+from tests.benchmarks.measuring import Cell, Table, interleaved, timed
 
 MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bwbayes'; main()"
 

@@ -36,4 +36,4 @@ def test_the_quick_command_says_what_became_of_each_target(tmp_path: Path) -> No
     done = CliRunner().invoke(main, ["--quick", "--out", str(out)], catch_exceptions=False)
     assert 0 == done.exit_code
     rows = json.loads(out.read_text(encoding="utf-8"))["targets"]["rows"]
-    assert [name for name, _, _ in TARGETS] == [row["target"] for row in rows]
+    assert [name for name, *_ in TARGETS] == [row["target"] for row in rows]
