@@ -28,12 +28,6 @@ from bwbayes.results.identifiability import stretches_once
 
 __all__ = ["promises"]
 
-# Draws that the promise is averaged over, and those that say what is known already.
-DRAWS, KNOWN = 40, 4000
-
-# Step of the derivatives, in posterior sds of a coordinate.
-STEP = 0.01
-
 
 def promises(
     posterior: Posterior,
@@ -142,14 +136,14 @@ class _Asker:
             if d.scope == "actuator" and d.name in prior.free_names
         ]
         columns = tuple(prior.free_names.index(name) for name in names)
-        coordinates = prior.unconstrain(draws[:: max(len(draws) // KNOWN, 1)])
+        coordinates = prior.unconstrain(draws[:: max(len(draws) // 4000, 1)])
         covariance = np.atleast_2d(np.cov(coordinates[:, columns], rowvar=False))
-        chosen = generator.choice(len(coordinates), min(DRAWS, len(coordinates)), replace=False)
+        chosen = generator.choice(len(coordinates), min(40, len(coordinates)), replace=False)
         offset_sd = 0.0
         for parameter in prior.free:
             if parameter.name == "offset" and parameter.prior is not None:
                 offset_sd = float(parameter.prior.frozen.std())
-        steps = STEP * np.sqrt(np.diag(covariance))
+        steps = 0.01 * np.sqrt(np.diag(covariance))
         return cls(
             posterior, coordinates[chosen], columns, tuple(names), covariance, steps, offset_sd
         )

@@ -31,9 +31,6 @@ from bwbayes.shown import brief
 
 __all__ = ["Design", "Promise"]
 
-# Standard errors of a difference below which two promises are not told apart.
-SURE = 2.0
-
 
 @dataclass(frozen=True)
 class Promise:
@@ -122,7 +119,7 @@ class Design(Sequence[Promise]):
         return [
             promise.name
             for promise in self.promises[1:]
-            if promise.left - best.left < SURE * float(np.hypot(promise.error, best.error))
+            if promise.left - best.left < 2 * float(np.hypot(promise.error, best.error))
         ]
 
     def numbers(self) -> dict[str, object]:

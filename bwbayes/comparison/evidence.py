@@ -22,17 +22,8 @@ from bwbayes.sampling.proposals import StudentMixture
 
 __all__ = ["Bridge", "Evidence", "bridge", "evidence", "log_prior_mass", "screening_evidence"]
 
-# Places that are proposed, draws that the mixture is fitted to, and draws at the other end.
-PROPOSED = 10_000
-FITTED = 20_000
-BRIDGED = 20_000
-
-# Draws that the mass which the constraints leave of the prior is estimated from.
-PRIOR_DRAWS = 100_000
-
-# The fixed point is reached in some ten rounds where the two distributions overlap at all.
-ROUNDS = 1000
-ACCURACY = 1e-10
+# Draws that the mixture is fitted to, and draws at the other end, at most.
+MAX_DRAWS = 20_000
 
 
 @dataclass(frozen=True)
@@ -105,7 +96,7 @@ def evidence(
     coordinates = coordinates.reshape(draws.shape)
     half = draws.shape[1] // 2
     fitted = coordinates[:, :half].reshape(-1, free)
-    fitted = fitted[:: max(len(fitted) // FITTED, 1)]
+    fitted = fitted[:: max(len(fitted) // MAX_DRAWS, 1)]
     mass, mass_error = log_prior_mass(posterior.prior, generator)
     try:
         proposal = StudentMixture.fitted(fitted)
@@ -113,11 +104,11 @@ def evidence(
         highest = float(np.max(log_likelihood))
         return Evidence(np.nan, np.inf, mass, 0.0, max_log_likelihood=highest)
     size = log_density[:, half:].size
-    thin = max(size // BRIDGED, 1)
+    thin = max(size // MAX_DRAWS, 1)
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - _normalized(proposal, sampled)
     random = np.random.RandomState(generator.integers(2**32))
-    places = proposal.draw(random, PROPOSED)
+    places = proposal.draw(random, 10_000)
     at_places = posterior.log_density(places) - _normalized(proposal, places)
     bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
@@ -202,12 +193,12 @@ def _fixed_point(
     """Iterate to log r; return it and the logs of what is averaged at draws and at places."""
     with np.errstate(divide="ignore"):
         from_posterior, from_reference = np.log(share), np.log1p(-share)
-    for _ in range(ROUNDS):
+    for _ in range(1000):  # some ten where the two distributions overlap at all
         at_draws = -np.logaddexp(from_posterior + draws, from_reference + log_r)
         at_places = places - np.logaddexp(from_posterior + places, from_reference + log_r)
         top = logsumexp(at_places) - np.log(places.size)
         before, log_r = log_r, float(top - (logsumexp(at_draws) - np.log(draws.size)))
-        if not abs(log_r - before) > ACCURACY:  # nan too
+        if not abs(log_r - before) > 1e-10:  # nan too
             break
     return log_r, (at_draws, at_places)
 
@@ -238,7 +229,7 @@ def log_prior_mass(prior: JointPrior, generator: np.random.Generator) -> tuple[f
     F(u) − F(l) over the parameters, zero where a constraint does not hold. Its mean over standard
     normal coordinates is the mass.
     """
-    coordinates = generator.standard_normal((PRIOR_DRAWS, prior.dimensions))
+    coordinates = generator.standard_normal((100_000, prior.dimensions))
     log_prior = prior.constrain(coordinates)[1]
     room = np.exp(log_prior + 0.5 * np.sum(coordinates**2, axis=1))
     mean = float(np.mean(room))

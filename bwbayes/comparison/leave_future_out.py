@@ -39,11 +39,6 @@ BLOCKS = 10
 # fewer than the second number, that end is sampled as well.
 DRAWS, MIN_EFFECTIVE = 500, 100.0
 
-# Effective draws of a fit to other readings, and its budget.
-ESS, MAX_STEPS = 400.0, 4000
-
-ROUNDS, ACCURACY = 1000, 1e-8
-
 
 @dataclass(frozen=True)
 class Part:
@@ -122,9 +117,12 @@ def leave_future_out(
         earlier = _fitted(path[0], plan, flat, rng, executor)
         if earlier is not None:
             parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng)
-    for record, name, windows in (
-        (record, *scores_ow) for record, named in held_out.items() for scores_ow in named.items()
-    ):
+    later_windows = [
+        (record, name, windows)
+        for record, named in held_out.items()
+        for name, windows in named.items()
+    ]
+    for record, name, windows in later_windows:
         displacement = next(d.displacement for d in posterior.datasets if d.name == record)
         rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
         rows = rows[np.isfinite(displacement[rows])]
@@ -137,13 +135,13 @@ def leave_future_out(
             for edge in _edges(rows)
         ]
         path.append(posterior.trained(training))
-        scores_ow = _scored(path, {0: flat}, {record: rows}, rng)
-        if scores_ow.effective < MIN_EFFECTIVE:
+        part = _scored(path, {0: flat}, {record: rows}, rng)
+        if part.effective < MIN_EFFECTIVE:
             longer = _fitted(path[-1], plan, flat, rng, executor)
             if longer is not None:
-                scores_ow = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
+                part = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
                 flat = longer
-        parts[name] = scores_ow
+        parts[name] = part
     return parts
 
 
@@ -199,12 +197,12 @@ def log_ratios(
     sampled = [*counts]
     logs = np.log([*counts.values()])[:, np.newaxis]
     log_z = np.zeros((len(sampled), 1))
-    for _ in range(ROUNDS):
+    for _ in range(1000):
         mixture = logsumexp(logs + log_likelihood[sampled] - log_z, axis=0)
         before = log_z
         log_z = logsumexp(log_likelihood[sampled] - mixture, axis=1, keepdims=True)
         log_z -= log_z[0]
-        if np.max(np.abs(log_z - before)) < ACCURACY:
+        if np.max(np.abs(log_z - before)) < 1e-8:
             break
     weights = log_likelihood - mixture
     ratios = logsumexp(weights, axis=1)
@@ -229,10 +227,14 @@ def _scored(
     worth = 0.0
     for dataset in path[-1].datasets:
         if dataset.name in rows:
-            its_rows = rows[dataset.name]
-            simulated = path[-1].simulate(likeliest, its_rows, dataset.name if several else None)[0]
-            worth += its_rows.size / _correlation_time(dataset.displacement[its_rows] - simulated)
-    readings = sum(its_rows.size for its_rows in rows.values())
+            record_rows = rows[dataset.name]
+            simulated = path[-1].simulate(
+                likeliest, record_rows, dataset.name if several else None
+            )[0]
+            worth += record_rows.size / _correlation_time(
+                dataset.displacement[record_rows] - simulated
+            )
+    readings = sum(record_rows.size for record_rows in rows.values())
     return Part(np.diff(log_z), readings, worth, effective=float(np.min(effective)))
 
 
@@ -252,7 +254,7 @@ def _fitted(
     # With less readings a posterior is wider.
     covariance = 2 * np.atleast_2d(np.cov(coordinates, rowvar=False))
     point = PointFit(best, covariance, float(np.max(density)), best[np.newaxis], wide)
-    short = replace(plan, ess=min(ESS, plan.ess), most_steps=min(MAX_STEPS, plan.most_steps))
+    short = replace(plan, ess=min(400.0, plan.ess), most_steps=min(4000, plan.most_steps))
     chain = first_chain(posterior, point, short, rng)
     if not sample(posterior, short, chain, executor).converged:
         return None

@@ -22,19 +22,8 @@ from bwbayes.comparison.compared import Comparison, Difference
 
 __all__ = ["difference", "recommend"]
 
-# Odds of 20 to 1, nats: log evidences that differ by less do not tell models apart.
-MIN_LOG_ODDS = float(np.log(20))
-
-# Nats over all later readings below which a difference is small whatever its error: models that
-# predict nearly the same differ by the luck of one fit (T. Sivula, M. Magnusson, A. Vehtari,
-# arXiv:2008.10296).
-SMALL = 4.0
-
 # Independent readings that a part must be worth to have a vote: as many blocks tell its error.
 MIN_WORTH = 5
-
-# A Monte Carlo error of the log evidence above this leaves it out, nats.
-MAX_ERROR = 0.5
 
 
 def recommend(candidates: Sequence[Candidate]) -> Comparison:
@@ -71,7 +60,7 @@ def recommend(candidates: Sequence[Candidate]) -> Comparison:
     near = [candidate for candidate in ordered if not differences[candidate.name].worse]
     tied = near
     if voting and all(_is_known(candidate) for candidate in near):
-        top = max(near, key=_log_evidence)
+        top = max(near, key=lambda candidate: candidate.log_evidence)
         tied = [candidate for candidate in near if not _evidence_difference(candidate, top).worse]
     recommended = min(tied, key=lambda candidate: (candidate.free, -value(candidate)))
     others = tuple(candidate.name for candidate in tied if candidate is not recommended)
@@ -99,7 +88,9 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
     """Return the log score of a model less that of the best, over parts by their names, nats.
 
     Its error is that of sums over blocks of each part, ten, or five where either model's residuals
-    leave no ten independent ones; the Monte Carlo errors of both are in it.
+    leave no ten independent ones; the Monte Carlo errors of both are in it. Less than four nats
+    are small whatever their error: models that predict nearly the same differ by the luck of one
+    fit (T. Sivula, M. Magnusson, A. Vehtari, arXiv:2008.10296).
     """
     if candidate is best:
         return Difference(0.0, 0.0, 0.0)
@@ -114,7 +105,7 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
             variance += 1 / first.effective + 1 / second.effective
             freedom += blocks - 1
     error = float(np.sqrt(variance))
-    return Difference(total, error, max(SMALL, float(scipy.stats.t.ppf(0.975, freedom)) * error))
+    return Difference(total, error, max(4.0, float(scipy.stats.t.ppf(0.975, freedom)) * error))
 
 
 def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Candidate:
@@ -129,20 +120,19 @@ def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Cand
 
 
 def _evidence_difference(candidate: Candidate, best: Candidate) -> Difference:
-    """Return the log evidence of a model less that of the best."""
+    """Return the log evidence of a model less that of the best; odds of 20 to 1 count."""
     if candidate is best:
         return Difference(0.0, 0.0, 0.0)
     errors = [c.evidence.error for c in (candidate, best) if c.evidence is not None]
     error = float(np.linalg.norm(errors)) if len(errors) > 1 else np.inf
-    return Difference(candidate.log_evidence - best.log_evidence, error, MIN_LOG_ODDS + 2 * error)
-
-
-def _log_evidence(candidate: Candidate) -> float:
-    return candidate.log_evidence
+    return Difference(
+        candidate.log_evidence - best.log_evidence, error, float(np.log(20)) + 2 * error
+    )
 
 
 def _is_known(candidate: Candidate) -> bool:
-    return candidate.evidence is not None and candidate.evidence.error < MAX_ERROR
+    """Tell whether the Monte Carlo error of a log evidence leaves it in."""
+    return candidate.evidence is not None and candidate.evidence.error < 0.5
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -205,7 +195,7 @@ def _list_caveats(
     yield from comparison.standing.said
     if not comparison.voting:
         yield "the evidence decides alone, which takes priors and noise at their word"
-    top = max(ordered, key=_log_evidence)
+    top = max(ordered, key=lambda candidate: candidate.log_evidence)
     against = _evidence_difference(recommended, top)
     if comparison.voting and _is_known(top) and against.worse:
         assert top.evidence is not None

@@ -24,22 +24,6 @@ from bwbayes.model.distributions import Distribution
 
 __all__ = ["around", "conflicts", "effective"]
 
-# Prior sds between a prior and the posterior's mean beyond which they disagree.
-DISAGREE = 3.0
-
-# A bound is pressed against where more than this part of the draws lies within half a posterior sd
-# of it: 0.14 for a flat posterior, 0.24 for half a normal one with its peak on the bound, 0.30 for
-# what a bound leaves of a normal one a sd beyond it, 0.39 for an exponential one.
-NEAR = 0.5
-PRESSES = 0.3
-
-# A ratio between -1 and 1 that the record hardly tells leans on a bound by chance.
-TOLD = 0.05
-
-# A prior's scale looks like another unit's from this factor on, and this many sds of the default.
-ANOTHER_UNIT = 100.0
-UNLIKELY = 2.5
-
 # Draws that stand for a prior, or for a Gaussian posterior.
 DRAWS = 4000
 
@@ -93,14 +77,16 @@ def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None
     """Find that a positive parameter's scale is far from what the record's ranges suggest."""
     if not parameter.positive or parameter.prior == default:
         return None
-    expected, sd = float(default.frozen.median()), _log_sd(default)
+    low, expected, high = default.frozen.ppf([0.16, 0.5, 0.84]).tolist()
+    sd = float(np.log(high / low)) / 2
     label, value = "fixed value", parameter.fixed
     if parameter.prior is not None:
         label, value = "prior's median", float(parameter.prior.frozen.median())
     if value is None or value <= 0:
         return None
     distance = float(np.log(value / expected))
-    if abs(distance) < max(np.log(ANOTHER_UNIT), UNLIKELY * sd):
+    # A factor of a hundred, which the default holds for unlikely, is another unit.
+    if abs(distance) < max(np.log(100), 2.5 * sd):
         return None
     return Finding(
         parameter.name,
@@ -113,12 +99,12 @@ def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None
 def _disagreement(
     parameter: Parameter, values: FloatArray, default: Distribution | None
 ) -> Finding | None:
-    """Find that the posterior lies some sds from a parameter's prior."""
+    """Find that the posterior's mean lies more than three sds from a parameter's prior."""
     assert parameter.prior is not None
     low, high = (np.asarray(end) for end in parameter.support)
     scores = np.clip(parameter.prior.to_normal(values, low, high), -37, 37)
     score = float(np.mean(scores))
-    if abs(score) <= DISAGREE:
+    if abs(score) <= 3:
         return None
     side = "above" if score > 0 else "below"
     text = (
@@ -163,16 +149,22 @@ def _pressed_by_others(parameter: Parameter, x: FloatArray, values: Values) -> I
         if advice is None or not np.isfinite(bound).all():
             continue
         gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
-        # Beyond a bound that does not hold here nothing ends.
-        if float(np.min(gap)) >= 0 and np.std(gap) < TOLD and _near(gap):
+        # Beyond a bound that does not hold here nothing ends, and a ratio that the record hardly
+        # tells leans on it by chance.
+        if float(np.min(gap)) >= 0 and np.std(gap) < 0.05 and _near(gap):
             stated = parameter.declared.stated_bounds
             yield Finding(parameter.name, f"lies on its {side} bound of {stated}", advice)
 
 
 def _near(gap: FloatArray) -> bool:
-    """Tell whether draws (draws,) of the distance to a bound pile up at zero."""
+    """Tell whether draws (draws,) of the distance to a bound pile up at zero.
+
+    Where more than 0.3 of them lie within half a posterior sd of it: 0.14 do for a flat posterior,
+    0.24 for half a normal one with its peak on the bound, 0.30 for what a bound leaves of a normal
+    one a sd beyond it, 0.39 for an exponential one.
+    """
     sd = float(np.std(gap))
-    return sd > 0 and float(np.mean(gap < NEAR * sd)) > PRESSES
+    return sd > 0 and float(np.mean(gap < 0.5 * sd)) > 0.3
 
 
 def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
@@ -182,11 +174,6 @@ def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
     if configured != bound:
         fix = f"widen its prior {parameter.prior}, which ends there"
     return Finding(parameter.name, f"lies on its {side} bound {bound:.4g} {parameter.unit}", fix)
-
-
-def _log_sd(distribution: Distribution) -> float:
-    low, high = distribution.frozen.ppf([0.16, 0.84])
-    return float(np.log(high / low)) / 2
 
 
 def _widened(distribution: Distribution) -> Distribution:

@@ -50,9 +50,6 @@ LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
 # Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))
 
-# A parameter that moves by more of its sds is another one.
-SHIFTED = 3.0
-
 
 def explain(
     scene: Scene, watch: Callable[[float], None] = lambda _: None, *, thorough: bool
@@ -88,12 +85,12 @@ def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return what a fit may have followed although the actuator has not done it.
 
     What is beyond chance is enough by itself: parameters that followed it need not find back. Even
-    odds are enough where a parameter moves as well: a good fit hardly has both.
+    odds are enough where a parameter moves by three sds as well: a good fit hardly has both.
     """
     best = max((explanation.nats for explanation in ranked), default=0.0)
     near = [explanation for explanation in ranked if explanation.nats > max(0.0, best - TIED)]
     return tuple(
         explanation
         for explanation in near
-        if explanation.foreign and (explanation.nats > LIMIT or explanation.shift > SHIFTED)
+        if explanation.foreign and (explanation.nats > LIMIT or explanation.shift > 3)
     )

@@ -19,13 +19,6 @@ from bwbayes.model.drive import fastest, time_between_turns
 
 __all__ = ["beyond_training"]
 
-# Part of the fitted voltages' range that others may lie beyond it: a sensor's noise.
-SLACK = 0.02
-
-# A voltage that moves faster than the fitted one by more than this factor tells more of the lag
-# than the record did. Noise and the sampling change a speed by a tenth or so.
-FASTER = 1.5
-
 # Part of the time between turning points over which a speed is taken: a sine's peak speed is then
 # 0.4 % too low, and noise of 1 % of its range adds a tenth.
 PART = 0.1
@@ -34,12 +27,6 @@ PART = 0.1
 # does not show. Creep goes with the logarithm of the time, by one or two percent of a change each
 # decade: half a decade is half of the one or two percent that a model misses anyway.
 LONGER = 3.0
-
-# Slow means are looked at over times that are so many to a factor of ten.
-A_DECADE = 8
-
-# The sides to which a mean may leave others: low and high.
-SIDES = np.array([[-1.0], [1.0]])
 
 
 def beyond_training(
@@ -91,7 +78,7 @@ def _turn_times(posterior: Posterior) -> list[float]:
 
 def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
     low, high = _fitted_range(posterior)
-    slack = SLACK * (high - low)
+    slack = 0.02 * (high - low)  # a sensor's noise
     if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
         return None
     return Finding(
@@ -114,7 +101,8 @@ def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Findin
         # Of several records the one that comes nearest to the drive.
         if this * before <= now * its or before == math.inf:
             before, now = its, this
-    if now <= FASTER * before:
+    # Noise and the sampling change a speed by a tenth or so.
+    if now <= 1.5 * before:
         return None
     return Finding(
         "speed",
@@ -133,27 +121,28 @@ def _slow(
     as ∫ (mean now − mean then) d log T, where means go beyond those of training.
     """
     low, high = _fitted_range(posterior)
+    a_decade, sides = 8, np.array([[-1.0], [1.0]])  # times, and where a mean may go
     # What is beyond the range is said by itself.
     inside = np.clip(voltage[: window.stop], low, high)
     longest, shortest = inside.size * interval, PART * min(_turn_times(posterior))
     decades = max(math.log10(longest / shortest), 0.0)
-    times = longest / 10 ** (np.arange(1 + math.ceil(A_DECADE * decades)) / A_DECADE)
+    times = longest / 10 ** (np.arange(1 + math.ceil(a_decade * decades)) / a_decade)
     planned = _slow_means(inside, interval, times, [window])
     fitted = [
         _slow_means(dataset.voltage, dataset.actuator.interval, times, dataset.training)
         for dataset in posterior.datasets
     ]
-    now, before = SIDES * planned, np.max([SIDES * _filled(means) for means in fitted], axis=0)
+    now, before = sides * planned, np.max([sides * _filled(means) for means in fitted], axis=0)
     # A mean over a longer time is that over a shorter one somewhere.
     before = np.maximum.accumulate(before, axis=1)
     excess = np.maximum(np.nan_to_num(now - before), 0.0)
     # In volts times decades of time; a sine over the whole range has half the range to either side.
-    unknown = np.sum(excess, axis=1) / A_DECADE
+    unknown = np.sum(excess, axis=1) / a_decade
     if unknown.max() <= math.log10(LONGER) * (high - low) / 2:
         return None
     side = int(np.argmax(unknown))
     at = int(np.argmax(excess[side] >= excess[side].max() / 2))
-    reached = f"at {('least', 'most')[side]} {(SIDES * before)[side, at]:.3g} V"
+    reached = f"at {('least', 'most')[side]} {(sides * before)[side, at]:.3g} V"
     return Finding(
         "slow",
         f"voltage averages {planned[side, at]:.3g} V over {times[at]:.3g} s, in training {reached}"

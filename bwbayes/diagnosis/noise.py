@@ -13,9 +13,6 @@ from bwbayes.diagnosis.scene import Explanation, Scene
 
 __all__ = ["growing_noise", "heavy_tails", "tail_nats"]
 
-# Degrees of freedom of the tails that are tried, evenly probable.
-DEGREES = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0])
-
 
 def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     """Try innovations of a Student t distribution, of whatever scale."""
@@ -28,8 +25,8 @@ def heavy_tails(scene: Scene) -> Iterator[Explanation]:
 
 def tail_nats(white: FloatArray) -> float:
     """Return by how many nats a t distribution explains innovations (readings,) better, in sds."""
-    densities = []
-    for degrees in DEGREES:
+    densities, tried = [], (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)  # evenly probable
+    for degrees in tried:
 
         def cost(log_scale: float, degrees: float = degrees) -> float:
             return -float(np.sum(scipy.stats.t.logpdf(white, degrees, scale=np.exp(log_scale))))
@@ -40,7 +37,7 @@ def tail_nats(white: FloatArray) -> float:
     normal = float(np.sum(scipy.stats.norm.logpdf(white)))
     # The scale is paid for as its sd of a half over the root of the readings, of a prior's of one.
     cost_of_scale = 0.5 * np.log(2 * white.size)
-    return float(logsumexp(densities) - np.log(DEGREES.size) - cost_of_scale) - normal
+    return float(logsumexp(densities) - np.log(len(tried)) - cost_of_scale) - normal
 
 
 def growing_noise(scene: Scene) -> Iterator[Explanation]:

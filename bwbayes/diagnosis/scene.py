@@ -20,15 +20,9 @@ from bwbayes.model.drive import rate, time_between_turns
 
 __all__ = ["Explanation", "Reconfigure", "Scene"]
 
-# Fraction of the readings without which other places to start from are found.
-BEGINNING = 0.2
-
 # Readings that are looked at: an explanation takes some hundred passes over them, and what a model
 # misses shows in fewer.
 READINGS = 4_000
-
-# A gain of less, nats, pays for no parameter: such a climb may end early.
-PAYS = 1.0
 
 # Returns the posterior of the same record with other values of keys of [model], and what
 # [parameters] says of parameters that only the new model has.
@@ -129,7 +123,7 @@ class Scene:
             thinned = posterior.only.displacement.copy()
             thinned[np.setdiff1d(rows, kept)] = np.nan
             posterior, rows = posterior.altered(displacement=thinned), kept
-        first = int(rows[int(BEGINNING * rows.size)])
+        first = int(rows[rows.size // 5])
         windows = posterior.only.training
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
         places = optima
@@ -222,8 +216,11 @@ class Scene:
     def climbed(
         self, posterior: Posterior, places: FloatArray, effect: Effect | None = None
     ) -> LocalFit:
-        """Fit another model, as long as it may become more probable than that without extension."""
-        return climb(posterior, places, effect, self.fit.log_density + PAYS)
+        """Fit another model, as long as it may become more probable than that without extension.
+
+        A gain of less than a nat pays for no parameter.
+        """
+        return climb(posterior, places, effect, self.fit.log_density + 1.0)
 
     def explained(
         self,

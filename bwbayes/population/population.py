@@ -27,12 +27,20 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
 from bwbayes.population.specimen import Specimen, likelihoods, shared
 from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
 
-__all__ = ["FEWEST", "Population", "PopulationParameter", "SpecimenEstimate", "population"]
+__all__ = [
+    "FEWEST",
+    "Population",
+    "PopulationParameter",
+    "SpecimenEstimate",
+    "next_specimen",
+    "population",
+]
 
 # Specimens below which nothing is said of a spread.
 FEWEST = 3
@@ -42,16 +50,6 @@ DRAWS = 1000
 # Of how many populations one serves as a prior of a specimen; so many are enough for that.
 EVERY = 4
 
-# Effective draws of a specimen's weights that its own draws must keep.
-LEAST_EFFECTIVE = 50
-
-# Rounds of proposals, and the degrees of freedom of those after the first.
-ROUNDS = 4
-DEGREES = 5
-
-# Probability of a single false alarm among all specimens and parameters of a sound campaign.
-FALSE_ALARM = 0.05
-
 
 @dataclass(frozen=True)
 class SpecimenEstimate:
@@ -60,9 +58,9 @@ class SpecimenEstimate:
     ``lower``, ``median`` and ``upper`` are the 95 % interval with the population for a prior, and
     ``own_lower``, ``own_median``, ``own_upper`` that of the record alone, both in the parameter's
     unit. ``p`` is how likely the record would be as far off, either way, from the population that
-    all others show; ``outlier`` whether that is less than chance makes likely anywhere in the
-    campaign. ``pareto_k`` judges the reweighting, and ``normal`` tells whether the specimen's
-    likelihood was taken for normal because of it.
+    all others show; ``outlier`` whether that is so unlikely that a sound campaign has one such
+    among all specimens and parameters once in twenty. ``pareto_k`` judges the reweighting, and
+    ``normal`` tells whether the specimen's likelihood was taken for normal because of it.
     """
 
     __repr__ = brief
@@ -184,6 +182,43 @@ def population(specimens: Sequence[Specimen], generator: np.random.Generator) ->
     )
 
 
+def next_specimen(
+    population: Population, posterior: Posterior, draws: FloatArray, generator: np.random.Generator
+) -> FloatArray:
+    """Return draws of a specimen not measured yet, (draws, free), in their own units.
+
+    The actuator's parameters are those of the population, drawn independently of each other; noise
+    and what belongs to one record are as in a specimen that was measured.
+
+    Parameters
+    ----------
+    population
+        What the specimens have shown.
+    posterior
+        That of one of them, for the order of the parameters and the model's constraints; draws
+        that break these are left out.
+    draws
+        (draws, free) of its parameters: noise and all that belongs to one record comes from there.
+    generator
+        Pairs them.
+
+    Raises
+    ------
+    InputError
+        The constraints leave hardly a draw.
+    """
+    prior = posterior.prior
+    count = next(iter(population.parameters.values())).new.size
+    specimens = draws[generator.choice(len(draws), count, replace=len(draws) < count)].copy()
+    for column, parameter in enumerate(prior.free):
+        if parameter.name in population.parameters:
+            specimens[:, column] = population.parameters[parameter.name].new
+    possible = specimens[np.isfinite(prior.log_density(specimens))]
+    if len(possible) < 0.1 * count:
+        raise InputError("population: hardly a draw of it is a model; look at outliers and priors")
+    return possible
+
+
 def _population_of(
     specimens: Sequence[Specimen], name: str, generator: np.random.Generator, tests: int
 ) -> PopulationParameter:
@@ -209,7 +244,7 @@ def _population_of(
             **dict(zip(("lower", "median", "upper"), shrunk, strict=True)),
             **dict(zip(("own_lower", "own_median", "own_upper"), alone, strict=True)),
             p=float(p[i]),
-            outlier=bool(p[i] * tests < FALSE_ALARM),
+            outlier=bool(p[i] * tests < 0.05),
             pareto_k=float(reweighted.shapes[i]),
             normal=bool(reweighted.normal[i]),
         )
@@ -250,7 +285,7 @@ def _reweighted(
     shapes, as_normal = _judged(draws, float(np.median(mean)), float(np.median(spread)))
     proposed = prior.log_density(mean, spread) + np.sum(normal.marginal(mean, spread), axis=0)
     weights, k = np.full(DRAWS, 1 / DRAWS), 0.0
-    for _ in range(ROUNDS):
+    for _ in range(4):
         target = prior.log_density(mean, spread)
         target += np.sum(_marginals(draws, as_normal, normal, mean, spread), axis=0)
         weights, k = smoothed_weights(target - proposed)
@@ -281,7 +316,7 @@ def _judged(
     for i, (y, log_prior) in enumerate(draws):
         weights, shapes[i] = smoothed_weights(-0.5 * ((y - mean) / spread) ** 2 - log_prior)
         effective[i] = 1 / np.sum(weights**2)
-    return shapes, ~((shapes <= LARGEST_PARETO_K) & (effective >= LEAST_EFFECTIVE))
+    return shapes, ~((shapes <= LARGEST_PARETO_K) & (effective >= 50))
 
 
 def _marginals(
@@ -340,7 +375,7 @@ def _around(
     center = weights @ places
     away = places - center
     covariance = (away * weights[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
-    student = scipy.stats.multivariate_t(center, covariance, df=DEGREES, seed=generator)
+    student = scipy.stats.multivariate_t(center, covariance, df=5, seed=generator)
     drawn = student.rvs(DRAWS)
     # The density of τ is that of log τ over τ.
     return drawn[:, 0], np.exp(drawn[:, 1]), student.logpdf(drawn) - drawn[:, 1]

@@ -28,12 +28,6 @@ DRAWS = 1000
 # Places along a parameter, and draws of all others at each, that tell what the constraints cut off.
 PLACES, OTHERS = 33, 400
 
-# Draws of the cut prior that its moments come from.
-MOMENTS = 2000
-
-# Below this part of the prior's precision a record tells nothing of a parameter.
-LEAST = 0.02
-
 
 @dataclass(frozen=True)
 class Specimen:
@@ -109,7 +103,7 @@ def specimen_of(
     chosen = draws
     if len(draws) > DRAWS:
         chosen = draws[generator.choice(len(draws), DRAWS, replace=False)]
-    before = prior.draw(generator, MOMENTS)
+    before = prior.draw(generator, 2000)
     logarithmic = np.array([prior.free[i].positive for i in columns], dtype=np.bool_)
     y = _coordinates(chosen[:, columns], logarithmic)
     prior_coordinates = _coordinates(before[:, columns], logarithmic)
@@ -141,7 +135,7 @@ def likelihoods(specimens: Sequence[Specimen], name: str) -> NormalLikelihoods:
         i = specimen.names.index(name)
         after, before = np.var(specimen.draws[:, i]) ** -1.0, specimen.prior_sd[i] ** -2.0
         precision = after - before
-        if precision < LEAST * before:
+        if precision < 0.02 * before:  # the record tells nothing
             means.append(float(specimen.prior_mean[i]))
             precisions.append(0.0)
             continue

@@ -11,9 +11,8 @@ from scipy import stats
 
 from bwbayes.errors import InputError
 from bwbayes.population import population as module
-from bwbayes.population.next_specimen import next_specimen
 from bwbayes.population.normal import Hyperprior, spreads
-from bwbayes.population.population import PopulationParameter, population
+from bwbayes.population.population import PopulationParameter, next_specimen, population
 from bwbayes.population.specimen import Specimen, likelihoods, shared, specimen_of
 from tests.inference.problems import short_posterior
 from tests.measured import keep

@@ -1,7 +1,7 @@
 """Make the reference posteriors: nested sampling of the plain posterior, by dynesty.
 
-From the repository's root, ``python -m tests.reference.make virtual measured``. It needs dynesty
-and numba, which the package and its tests do not; numba compiles the plain loops as they stand.
+From the repository's root, ``python -m tests.reference.make virtual measured measured_evidence``.
+It needs dynesty and numba, which the package and its tests do not; numba compiles the plain loops.
 Independent runs of dynamic nested sampling, aimed at the posterior, are pooled; the errors that
 their spread shows are stored with the result. It takes five and ten minutes on one core.
 """
@@ -66,29 +66,33 @@ def from_cube(case: Case, cube: Floats) -> Floats:
     return np.array(list(starmap(quantile, rows)))
 
 
-def nested(case: Case, seed: int) -> Any:
-    """Run dynesty once. The physical constraints are where the likelihood is zero."""
-    loops = compiled()
+def nested(case: Case, seed: int, *, aim: str = "posterior") -> Any:
+    """Run dynesty once, aimed at the posterior or at its integral, the evidence.
+
+    The physical constraints are where the likelihood is zero. For the evidence, slices along random
+    directions keep to the shell however narrow the ridge.
+    """
+    loops, dynesty = compiled(), import_module("dynesty")
 
     def likelihood(free: Floats) -> float:
         theta = {**case.fixed, **dict(zip(case.free, free.tolist(), strict=True))}
         return log_likelihood(case, theta, loops) if inside(theta) else -math.inf
 
-    sampler = import_module("dynesty").DynamicNestedSampler(
-        likelihood,
-        lambda cube: from_cube(case, cube),
-        len(case.free),
-        nlive=LIVE,
-        sample="rwalk",
-        walks=WALKS,
-        rstate=np.random.default_rng(seed),
-    )
-    sampler.run_nested(
-        wt_kwargs={"pfrac": 1.0},
-        n_effective=EFFECTIVE,
-        maxcall=MOST_CALLS,
-        print_progress=sys.stderr.isatty(),
-    )
+    problem = likelihood, lambda cube: from_cube(case, cube), len(case.free)
+    rng, shown = np.random.default_rng(seed), sys.stderr.isatty()
+    if aim == "evidence":
+        sampler = dynesty.NestedSampler(*problem, nlive=2 * LIVE, sample="rslice", rstate=rng)
+        sampler.run_nested(dlogz=0.02, print_progress=shown)
+    else:
+        sampler = dynesty.DynamicNestedSampler(
+            *problem, nlive=LIVE, sample="rwalk", walks=WALKS, rstate=rng
+        )
+        sampler.run_nested(
+            wt_kwargs={"pfrac": 1.0},
+            n_effective=EFFECTIVE,
+            maxcall=MOST_CALLS,
+            print_progress=shown,
+        )
     return sampler.results
 
 
@@ -162,10 +166,25 @@ def reference(name: str) -> dict[str, object]:
     }
 
 
+def reference_evidence(name: str) -> dict[str, object]:
+    """Make one reference evidence; the spread of independent runs is its error."""
+    case = load_case(FOLDER / f"{name}.toml")
+    runs = [nested(case, seed, aim="evidence") for seed in range(1, 5)]
+    return {
+        "digest": digest(case),
+        "versions": {p: version(p) for p in ("numpy", "scipy", "numba", "dynesty")},
+        "live_points": 2 * LIVE,
+        "log_evidence": [float(run.logz[-1]) for run in runs],
+        "log_evidence_error": [float(run.logzerr[-1]) for run in runs],
+    }
+
+
 def main(names: list[str]) -> None:
     """Make the named references and write them beside this file."""
     for name in names:
-        text = json.dumps(reference(name), indent=2) + "\n"
+        case, wanted_evidence = name.removesuffix("_evidence"), name.endswith("_evidence")
+        made = reference_evidence(case) if wanted_evidence else reference(case)
+        text = json.dumps(made, indent=2) + "\n"
         (FOLDER / f"{name}.json").write_text(text, encoding="utf-8")
 
 

@@ -24,8 +24,7 @@ from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
-from bwbayes.population.next_specimen import next_specimen
-from bwbayes.population.population import Population
+from bwbayes.population.population import Population, next_specimen
 from bwbayes.report.figures import drawn
 from bwbayes.results.start import Start
 from bwbayes.shown import head
