@@ -18,9 +18,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtr
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.plainmap import PlainMap
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution, Scored
 from bwbayes.shown import brief
@@ -263,7 +262,10 @@ class JointPrior:
         unclipped = np.ascontiguousarray(coordinates.T)
         safe = np.clip(unclipped, -FARTHEST, FARTHEST)
         free, possible = np.empty_like(safe), np.equal(safe, unclipped).all(axis=0)
-        self._plain.fill(free, safe)
+        rows, logarithmic, center, scale = self._formulas
+        scaled = scale * safe[rows]
+        grown = center * np.exp(np.where(logarithmic, scaled, 0.0))
+        free[rows] = np.where(logarithmic, grown, center + scaled)
         values = self._values(None, rows=coordinates.shape[0])
         values.update(zip(self.free_names, free, strict=True))
         room = np.ones(coordinates.shape[0])
@@ -279,18 +281,22 @@ class JointPrior:
         return free.T, np.where(possible, log_prior, -np.inf)
 
     @cached_property
-    def _plain(self) -> PlainMap:
-        """The free parameters that a formula maps and nothing ever cuts."""
-        return PlainMap.of({row: p.formula for row, p in enumerate(self.free)})
+    def _formulas(self) -> tuple[IntArray, BoolArray, FloatArray, FloatArray]:
+        """Which free parameters a formula maps and nothing cuts: most, so it is done at once.
+
+        Their rows; and, as columns, whether x = c exp(s z) instead of c + s z, c, and s.
+        """
+        forms = {row: p.formula for row, p in enumerate(self.free)}
+        table = np.array(
+            [(k, f.logarithmic, f.center, f.scale) for k, f in forms.items() if f is not None]
+        ).reshape(-1, 4)
+        rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
+        return rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
 
     @cached_property
     def _cut(self) -> tuple[tuple[int, Parameter], ...]:
         """The other ones, and which they are of the free ones."""
-        return tuple(
-            (row, parameter)
-            for row, parameter in enumerate(self.free)
-            if row not in self._plain.rows
-        )
+        return tuple((row, p) for row, p in enumerate(self.free) if p.formula is None)
 
     @cached_property
     def _floors(self) -> tuple[FloatArray, FloatArray]:

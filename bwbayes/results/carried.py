@@ -70,22 +70,9 @@ def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) ->
     """
     readings, noise = likelihood.readings, likelihood.spaced
     parameters = likelihood.table.noise(theta)
-    discrepancy, sensor = (sd**2 for sd in noise.marginal_sd(parameters))
-    always = discrepancy[:, np.newaxis, np.newaxis] * np.eye(2)
-    mean, gained = np.zeros((len(theta), 2)), np.zeros((len(theta), 2, 2))
-    residual = readings.values - simulated
-    steps = {missing: noise.transition(parameters, 1 + missing) for missing in readings.skipped}
-    for t, missing in enumerate(readings.skipped.tolist()):
-        if t:
-            kept = steps[missing]
-            mean = np.einsum("dij,dj->di", kept, mean)
-            gained = kept @ gained @ np.swapaxes(kept, 1, 2)
-        unsure = always - gained
-        # What a reading says: the state's covariance with it, over the variance of both.
-        told = unsure[:, :, 0]
-        total = (told[:, 0] + sensor)[:, np.newaxis]
-        gain = np.divide(told, total, out=np.zeros_like(told), where=total > 0)
-        mean = mean + gain * (residual[:, t] - mean[:, 0])[:, np.newaxis]
-        gained = gained + gain[:, :, np.newaxis] * told[:, np.newaxis]
+    residual = (readings.values - simulated)[:, np.newaxis]
+    filtered = noise.filter(parameters, residual, readings.skipped)
+    always = noise.marginal_sd(parameters)[0][:, np.newaxis, np.newaxis] ** 2 * np.eye(2)
+    mean, gained = filtered.mean[:, 0], always - filtered.covariance
     last = int(readings.rows[-1])
     return Carried(last, mean, gained, likelihood.noise, parameters)

@@ -17,9 +17,9 @@ from numba import njit
 from numba.extending import overload
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled import extrema, pinned, relaxing, stepped
+from bwbayes.inference.compiled import extrema, pinned, relaxing
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.model.compiled import FormulaType
+from bwbayes.model.compiled import FormulaType, move
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.memory import RemembersExtrema
@@ -59,7 +59,8 @@ def prepared(operator: Operator, column: Values, voltage: FloatArray, memory: An
         group, plan_rows = relaxing.rows(step, state, voltage[0]), relaxing.planned(step)
         return Stage(step, group[:, 0], group, plan_rows)
     equilibrium = step.go(state, np.full(len(state), voltage[0])).w
-    return Stage(step, equilibrium, stepped.rows(state, equilibrium), step.parameters)
+    group = np.column_stack([np.arange(equilibrium.size), equilibrium, state])
+    return Stage(step, equilibrium, group, step.parameters)
 
 
 # What makes the drive of a whole piece at once, (models, samples), as the operator's ``advance``.
@@ -103,7 +104,7 @@ def _compiled_along(
     del group, plan, voltage, first, last, out
     stage: Any = _given
     if isinstance(kind, FormulaType):
-        stage = stepped.stepped
+        stage = _stepped
         if issubclass(kind.kind, RelaxingStep):
             stage = relaxing.relaxing
         elif issubclass(kind.kind, RemembersExtrema):
@@ -132,3 +133,32 @@ def _given(
         drive = plan[int(group[i])]
         for t in range(first, last):
             out[(t - first) * LANES + i] = drive[t] - group[LANES + i]
+
+
+@njit(nogil=True, cache=True)
+def _stepped(
+    step: HysteresisStep,
+    group: FloatArray,
+    plan: FloatArray,
+    voltage: FloatArray,
+    first: int,
+    last: int,
+    out: FloatArray,
+) -> None:
+    """Step one model after the other, sample by sample.
+
+    Rows are a model's number in the plan, w₀, and what its step remembers.
+    """
+    memory = np.empty(group.size // LANES - 2)
+    after = np.empty(memory.size)
+    for i in range(LANES):
+        parameters = plan[int(group[i])]
+        for k in range(memory.size):
+            memory[k] = group[(2 + k) * LANES + i]
+        for t in range(first, last):
+            w, _ = move(step, parameters, memory, voltage[t], after)
+            out[(t - first) * LANES + i] = w - group[LANES + i]
+            for k in range(memory.size):
+                memory[k] = after[k]
+        for k in range(memory.size):
+            group[(2 + k) * LANES + i] = memory[k]
