@@ -61,8 +61,8 @@ OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": Fa
 # Where a command writes unless --out says where, and the files there. {0} and {1} are its first
 # words, {stem} is the first one's name, {record} that of what is predicted.
 LEAVES = {
-    "run": ("results/{stem}", "report.html summary.json bands.csv posterior.nc chain.h5"),
-    "resume": ("{0}", "report.html summary.json bands.csv posterior.nc chain.h5"),
+    "run": ("results/{stem}", "report.html summary.json bands.csv posterior.nc chain/start.npz"),
+    "resume": ("{0}", "report.html summary.json bands.csv posterior.nc chain/start.npz"),
     "report": ("{0}", "report.html figures/corner.png"),
     "check": ("results/{stem}-check", "check.html"),
     "init": ("", "{stem}.toml"),

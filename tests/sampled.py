@@ -6,7 +6,7 @@ from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.inference import pointfit
 from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.sampler import first_chain, sample
 
 

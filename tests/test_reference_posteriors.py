@@ -27,7 +27,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.data import Record, write_record
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.sampling.chain import draws
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from tests.reference.make import digest, from_cube
 from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
 from tests.sampled import sampled

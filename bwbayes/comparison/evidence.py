@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
@@ -106,10 +106,10 @@ def evidence(
     size = log_density[:, half:].size
     thin = max(size // MAX_DRAWS, 1)
     sampled = coordinates[::thin, half:]
-    at_draws = log_density[::thin, half:] - _normalized(proposal, sampled)
+    at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))
     places = proposal.draw(random, 10_000)
-    at_places = posterior.log_density(places) - _normalized(proposal, places)
+    at_places = posterior.log_density(places) - proposal.log_density(places)
     bridged, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
@@ -209,17 +209,6 @@ def _effective(values: FloatArray) -> float:
         return float(values.size)
     bulk, _ = effective_draws(values)
     return bulk if np.isfinite(bulk) else 1.0
-
-
-def _normalized(proposal: StudentMixture, coordinates: FloatArray) -> FloatArray:
-    """Log density of a proposal with its constant, shaped as the coordinates less the last axis."""
-    first = proposal.components[0]
-    free, freedom = first.center.size, first.freedom
-    constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)
-    constant -= 0.5 * free * np.log(freedom * np.pi)
-    density = proposal.log_density(coordinates.reshape(-1, free)) + constant
-    result: FloatArray = density.reshape(coordinates.shape[:-1])
-    return result
 
 
 def log_prior_mass(prior: JointPrior, generator: np.random.Generator) -> tuple[float, float]:

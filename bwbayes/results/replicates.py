@@ -30,7 +30,7 @@ from bwbayes.results.loops import at_level, crossings
 from bwbayes.results.prediction import predict_windows, thinned
 from bwbayes.results.simulated import OtherRecord, Simulated, covered
 from bwbayes.sampling.chain import draws
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.shown import brief

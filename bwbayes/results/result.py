@@ -26,8 +26,7 @@ from bwbayes.results.scores import Scores, as_summary
 from bwbayes.results.standing import Standing
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
-from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.shown import brief
 
 __all__ = ["Result", "summary"]

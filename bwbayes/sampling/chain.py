@@ -1,8 +1,8 @@
 """The chain of a sampling: what every ensemble did, block by block.
 
-A :class:`Chain` keeps it in memory; :class:`~bwbayes.sampling.storage.ChainFile` writes it to a
-file as well. The blocks of the pilot and the tuning are kept apart from those that count, and so
-are blocks of the sampling whose proposal turned out not to cover the posterior.
+A :class:`Chain` keeps it in memory; :class:`~bwbayes.sampling.storage.ChainFile` writes it to files
+as well. The blocks of the pilot and the tuning are kept apart from those that count, and so are
+blocks of the sampling whose proposal turned out not to cover the posterior.
 """
 
 from __future__ import annotations
@@ -20,10 +20,8 @@ from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.shown import brief
 
 __all__ = [
-    "MOST_DRAWS",
     "MOVES",
     "PHASES",
-    "RANDOM_STATE_WORDS",
     "Block",
     "Chain",
     "EnsembleState",
@@ -43,9 +41,6 @@ PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
 # Names of the moves, in the order in which a block counts them.
 MOVES = ("differential evolution", "snooker", "mixture", "nearby")
-
-# Mersenne twister: 624 words, position, whether a normal number is kept, and that number.
-RANDOM_STATE_WORDS = 628
 
 
 @dataclass(frozen=True)
@@ -79,14 +74,6 @@ class Block:
     end: EnsembleState
 
 
-def thinning(draws: int, limit: int = MOST_DRAWS) -> int:
-    """Return of how many steps one is used where a chain has so many draws: a power of two."""
-    thin = 1
-    while draws > limit * thin:
-        thin *= 2
-    return thin
-
-
 class Chain:
     """Blocks of all ensembles, in three phases.
 
@@ -102,8 +89,8 @@ class Chain:
     set_aside
         Blocks at the beginning of the sampling that do not count, because their proposal turned
         out not to cover the posterior.
-    refit, refitted
-        The proposal that was last fitted to blocks of the sampling, and to how many.
+    refit
+        The proposal that was then fitted to them, if any.
     """
 
     __repr__ = brief
@@ -111,7 +98,7 @@ class Chain:
     def __init__(self, starts: Sequence[EnsembleState]) -> None:
         self.starts = tuple(starts)
         self.proposals: dict[Phase, StudentMixture | None] = dict.fromkeys(PHASES)
-        self.set_aside = self.refitted = 0
+        self.set_aside = 0
         self.refit: StudentMixture | None = None
         self._blocks: dict[Phase, list[tuple[Block, ...]]] = {phase: [] for phase in PHASES}
 
@@ -124,15 +111,11 @@ class Chain:
 
         It goes on with a proposal that was fitted to them, or without any.
         """
-        if refit is not None:
-            self.refit, self.refitted = refit, blocks
-        self.set_aside = blocks
+        self.set_aside, self.refit = blocks, refit
 
     def proposal_in_use(self, phase: Phase) -> StudentMixture | None:
         """Return the proposal that a phase goes on with."""
-        if phase != "sampling" or not self.set_aside:
-            return self.proposals[phase]
-        return self.refit if self.set_aside == self.refitted else None
+        return self.refit if phase == "sampling" and self.set_aside else self.proposals[phase]
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
         """Add the next block of every ensemble."""
@@ -142,17 +125,13 @@ class Chain:
         """Return how many blocks each ensemble has, without those that were set aside."""
         return len(self._counting(phase))
 
-    def block_of(self, phase: Phase, number: int) -> tuple[Block, ...]:
-        """Return block ``number`` of every ensemble."""
-        return self._counting(phase)[number]
-
     def history(self, phase: Phase) -> tuple[tuple[Block, ...], ...]:
         """Return all blocks of a phase, those that were set aside first."""
         return tuple(self._blocks[phase])
 
     def steps(self, phase: Phase) -> int:
         """Return how many steps each ensemble has made."""
-        return sum(blocks[0].coordinates.shape[0] for blocks in self._counting(phase))
+        return sum(len(blocks[0].coordinates) for blocks in self._counting(phase))
 
     @property
     def ends(self) -> tuple[EnsembleState, ...]:
@@ -160,17 +139,20 @@ class Chain:
         done = [blocks for phase in PHASES for blocks in self._blocks[phase]]
         return tuple(block.end for block in done[-1]) if done else self.starts
 
-    def draws(self, phase: Phase) -> int:
-        """Return how many draws all walkers have made."""
-        return sum(b.log_density.size for blocks in self._counting(phase) for b in blocks)
+    def draws(self, phase: Phase, blocks: int | None = None) -> int:
+        """Return how many draws all walkers have made, in the first ``blocks`` or all."""
+        return sum(b.log_density.size for row in self._counting(phase)[:blocks] for b in row)
 
-    def coordinates(self, phase: Phase, thin: int = 1) -> FloatArray:
-        """Return (steps, ensembles, walkers, free), unconstrained, of every ``thin``-th step."""
-        return self._joined(phase, "coordinates", thin)
+    def coordinates(self, phase: Phase, thin: int = 1, blocks: int | None = None) -> FloatArray:
+        """Return (steps, ensembles, walkers, free), unconstrained, of every ``thin``-th step.
 
-    def log_density(self, phase: Phase, thin: int = 1) -> FloatArray:
-        """Return (steps, ensembles, walkers), nats, of every ``thin``-th step."""
-        return self._joined(phase, "log_density", thin)
+        Of the first ``blocks`` blocks that count, or of all.
+        """
+        return self._joined(phase, "coordinates", thin, blocks)
+
+    def log_density(self, phase: Phase, thin: int = 1, blocks: int | None = None) -> FloatArray:
+        """Return (steps, ensembles, walkers), nats, of the steps of :meth:`coordinates`."""
+        return self._joined(phase, "log_density", thin, blocks)
 
     def accepted(self, phase: Phase) -> IntArray:
         """Return the accepted moves of each block, (blocks, ensembles, walkers)."""
@@ -192,14 +174,25 @@ class Chain:
         """Return the blocks that count."""
         return self._blocks[phase][self.set_aside if phase == "sampling" else 0 :]
 
-    def _joined(self, phase: Phase, name: str, thin: int) -> FloatArray:
+    def _joined(self, phase: Phase, name: str, thin: int, count: int | None) -> FloatArray:
         parts, done = [], 0
-        for blocks in self._counting(phase):
+        for blocks in self._counting(phase)[:count]:
             arrays = [getattr(block, name) for block in blocks]
             first = -(done + 1) % thin  # of steps counted from one, those that thin divides
             parts.append(np.stack([values[first::thin] for values in arrays], axis=1))
             done += len(arrays[0])
         return np.concatenate(parts)
+
+
+def thinning(draws: int, limit: int | None = None) -> int:
+    """Return of how many steps one is used, of so many draws: a power of two.
+
+    So that ``limit`` are used at most, ``MOST_DRAWS`` by default.
+    """
+    thin = 1
+    while draws > (limit or MOST_DRAWS) * thin:
+        thin *= 2
+    return thin
 
 
 def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:

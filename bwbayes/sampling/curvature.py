@@ -16,24 +16,10 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 
-__all__ = ["QuadraticMap", "pairs", "rows_of", "subsample"]
+__all__ = ["QuadraticMap", "subsample"]
 
-# A coordinate bends if that explains so much of its variance.
-LEAST_EXPLAINED = 0.1
-
-# Only the longest coordinates bend others: so many, and fewer if a coefficient has fewer draws.
-LONGEST = 12
-DRAWS_EACH = 50
-
-# Draws that a bend is fitted to, and places that are straightened at once: products take memory.
-FITTED = 20_000
-AT_ONCE = 4096
-
-# Added to the coefficients' information, in units of that of all draws: few draws tell little.
-RIDGE = 1e-3
-
-# A bend goes on straight beyond so many sds, where no draws have shown it.
-FARTHEST = 5.0
+LONGEST = 12  # only the longest coordinates bend others
+FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
 
 
 @dataclass(frozen=True)
@@ -61,43 +47,37 @@ class QuadraticMap:
 
     @classmethod
     def fitted(cls, draws: FloatArray) -> QuadraticMap | None:
-        """Fit to draws (count, free), or some of many, by least squares; None if not bent.
+        """Fit to draws (count, free), or 20,000 of them, by least squares; None if not bent.
+
+        A coordinate bends if that explains a tenth of its variance, and with as many others as
+        leave fifty draws to a coefficient.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             The decomposition of the draws does not converge.
         """
-        draws = subsample(draws, FITTED)
+        draws = subsample(draws, 20_000)
         count, free = draws.shape
         center = np.mean(draws, axis=0)
         # Singular values keep the digits of directions that variances would lose.
         _, lengths, axes = np.linalg.svd(np.linalg.qr(draws - center, mode="r"))
         factor = axes.T * (lengths / np.sqrt(count))
         z = np.linalg.solve(factor, (draws - center).T).T
-        bends = np.zeros((pairs(free), free))
+        longest = min(free, LONGEST)
+        bends = np.zeros((longest * (longest + 1) // 2, free))
         products = np.empty((count, 0))
         for j in range(1, free):
-            if j <= LONGEST and (products.shape[1] + j) * DRAWS_EACH <= count:
+            if j <= LONGEST and (products.shape[1] + j) * 50 <= count:
                 products = np.concatenate([products, _products(z, j - 1)], axis=1)
             terms = products.shape[1]
-            information = products.T @ products / count + RIDGE * np.eye(terms)
+            # Few draws tell little: each coefficient is drawn to zero by a thousandth of them all.
+            information = products.T @ products / count + 1e-3 * np.eye(terms)
             coefficients = np.linalg.solve(information, products.T @ z[:, j] / count)
             straight = z[:, j] - products @ coefficients
-            if np.var(straight) < (1 - LEAST_EXPLAINED) * np.var(z[:, j]):
+            if np.var(straight) < 0.9 * np.var(z[:, j]):
                 z[:, j], bends[:terms, j] = straight, coefficients
         return cls(center, factor, bends) if bends.any() else None
-
-    @classmethod
-    def of(cls, numbers: FloatArray) -> QuadraticMap | None:
-        """Return the bend of ``numbers``; None if they are zero."""
-        free = numbers.shape[1]
-        return cls(numbers[0], *np.split(numbers[1:], [free])) if numbers.any() else None
-
-    @property
-    def numbers(self) -> FloatArray:
-        """μ, F and b as one table, (1 + free + pairs, free)."""
-        return np.vstack([self.center, self.factor, self.bends])
 
     @cached_property
     def log_volume(self) -> float:
@@ -111,17 +91,14 @@ class QuadraticMap:
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
         """Every i and k of the rows of ``bends``."""
-        longest = np.arange(min(self.center.size, LONGEST))
-        k = np.repeat(longest, longest + 1)
-        return np.concatenate([longest[: last + 1] for last in longest]), k
+        k, i = np.tril_indices(min(self.center.size, LONGEST))
+        return i, k
 
     @cached_property
     def _curved(self) -> tuple[tuple[int, int], ...]:
         """The coordinates that bend, and how many pairs bend them."""
-        ends = [
-            int(np.flatnonzero(column)[-1]) + 1 if column.any() else 0 for column in self.bends.T
-        ]
-        return tuple((j, end) for j, end in enumerate(ends) if end)
+        bent = [(j, np.flatnonzero(column)) for j, column in enumerate(self.bends.T)]
+        return tuple((j, int(rows[-1]) + 1) for j, rows in bent if rows.size)
 
     def to_curved(self, straight: FloatArray) -> FloatArray:
         """Return x (..., free) of z (..., free)."""
@@ -133,39 +110,23 @@ class QuadraticMap:
 
     def to_straight(self, bent: FloatArray) -> FloatArray:
         """Return z (..., free) of x (..., free)."""
-        places = bent.reshape(-1, bent.shape[-1])
-        chunks = [places[i : i + AT_ONCE] for i in range(0, len(places), AT_ONCE)]
-        z = np.concatenate([self._straight(chunk) for chunk in chunks]) if chunks else places
+        z = ((bent - self.center) @ self._inverse).reshape(-1, self.center.size)
+        for start in range(0, len(z), 4096):  # products take memory
+            chunk = z[start : start + 4096]
+            products = np.empty((len(chunk), 0))
+            last = 0
+            for j, end in self._curved:
+                while products.shape[1] < end:
+                    products = np.concatenate([products, _products(chunk, last)], axis=1)
+                    last += 1
+                chunk[:, j] -= products[:, :end] @ self.bends[:end, j]
         return z.reshape(bent.shape)
-
-    def _straight(self, bent: FloatArray) -> FloatArray:
-        """Do it for places (count, free), one coordinate after the other."""
-        z: FloatArray = (bent - self.center) @ self._inverse
-        products = np.empty((len(z), 0))
-        last = 0
-        for j, end in self._curved:
-            while products.shape[1] < end:
-                products = np.concatenate([products, _products(z, last)], axis=1)
-                last += 1
-            z[:, j] -= products[:, :end] @ self.bends[:end, j]
-        return z
 
 
 def subsample(draws: FloatArray, count: int) -> FloatArray:
     """Return so many of draws (count, free) at most, evenly from first to last."""
     # An odd stride, or the same few walkers might be taken at every step.
     return draws[:: -(-len(draws) // count) | 1]
-
-
-def pairs(free: int) -> int:
-    """Return how many pairs of so many coordinates may bend others."""
-    longest = min(free, LONGEST)
-    return longest * (longest + 1) // 2
-
-
-def rows_of(free: int) -> int:
-    """Return how many rows the numbers of a bend have."""
-    return 1 + free + pairs(free)
 
 
 def _products(z: FloatArray, last: int) -> FloatArray:

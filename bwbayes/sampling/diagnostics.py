@@ -27,7 +27,10 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.shown import brief
 
 __all__ = [
+    "LARGEST_PARETO_K",
+    "LENGTH",
     "Check",
+    "Outcome",
     "as_chains",
     "autocorrelation_time",
     "check",
@@ -53,20 +56,7 @@ EQUAL = 1e-6
 # Steps in autocorrelation times, before which no estimate of it can be trusted.
 LENGTH = 50
 
-# Autocorrelation times without a move after which a walker is stuck. The longest of an independence
-# sampler's rests at a place where its proposal hardly goes are a third of that.
-STILL = 25
-
 TAIL = (0.05, 0.95)
-
-# Sokal's window for an autocorrelation time: the first lag of so many times that time.
-WINDOW = 5
-
-# Digits behind the point beyond which a number is not told from its limit.
-MOST_DIGITS = 9
-
-# Threads that judge parameters side by side: their sorting and transforms leave Python free.
-THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -76,9 +66,9 @@ class Check:
     ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk``, of the ranks, and
     ``ess_tail`` are totals, and so is ``ess_mean``, which the Monte Carlo error of the mean hangs
     on; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
-    ``stuck`` counts the walkers that have not moved for the last ``STILL`` autocorrelation times;
-    ``pareto_k`` is that of the proposal at these draws, None if there is no proposal;
-    ``walker_rhat`` is the largest R-hat with each walker a chain.
+    ``stuck`` counts the walkers that do not move any more, as :func:`stuck` does; ``pareto_k`` is
+    that of the proposal at these draws, None if there is no proposal; ``walker_rhat`` is the
+    largest R-hat with each walker a chain.
     """
 
     __repr__ = brief
@@ -103,89 +93,47 @@ class Check:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
         First what more draws need not cure. Of effective draws, and of autocorrelation times, a
-        ``part`` is enough. Every comparison is written so that nan fails it.
+        ``fraction`` is enough. Every comparison is written so that nan fails it.
         """
         reasons = self.disagreements()
         fewest, draws = np.min([self.ess_bulk, self.ess_tail]), fraction * ess
         if not fewest >= draws:
-            reasons.append(f"ESS {_beside_limit(fewest, draws)} has not reached {draws:g}")
+            reasons.append(f"ESS {np.floor(fewest):.0f} has not reached {draws:g}")
         times, length = self.steps / np.max(self.autocorrelation), fraction * LENGTH
         if not times >= length:
-            shown = _beside_limit(times, length)
-            reasons.append(f"{shown} autocorrelation times are fewer than {length:g}")
+            reasons.append(f"{np.floor(times):.0f} autocorrelation times are fewer than {length:g}")
         return reasons
 
     def disagreements(self) -> list[str]:
-        """Say what is wrong with the draws that there are; empty if nothing is."""
+        """Say what is wrong with the draws that there are; empty if nothing is.
+
+        Numbers are rounded away from the limit that they miss.
+        """
         reasons = []
         if not (self.rhat < LARGEST_RHAT).all():
-            rhat = _beside_limit(np.max(self.rhat), LARGEST_RHAT, 3)
-            reasons.append(f"R-hat {rhat} is not below {LARGEST_RHAT}")
+            rhat = np.ceil(1e3 * np.max(self.rhat)) / 1e3
+            reasons.append(f"R-hat {rhat:.3f} is not below {LARGEST_RHAT}")
         if not self.walker_rhat < LARGEST_WALKER_RHAT:
-            rhat = _beside_limit(self.walker_rhat, LARGEST_WALKER_RHAT, 2)
-            reasons.append(f"R-hat {rhat} of walkers is not below {LARGEST_WALKER_RHAT}")
+            rhat = np.ceil(1e3 * self.walker_rhat) / 1e3
+            reasons.append(f"R-hat {rhat:.3f} of walkers is not below {LARGEST_WALKER_RHAT}")
         if self.stuck:
             reasons.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
-            shape = _beside_limit(self.pareto_k, LARGEST_PARETO_K, 2)
-            reasons.append(f"Pareto k {shape} is not below {LARGEST_PARETO_K}")
+            shape = np.ceil(100 * self.pareto_k) / 100
+            reasons.append(f"Pareto k {shape:.2f} is not below {LARGEST_PARETO_K}")
         return reasons
 
 
-def _statistics() -> Any:
-    """Return arviz's statistics, slow to load, whose autocovariance is all chains' average."""
-    from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # noqa: PLC0415
+@dataclass(frozen=True)
+class Outcome:
+    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
 
-    class Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
-        def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
-            assert axis in (-1, 1)
-            return _autocovariance(ary)
+    __repr__ = brief
 
-    return Averaged()
-
-
-def _autocovariance(chains: FloatArray) -> FloatArray:
-    """Mean autocovariance (1, steps) of chains (chains, steps), by one transform back for all."""
-    steps = chains.shape[1]
-    padded = scipy.fft.next_fast_len(2 * steps, real=True)
-    spectrum = scipy.fft.rfft(chains - np.mean(chains, axis=1, keepdims=True), padded)
-    power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
-    covariance: FloatArray = scipy.fft.irfft(power, padded)[:, :steps] / steps
-    return covariance
-
-
-def _beside_limit(value: float, limit: float, digits: int = 0) -> str:
-    """Write a value with so many digits, or as many as tell it from the limit that it misses."""
-    text = f"{value:.{digits}f}"
-    while digits < MOST_DIGITS and float(text) == float(f"{limit:g}") != value:
-        digits += 1
-        text = f"{value:.{digits}f}"
-    return text
-
-
-def autocorrelation_time(chains: FloatArray) -> float:
-    """Integrated autocorrelation time, in steps, of chains (chains, steps) of one parameter.
-
-    As ``emcee.autocorr.integrated_time`` has it, from the mean of the chains' autocorrelations. It
-    is nan where it cannot be told, for instance where nothing moves.
-    """
-    from emcee.autocorr import auto_window  # noqa: PLC0415  # slow to load
-
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        away = chains - np.mean(chains, axis=1, keepdims=True)
-        away /= np.sqrt(np.sum(away**2, axis=1, keepdims=True))
-        correlation = chains.shape[1] * _autocovariance(away)[0]
-    time = 2 * np.cumsum(correlation) - 1
-    windowed = float(time[auto_window(time, WINDOW)])
-    return windowed if windowed > 0 else np.nan
-
-
-def times(draws: FloatArray, thin: int = 1) -> FloatArray:
-    """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
-    # One parameter at a time: the spectra of all would be many times as large as the draws.
-    columns = np.moveaxis(draws, -1, 0)
-    # A thinned series does not tell times below its own step.
-    return thin * np.array([autocorrelation_time(as_chains(values)) for values in columns])
+    converged: bool
+    stop_reason: str
+    check: Check
+    remarks: tuple[str, ...] = ()
 
 
 def check(
@@ -194,6 +142,7 @@ def check(
     block: int,
     thin: int = 1,
     autocorrelation: FloatArray | None = None,
+    pareto_k: float | None = None,
 ) -> Check:
     """Judge the draws of a sampling.
 
@@ -209,13 +158,16 @@ def check(
         Of how many steps the draws are one.
     autocorrelation
         Their autocorrelation times, if they are known.
+    pareto_k
+        That of the proposal at these draws, if there is one.
     """
-    free = draws.shape[-1]
     if autocorrelation is None:
         autocorrelation = times(draws, thin)
-    # Where threads silence warnings side by side, as arviz does, the last to end may leave them so.
-    with warnings.catch_warnings(), ThreadPoolExecutor(THREADS) as executor:
-        statistics = executor.map(_one_parameter, (draws[..., i] for i in range(free)))
+    columns = np.moveaxis(draws, -1, 0)
+    # Two threads: sorting and transforms leave Python free. Where threads silence warnings side by
+    # side, as arviz does, the last to end may leave them so.
+    with warnings.catch_warnings(), ThreadPoolExecutor(2) as executor:
+        statistics = executor.map(_one_parameter, columns)
         rhat, bulk, tail, mean, walker_rhat = np.array([*statistics]).T
     return Check(
         steps=len(accepted) * block,
@@ -225,34 +177,39 @@ def check(
         ess_mean=mean,
         autocorrelation=autocorrelation,
         acceptance=float(accepted.sum() / (accepted.size * block)),
-        walker_rhat=float(np.max(walker_rhat)),
         stuck=stuck(accepted, block, autocorrelation),
+        pareto_k=pareto_k,
+        walker_rhat=float(np.max(walker_rhat)),
     )
 
 
 def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     """Judge the draws (steps, ensembles, walkers) of one parameter.
 
-    R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers.
+    R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers: walkers that
+    share modes between them in the same way in each ensemble, and never change, look alike to the
+    nested R-hat, and are worth as many effective draws as they are.
     """
     steps, ensembles, _ = values.shape
-    scores, folded = _scores(values)
+    scores = _scores(values)
     half = steps // 2
-    halves, folded_halves = (
-        np.concatenate([s[:, :half], s[:, steps - half :]]) for s in (scores, folded)
-    )
     # The halves of all ensembles are superchains of their own: first halves, then second ones.
-    rhats = _rhat(scores, folded, ensembles), _rhat(halves, folded_halves, 2 * ensembles)
-    # np.max keeps a nan of either.
-    return float(np.max(rhats)), *_effective_draws(values, scores), _walker_rhat(scores)
+    halves = np.concatenate([scores[..., :half], scores[..., steps - half :]], axis=1)
+    rhat = float(np.max([_rhat(scores, ensembles), _rhat(halves, 2 * ensembles)]))  # keeps a nan
+    ranked = scores[0]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        between, within = np.var(np.mean(ranked, axis=1)), np.mean(np.var(ranked, axis=1))
+        walker_rhat = float(np.sqrt(1 + between / within))
+    return rhat, *_effective_draws(values, ranked), walker_rhat
 
 
 def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
-    """Count the walkers that have not moved for ``STILL`` autocorrelation times, or never.
+    """Count the walkers that have not moved for 25 autocorrelation times, or never.
 
-    Arguments as in :func:`check`.
+    The longest of an independence sampler's rests at a place where its proposal hardly goes are a
+    third of that. Arguments as in :func:`check`.
     """
-    blocks = STILL * np.max(autocorrelation) / block
+    blocks = 25 * np.max(autocorrelation) / block
     last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
     return int(np.sum(~accepted[-last:].any(axis=0)))
 
@@ -299,7 +256,7 @@ def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
 def nested_rhat(draws: FloatArray) -> FloatArray:
     """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
     columns = np.moveaxis(draws, -1, 0)
-    return np.array([_rhat(*_scores(values), values.shape[1]) for values in columns])
+    return np.array([_rhat(_scores(values), values.shape[1]) for values in columns])
 
 
 def effective_draws(values: FloatArray) -> tuple[float, float]:
@@ -321,44 +278,34 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     tail are worth another number.
     """
     statistics, means = _statistics(), np.mean(values, axis=2)
+    # A comparison would take what is not a number for a draw beyond the tail.
+    tails = [np.where(np.isnan(scores), np.nan, scores <= ndtri(p)) for p in TAIL]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = statistics.ess(means.T, method="mean") * np.var(values) / np.var(means)
-        bulk = statistics.ess(scores, method="mean")
-        # A comparison would take what is not a number for a draw beyond the tail.
-        tails = [
-            statistics.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
-            for p in TAIL
-        ]
-        mean = statistics.ess(as_chains(values), method="mean")
+        chains = (scores, *tails, as_chains(values))
+        bulk, lower, upper, mean = (statistics.ess(chain, method="mean") for chain in chains)
     # np.minimum keeps a nan of either.
-    bulk, tail, mean = np.minimum([bulk, np.min(tails), mean], cap).tolist()
+    bulk, tail, mean = np.minimum([bulk, np.minimum(lower, upper), mean], cap).tolist()
     return bulk, tail, mean
 
 
-def _rhat(scores: FloatArray, folded: FloatArray, ensembles: int) -> float:
-    """Nested R-hat of scores (chains, steps), an ensemble's chains in a row.
+def _rhat(scores: FloatArray, ensembles: int) -> float:
+    """Nested R-hat of scores (2, chains, steps), an ensemble's chains in a row.
 
     Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
     calls rank, which would rank the draws once more.
     """
-    superchain = np.repeat(np.arange(ensembles), len(scores) // ensembles)
+    superchain = np.repeat(np.arange(ensembles), scores.shape[1] // ensembles)
+    statistics = _statistics()
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        rhats = [
-            _statistics().rhat_nested(ranked, superchain_ids=superchain, method="split")
-            for ranked in (scores, folded)
-        ]
-    return float(np.max(rhats))
-
-
-def _walker_rhat(scores: FloatArray) -> float:
-    """R-hat of chains (chains, steps), √(1 + variance of their means / mean of their variances).
-
-    Walkers that share modes between them in the same way in each ensemble, and never change, look
-    alike to the nested R-hat, and are worth as many effective draws as they are.
-    """
-    between = np.var(np.mean(scores, axis=1))
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return float(np.sqrt(1 + between / np.mean(np.var(scores, axis=1))))
+        return float(
+            np.max(
+                [
+                    statistics.rhat_nested(ranked, superchain_ids=superchain, method="split")
+                    for ranked in scores
+                ]
+            )
+        )
 
 
 def as_chains(values: FloatArray) -> FloatArray:
@@ -370,29 +317,62 @@ def as_chains(values: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.moveaxis(values, 0, -1)).reshape(-1, len(values))
 
 
-def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rank draws (steps, ensembles, walkers) into normal scores (chains, steps).
+def _scores(values: FloatArray) -> FloatArray:
+    """Rank draws (steps, ensembles, walkers) into normal scores (2, chains, steps).
 
-    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)). The second ones are
-    those of the draws' distances from their median.
+    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)); nan if any draw is.
+    The second ones are those of the draws' distances from their median.
     """
     chains = as_chains(values)
     with np.errstate(invalid="ignore"):
-        scores, median = _normal_scores(chains)
-        return scores, _normal_scores(np.abs(chains - median))[0]
+        folded = np.abs(chains - np.median(chains))
+    ranks = np.stack([scipy.stats.rankdata(draws) for draws in (chains, folded)])
+    scores: FloatArray = ndtri((ranks - 3 / 8) / (chains.size + 1 / 4))
+    return scores.reshape(2, *chains.shape)
 
 
-def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
-    """Rank one parameter's draws, and find their median; all nan if any of them is."""
-    values = draws.ravel()
-    order = np.argsort(values)
-    ordered = values[order]
-    if np.isnan(ordered[-1]):  # nan sorts last
-        return np.full(draws.shape, np.nan), np.nan
-    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    equal = np.diff(first, append=values.size)
-    rank = first + 0.5 * (equal + 1)
-    scores = np.empty(values.size)
-    scores[order] = np.repeat(ndtri((rank - 3 / 8) / (values.size + 1 / 4)), equal)
-    center = ordered[(values.size - 1) // 2], ordered[values.size // 2]
-    return scores.reshape(draws.shape), float(np.mean(center))
+def times(draws: FloatArray, thin: int = 1) -> FloatArray:
+    """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
+    # One parameter at a time: the spectra of all would be many times as large as the draws.
+    columns = np.moveaxis(draws, -1, 0)
+    # A thinned series does not tell times below its own step.
+    return thin * np.array([autocorrelation_time(as_chains(values)) for values in columns])
+
+
+def autocorrelation_time(chains: FloatArray) -> float:
+    """Integrated autocorrelation time, in steps, of chains (chains, steps) of one parameter.
+
+    As ``emcee.autocorr.integrated_time`` has it, from the mean of the chains' autocorrelations. It
+    is nan where it cannot be told, for instance where nothing moves.
+    """
+    from emcee.autocorr import auto_window  # noqa: PLC0415  # slow to load
+
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        away = chains - np.mean(chains, axis=1, keepdims=True)
+        away /= np.sqrt(np.sum(away**2, axis=1, keepdims=True))
+        correlation = chains.shape[1] * _autocovariance(away)[0]
+    time = 2 * np.cumsum(correlation) - 1
+    windowed = float(time[auto_window(time, 5)])
+    return windowed if windowed > 0 else np.nan
+
+
+def _statistics() -> Any:
+    """Return arviz's statistics, slow to load, whose autocovariance is all chains' average."""
+    from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # noqa: PLC0415
+
+    class Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
+        def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
+            assert axis in (-1, 1)
+            return _autocovariance(ary)
+
+    return Averaged()
+
+
+def _autocovariance(chains: FloatArray) -> FloatArray:
+    """Mean autocovariance (1, steps) of chains (chains, steps), by one transform back for all."""
+    steps = chains.shape[1]
+    padded = scipy.fft.next_fast_len(2 * steps, real=True)
+    spectrum = scipy.fft.rfft(chains - np.mean(chains, axis=1, keepdims=True), padded)
+    power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
+    covariance: FloatArray = scipy.fft.irfft(power, padded)[:, :steps] / steps
+    return covariance

@@ -1,36 +1,32 @@
-"""One ensemble of walkers, some steps further: the unit of work of a sampling.
+"""Ensembles of walkers, some steps further: the unit of work of a sampling.
 
-:func:`advance` is a pure function of the posterior and an :class:`EnsembleState`, random state
+:func:`advance` is a pure function of the posterior and each :class:`EnsembleState`, random state
 included. So it does not matter where, when or in which order ensembles run: a run with two
 workers, or one that was interrupted and goes on, gives the same bits.
-:func:`advance_together` moves several at once, and makes one call of the density for all of them.
+
+An ensemble walks as a generator: it yields the places whose density it needs next and is sent the
+densities, so that one call of the density serves all ensembles that move together. It draws its
+random numbers in the order in which emcee does. Where an independence proposal stands does not
+depend on where the walkers are, so steps in a row that make one are proposed all together, their
+densities are asked for at once, and only then is it decided, step by step, who goes where.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 
 import numpy as np
-from emcee.moves import Move
+from emcee.moves import MHMove, RedBlueMove
 from numpy.typing import NDArray
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, EnsembleState
-from bwbayes.sampling.walking import Steps, walk
+from bwbayes.sampling.moves import AmongPlaces, Weighted
 
-__all__ = [
-    "advance",
-    "advance_together",
-    "start",
-]
-
-# Starts lie this many posterior sds from an optimum, in a cluster of a fraction of one.
-FAR = 10.0
-TIGHT = 0.2
-TRIALS = 100
+__all__ = ["advance", "start"]
 
 
 def start(
@@ -54,9 +50,9 @@ def start(
     axes = np.linalg.cholesky(point.covariance)
     optimum = point.optima[number % len(point.optima)]
     direction = generator.standard_normal(optimum.size)
-    direction *= FAR / np.linalg.norm(direction)
-    for _ in range(TRIALS):
-        tight = min(TIGHT, float(np.linalg.norm(direction)))
+    direction *= 10.0 / np.linalg.norm(direction)
+    for _ in range(100):
+        tight = min(0.2, float(np.linalg.norm(direction)))
         cluster = direction + tight * generator.standard_normal((walkers, optimum.size))
         coordinates = optimum + cluster @ axes.T
         log_density = posterior.log_density(coordinates)
@@ -69,38 +65,30 @@ def start(
             "be finite; check priors and record"
         )
     random = np.random.RandomState(np.random.MT19937(generator.integers(2**63)))
-    return EnsembleState(coordinates, log_density, _pack(random.get_state()))
+    return EnsembleState(coordinates, log_density, _words(random))
 
 
 def advance(
-    posterior: Posterior, moves: Sequence[tuple[Move, float]], state: EnsembleState, steps: int
-) -> Block:
-    """Move an ensemble ``steps`` steps on, by emcee's ``moves`` with their weights.
-
-    Each step takes one of the moves at random, for all walkers.
-    """
-    return advance_together(posterior, [moves], [state], steps)[0]
-
-
-def advance_together(
     posterior: Posterior,
-    moves: Sequence[Sequence[tuple[Move, float]]],
+    moves: Sequence[Weighted],
     states: Sequence[EnsembleState],
     steps: int,
 ) -> list[Block]:
-    """Move several ensembles on, each by ``moves`` of its own, with one density call for all.
+    """Move ensembles ``steps`` steps on, each by ``moves`` of its own, with one density call.
 
-    Each is moved as :func:`advance` moves it alone, and its random numbers are its own: bit for bit
-    where a density does not depend on the others of its batch, to rounding where it does (the
-    compiled engine decides for groups of models when their noise has settled). On a short record a
-    call costs more than the models in it, so that four ensembles cost little more than one.
+    Each step takes one of an ensemble's moves at random, with its weight, for all walkers. An
+    ensemble moves as it does alone: bit for bit where a density does not depend on the others of
+    its batch, to rounding where it does (the compiled engine decides for groups of models when
+    their noise has settled). On a short record a call costs more than the models in it, so that
+    four ensembles cost little more than one.
+
+    Raises
+    ------
+    InputError
+        A move that is neither emcee's ``RedBlueMove`` or ``MHMove`` nor an ``AmongPlaces``.
     """
-    randoms = [_generator(state.random_state) for state in states]
-    walks = [
-        walk(ensemble_moves, state.coordinates, state.log_density, random, steps)
-        for ensemble_moves, state, random in zip(moves, states, randoms, strict=True)
-    ]
-    finished: dict[int, Steps] = {}
+    walks = [_walk(weighted, state, steps) for weighted, state in zip(moves, states, strict=True)]
+    blocks: dict[int, Block] = {}
     # Far away a proposal may overflow: such a place has no density.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         proposed = {number: next(walk) for number, walk in enumerate(walks)}
@@ -113,8 +101,8 @@ def advance_together(
                 try:
                     proposed[number] = walks[number].send(answer)
                 except StopIteration as end:
-                    finished[number] = end.value
-    return [_block(finished[number], random) for number, random in enumerate(randoms)]
+                    blocks[number] = end.value
+    return [blocks[number] for number in range(len(walks))]
 
 
 def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
@@ -131,15 +119,127 @@ def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
     return density
 
 
-def _block(steps: Steps, random: np.random.RandomState) -> Block:
-    end = EnsembleState(
-        steps.coordinates[-1].copy(), steps.log_density[-1].copy(), _pack(random.get_state())
-    )
-    return Block(steps.coordinates, steps.log_density, steps.accepted, steps.moves, end)
+class _Path:
+    """Where the walkers of an ensemble are, and the steps behind them."""
+
+    def __init__(self, state: EnsembleState, steps: int, kinds: int) -> None:
+        self.here, self.density = state.coordinates.copy(), state.log_density.copy()
+        self.random = _generator(state.random_state)
+        walkers, free = self.here.shape
+        self.coordinates = np.empty((steps, walkers, free))
+        self.log_density = np.empty((steps, walkers))
+        self.accepted: IntArray = np.zeros(walkers, dtype=np.int64)
+        self.moves: IntArray = np.zeros((kinds, 2), dtype=np.int64)
+        self.done = 0
+
+    @property
+    def is_complete(self) -> bool:
+        return self.done == len(self.coordinates)
+
+    def step(self, kind: int, accepted: BoolArray, places: FloatArray, density: FloatArray) -> None:
+        """Let those who accepted go where it was proposed, and add the step."""
+        np.copyto(self.here, places, where=accepted[:, np.newaxis])
+        np.copyto(self.density, density, where=accepted)
+        self.coordinates[self.done], self.log_density[self.done] = self.here, self.density
+        self.accepted += accepted
+        self.moves[kind] += accepted.size, np.count_nonzero(accepted)
+        self.done += 1
+
+    def block(self) -> Block:
+        end = EnsembleState(self.here, self.density, _words(self.random))
+        return Block(self.coordinates, self.log_density, self.accepted, self.moves, end)
 
 
-def _pack(state: tuple[str, NDArray[np.uint32], int, int, float]) -> NDArray[np.uint32]:
-    _, words, position, has_normal, normal = state
+# Yields places (count, free), is sent their log densities (count,).
+_Walk = Generator[FloatArray, FloatArray, Block]
+
+
+def _walk(moves: Weighted, state: EnsembleState, steps: int) -> _Walk:
+    """Walk ``steps`` steps on."""
+    path = _Path(state, steps, len(moves))
+    random = path.random
+    ends = np.cumsum([weight for _, weight in moves])
+    ends = (ends / ends[-1]).tolist()
+
+    def choose() -> int:
+        uniform = random.random_sample()
+        return next(kind for kind, end in enumerate(ends) if uniform < end)
+
+    kind = choose()
+    while True:
+        move = moves[kind][0]
+        following = None
+        if isinstance(move, RedBlueMove):
+            yield from _split_step(move, kind, path)
+        elif isinstance(move, AmongPlaces):
+            proposed, chances = [], []
+            while following in (None, kind):
+                proposed.append(move.proposal.draw(random, move.places * len(path.here)))
+                chances.append(random.rand(len(path.here)))
+                if path.done + len(chances) == steps:
+                    break
+                following = choose()
+            yield from _independent_steps(move, kind, path, proposed, chances)
+        elif isinstance(move, MHMove):
+            places, factor = move.get_proposal(path.here, random)
+            density = yield places
+            accepted = np.log(random.rand(len(density))) < density - path.density + factor
+            path.step(kind, accepted, places, density)
+        else:
+            raise InputError(f"moves: {type(move).__name__} is neither a RedBlueMove nor an MHMove")
+        if path.is_complete:
+            return path.block()
+        kind = choose() if following is None else following
+
+
+def _split_step(
+    move: RedBlueMove, kind: int, path: _Path
+) -> Generator[FloatArray, FloatArray, None]:
+    """Move one split of the walkers after the other."""
+    random = path.random
+    places, density = path.here.copy(), path.density.copy()
+    move.setup(places)
+    splits = np.arange(len(places)) % move.nsplits
+    if move.randomize_split:
+        random.shuffle(splits)
+    accepted = np.zeros(len(places), dtype=bool)
+    for split in range(move.nsplits):
+        movers = np.flatnonzero(splits == split)
+        others = [places[splits == other] for other in range(move.nsplits) if other != split]
+        proposed, factor = move.get_proposal(places[movers], others, random)
+        offered = yield proposed
+        moved = factor + offered - density[movers] > np.log(random.rand(movers.size))
+        goers = movers[moved]
+        places[goers], density[goers], accepted[goers] = proposed[moved], offered[moved], True
+    path.step(kind, accepted, places, density)
+
+
+def _independent_steps(
+    move: AmongPlaces,
+    kind: int,
+    path: _Path,
+    proposed: Sequence[FloatArray],
+    chances: Sequence[FloatArray],
+) -> Generator[FloatArray, FloatArray, None]:
+    """Make steps of an independence proposal, whose places are known already."""
+    walkers, free = path.here.shape
+    places = np.concatenate([path.here, *proposed])
+    weight = -move.proposal.log_density(places)
+    offered = yield places[walkers:]
+    here = path.density + weight[:walkers]
+    shape = (len(chances), move.places, walkers)
+    weight = (offered + weight[walkers:]).reshape(shape)
+    offered, places = offered.reshape(shape), places[walkers:].reshape(*shape, free)
+    rows = np.arange(walkers)
+    for step, chance in enumerate(chances):
+        which, accepted, log_weight = move.choose(here, weight[step], chance)
+        path.step(kind, accepted, places[step, which, rows], offered[step, which, rows])
+        np.copyto(here, log_weight, where=accepted)
+
+
+def _words(random: np.random.RandomState) -> NDArray[np.uint32]:
+    """Return a generator's state, (628,): 624 words, position, and the normal number it kept."""
+    _, words, position, has_normal, normal = random.get_state()
     position_and_flag = np.array([position, has_normal], dtype=np.uint32)
     return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
 

@@ -12,16 +12,6 @@ from bwbayes.errors import InputError
 
 __all__ = ["SamplingPlan", "best_places", "best_together"]
 
-# Walkers times samples below which a step is mostly Python's work, and below which half is.
-LIGHT = 1 << 16
-MEDIUM = 1 << 18
-
-# Walkers times samples times places of a step on a short record. Its pilot is twice as long: in 50
-# steps it may miss a part of so wide a posterior. On 20 readings with 64 walkers, that is with six
-# places, ten fits took 2.2 to 4.0 CPU s, and six of 300 readings 2.2 to 5.3 s; with fewer places,
-# or half the pilot, one in ten took more than 11 s.
-CHEAP = 1 << 13
-
 
 @dataclass(frozen=True)
 class SamplingPlan:
@@ -72,13 +62,14 @@ def best_together(ensembles: int, walkers: int, samples: int) -> int:
     threads, where the models take as long as Python does. Else each by itself.
     """
     size = walkers * samples
-    return ensembles if size <= LIGHT else ensembles // 2 if size <= MEDIUM else 1
+    return ensembles if size <= 1 << 16 else ensembles // 2 if size <= 1 << 18 else 1
 
 
 def best_places(walkers: int, samples: int) -> int:
     """Return how many places a step of the mixture has to choose from, on so many samples.
 
-    Several where readings are few: they tell little, and the mixture covers so wide and curved a
-    posterior badly.
+    Several where readings are few, six of 20 readings with 64 walkers: they tell little, and the
+    mixture covers so wide and curved a posterior badly. Ten such fits took 2.2 to 4.0 CPU s; with
+    fewer places one in ten took more than 11 s.
     """
-    return max(1, CHEAP // (walkers * samples))
+    return max(1, (1 << 13) // (walkers * samples))

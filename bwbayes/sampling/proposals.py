@@ -11,156 +11,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy
+from scipy.special import gammaln
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
-__all__ = ["COMPONENTS", "Proposal", "StudentMixture", "StudentProposal"]
+__all__ = ["StudentMixture"]
 
 # Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
 CUTS = (0.5, 0.85)
 PARTS = len(CUTS) + 1
-COMPONENTS = PARTS + 1  # at most: one more for the draws that these cover worst
-
-# Which part of the draws that is, and how often it proposes.
-WORST = 0.02
-WORST_SHARE = 0.1
-
-# Part of a first guess that goes to all components alike.
-LEAST_GUESS = 0.25
-
-# Rounds of the fit: first with so few of the draws that they cost little, then with all.
-ROUGH_ROUNDS = 25
-ROUGH_DRAWS = 1024
-ROUNDS = 5
-
-# Part of the covariance of all components together that each keeps: the draws of a pilot are few.
-# That of all draws would be far too wide where components are modes apart.
-SHRINKAGE = 0.1
-
-# Share of every draw that every component keeps, so that none starves.
-LEAST_SHARE = 1e-3
-
-
-@runtime_checkable
-class Proposal(Protocol):
-    """An independence proposal, as ``emcee.moves.MHMove`` takes it."""
-
-    def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
-
-    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
-        """Draw coordinates (count, free) with emcee's generator."""
-
-    def __call__(
-        self, coordinates: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose for ``coordinates`` (walkers, free): places and log q(old) − log q(new)."""
 
 
 @dataclass(frozen=True)
-class StudentProposal:
-    """A multivariate Student-t distribution as an independence proposal.
+class StudentMixture:
+    """A mixture of multivariate Student-t distributions as an independence proposal.
 
-    With ν degrees of freedom, center μ and covariance-like scale LLᵀ over p coordinates,
+    Over p coordinates z, straight ones if there is a bend, with ν degrees of freedom,
 
-        log q(x) = −(ν + p)/2 log(1 + |L⁻¹(x − μ)|² / ν) − log det L + constant.
+        log q = log Σ wⱼ |Lⱼ|⁻¹ (1 + |Lⱼ⁻¹(z − μⱼ)|² / ν)^(−(ν + p)/2) + constant.
 
     Parameters
     ----------
-    center
-        μ, (free,).
-    factor
-        L, lower triangular, (free, free).
+    weights
+        wⱼ, (components,), adding up to one.
+    centers
+        μⱼ, (components, free).
+    factors
+        Lⱼ, lower triangular, (components, free, free).
+    bend
+        What makes the coordinates in which they are straight; None for the coordinates themselves.
     freedom
         ν; small enough for tails heavier than the posterior's.
     """
 
     __repr__ = brief
 
-    center: FloatArray
-    factor: FloatArray
-    freedom: float = 6.0
-
-    @classmethod
-    def fitted(cls, draws: FloatArray) -> StudentProposal:
-        """Fit to draws (count, free) by their mean and covariance.
-
-        The scale is the covariance itself, a little wider than the t of that covariance: a
-        proposal that is too wide costs acceptance, one that is too narrow costs mixing.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            The draws do not span the space.
-        """
-        _require_spread(draws)
-        return cls(
-            np.mean(draws, axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(draws, rowvar=False)))
-        )
-
-    def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
-        power = 0.5 * (self.freedom + self.center.size)
-        tails = power * np.log1p(self.squares(coordinates) / self.freedom)
-        density: FloatArray = -tails - self.log_volume
-        return density
-
-    def squares(self, coordinates: FloatArray) -> FloatArray:
-        """Squared distances |L⁻¹(x − μ)|² (..., count) of coordinates (..., count, free) from μ."""
-        white = (coordinates - self.center) @ self._whitening
-        distances: FloatArray = np.einsum("...j,...j->...", white, white)
-        return distances
-
-    @cached_property
-    def log_volume(self) -> float:
-        """The log determinant of L."""
-        return float(np.sum(np.log(np.diag(self.factor))))
-
-    @cached_property
-    def _whitening(self) -> FloatArray:
-        # Its transpose times a row is one product for all coordinates.
-        return np.ascontiguousarray(np.linalg.inv(self.factor).T)
-
-    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
-        """Draw coordinates (count, free) with emcee's generator."""
-        normal = random.standard_normal((count, self.center.size))
-        spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
-        coordinates: FloatArray = self.center + (normal * spread[:, np.newaxis]) @ self.factor.T
-        return coordinates
-
-    def __call__(
-        self, coordinates: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
-        proposed = self.draw(random, coordinates.shape[0])
-        return proposed, self.log_density(coordinates) - self.log_density(proposed)
-
-
-@dataclass(frozen=True)
-class StudentMixture:
-    """A mixture of Student-t distributions, log q(x) = log Σ wⱼ qⱼ(x).
-
-    Parameters
-    ----------
-    weights
-        wⱼ, (components,), adding up to one.
-    components
-        The distributions, of one number of degrees of freedom.
-    bend
-        What makes the coordinates in which they are straight; None for the coordinates themselves.
-    """
-
-    __repr__ = brief
-
     weights: FloatArray
-    components: tuple[StudentProposal, ...]
+    centers: FloatArray
+    factors: FloatArray
     bend: QuadraticMap | None = None
+    freedom: float = 6.0
 
     @classmethod
     def fitted(cls, draws: FloatArray, log_density: FloatArray | None = None) -> StudentMixture:
@@ -179,11 +74,12 @@ class StudentMixture:
         bend = QuadraticMap.fitted(draws)
         if bend is not None:
             draws = bend.to_straight(draws)
-        sample = subsample(draws, ROUGH_DRAWS)
+        # First with so few of the draws that they cost little, then with all.
+        sample = subsample(draws, 1024)
         mixture = _first_cut(sample)
-        for _ in range(ROUGH_ROUNDS):
+        for _ in range(25):
             mixture = mixture._fitted_on(sample)
-        for _ in range(ROUNDS):
+        for _ in range(5):
             mixture = mixture._fitted_on(draws)
         if log_density is not None:
             mixture = mixture._with_worst(draws, log_density - mixture.log_density(draws))
@@ -199,72 +95,78 @@ class StudentMixture:
         component gets less than a twelfth: the shares of modes are a guess.
         """
         modes = np.arange(PARTS) % len(optima)
-        factors = np.linalg.cholesky(covariances)
-        parts = (
-            StudentProposal(optima[mode], (1 + i // len(optima)) * factors[mode])
-            for i, mode in enumerate(modes)
-        )
+        widths = 1.0 + np.arange(PARTS) // len(optima)
+        factors = widths[:, np.newaxis, np.newaxis] * np.linalg.cholesky(covariances)[modes]
         split_shares = shares[modes] / np.bincount(modes)[modes]
-        weights = (1 - LEAST_GUESS) * split_shares / np.sum(split_shares) + LEAST_GUESS / PARTS
-        return cls(weights, tuple(parts))
+        weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / PARTS
+        return cls(weights, optima[modes], factors)
 
     @cached_property
-    def _ends(self) -> FloatArray:
-        """Where each component's part of the numbers from 0 to 1 ends."""
-        ends = np.cumsum(self.weights)
-        return np.asarray(ends / ends[-1])
+    def _whitening(self) -> FloatArray:
+        # Its transpose times a row is one product for all coordinates.
+        return np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
 
     @cached_property
-    def _places(self) -> tuple[FloatArray, FloatArray]:
-        """The components' centers (components, free) and factors (components, free, free)."""
-        centers, factors = zip(*((c.center, c.factor) for c in self.components), strict=True)
-        return np.stack(centers), np.stack(factors)
+    def _log_volumes(self) -> FloatArray:
+        """The log determinants of the factors, (components,)."""
+        return np.sum(np.log(np.diagonal(self.factors, axis1=1, axis2=2)), axis=1)
 
-    def _fitted_on(self, draws: FloatArray) -> StudentMixture:
-        """Take a round of expectation maximization."""
-        parts = [_gaussian(component, draws) for component in self.components]
-        logs = np.log(self.weights)[:, np.newaxis] + np.stack(parts)
-        density = np.exp(logs - np.max(logs, axis=0))
-        return _of_shares(draws, _kept_alive(density / np.sum(density, axis=0)))
+    @cached_property
+    def _log_scales(self) -> FloatArray:
+        """Log wⱼ / |Lⱼ| and the constant of a Student-t distribution, (components,)."""
+        freedom, free = self.freedom, self.centers.shape[1]
+        constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)
+        constant -= 0.5 * free * np.log(freedom * np.pi)
+        return np.asarray(np.log(self.weights) - self._log_volumes + constant)
 
-    def _with_worst(self, draws: FloatArray, log_ratio: FloatArray) -> StudentMixture:
-        """Add the component of the draws (count, free) with the largest log p − log q (count,)."""
-        worst = log_ratio >= np.quantile(log_ratio, 1 - WORST)
-        component = _components(draws, _kept_alive(np.stack([worst, ~worst])))[0]
-        weights = np.append((1 - WORST_SHARE) * self.weights, WORST_SHARE)
-        return StudentMixture(weights, (*self.components, component))
+    def squares(self, straight: FloatArray) -> FloatArray:
+        """Squared distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
+        pairs = zip(self.centers, self._whitening, strict=True)
+        white = [(straight - center) @ whitening for center, whitening in pairs]
+        return np.stack([np.einsum("...j,...j->...", z, z) for z in white])
+
+    def log_parts(self, squares: FloatArray) -> FloatArray:
+        """Log densities times weights, of :meth:`squares` and shaped alike."""
+        power = 0.5 * (self.freedom + self.centers.shape[1])
+        scales = self._log_scales.reshape(-1, *[1] * (squares.ndim - 1))
+        parts: FloatArray = scales - power * np.log1p(squares / self.freedom)
+        return parts
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (..., count) at coordinates (..., count, free), up to a constant."""
+        """Log density (..., count) at coordinates (..., count, free)."""
         lost = 0.0
         if self.bend is not None:
             coordinates, lost = self.bend.to_straight(coordinates), self.bend.log_volume
-        parts = [component.log_density(coordinates) for component in self.components]
-        logs = np.stack(
-            [log + values for log, values in zip(np.log(self.weights), parts, strict=True)]
-        )
-        density: FloatArray = np.logaddexp.reduce(logs) - lost
+        density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(coordinates))) - lost
         return density
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
         # As ``random.choice`` does with these weights, without its checks of them.
-        chosen = self._ends.searchsorted(random.random_sample(count), side="right")
-        centers, factors = self._places
-        freedom = self.components[0].freedom
-        normal = random.standard_normal((count, centers.shape[1]))
-        spread = np.sqrt(freedom / random.chisquare(freedom, count))
-        away = (factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
-        drawn: FloatArray = centers[chosen] + away
+        ends = np.cumsum(self.weights)
+        chosen = (ends / ends[-1]).searchsorted(random.random_sample(count), side="right")
+        normal = random.standard_normal((count, self.centers.shape[1]))
+        spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
+        steps = (self.factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
+        drawn: FloatArray = self.centers[chosen] + steps
         return drawn if self.bend is None else self.bend.to_curved(drawn)
 
-    def __call__(
-        self, coordinates: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose, as ``emcee.moves.MHMove`` asks: places and log q(old) − log q(new)."""
-        proposed = self.draw(random, coordinates.shape[0])
-        old, new = np.split(self.log_density(np.concatenate([coordinates, proposed])), 2)
-        return proposed, old - new
+    def _fitted_on(self, draws: FloatArray) -> StudentMixture:
+        """Take a round of expectation maximization."""
+        logs = np.log(self.weights) - self._log_volumes
+        logs = logs[:, np.newaxis] - 0.5 * self.squares(draws)
+        density = np.exp(logs - np.max(logs, axis=0))
+        return _of_shares(draws, density / np.sum(density, axis=0))
+
+    def _with_worst(self, draws: FloatArray, log_ratio: FloatArray) -> StudentMixture:
+        """Add the component of the 2 % of draws with the largest log p − log q (count,)."""
+        worst = log_ratio >= np.quantile(log_ratio, 0.98)
+        added = _of_shares(draws, np.stack([worst, ~worst]))
+        return StudentMixture(
+            np.append(0.9 * self.weights, 0.1),
+            np.concatenate([self.centers, added.centers[:1]]),
+            np.concatenate([self.factors, added.factors[:1]]),
+        )
 
 
 def _require_spread(draws: FloatArray) -> None:
@@ -284,34 +186,21 @@ def _first_cut(draws: FloatArray) -> StudentMixture:
     # Ranks from the body of the distribution to its longer tail.
     along = draws[:, axis] * (1 if shape[axis] >= 0 else -1)
     start = np.searchsorted(np.quantile(along, CUTS), along)
-    return _of_shares(draws, _kept_alive(np.equal.outer(np.arange(PARTS), start)))
+    return _of_shares(draws, np.equal.outer(np.arange(PARTS), start))
 
 
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:
-    """Return the mixture whose components have these shares (components, count) of draws."""
-    return StudentMixture(share.mean(axis=1), tuple(_components(draws, share)))
+    """Return the mixture whose components have these shares (components, count) of draws.
 
-
-def _kept_alive(share: FloatArray) -> FloatArray:
-    """Give every component something of each draw; its weight says how little it matters."""
-    raised: FloatArray = (share + LEAST_SHARE) / (1 + LEAST_SHARE * len(share))
-    return raised
-
-
-def _components(draws: FloatArray, share: FloatArray) -> list[StudentProposal]:
-    """Weighted means and covariances, one component for each row of ``share``."""
+    Every component gets a thousandth of each draw, so that none starves, and a tenth of the mean
+    covariance: the draws are few. That of all draws would be far too wide where components are
+    modes apart.
+    """
+    share = (share + 1e-3) / (1 + 1e-3 * len(share))
+    weights = share.mean(axis=1)
     parts = share / share.sum(axis=1, keepdims=True)
     centers = parts @ draws
     deviations = [(draws - center).T for center in centers]
-    covariances = np.stack(
-        [(weights * away) @ away.T for weights, away in zip(parts, deviations, strict=True)]
-    )
-    together = np.average(covariances, axis=0, weights=share.mean(axis=1))
-    factors = np.linalg.cholesky((1 - SHRINKAGE) * covariances + SHRINKAGE * together)
-    return [StudentProposal(*pair) for pair in zip(centers, factors, strict=True)]
-
-
-def _gaussian(component: StudentProposal, draws: FloatArray) -> FloatArray:
-    """Log density of the normal distribution with a component's center and scale."""
-    density: FloatArray = -0.5 * component.squares(draws) - component.log_volume
-    return density
+    covariances = np.stack([(p * d) @ d.T for p, d in zip(parts, deviations, strict=True)])
+    together = np.average(covariances, axis=0, weights=weights)
+    return StudentMixture(weights, centers, np.linalg.cholesky(0.9 * covariances + 0.1 * together))

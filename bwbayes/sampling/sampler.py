@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,15 +36,20 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
+from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning
 from bwbayes.sampling.diagnostics import (
+    LARGEST_PARETO_K,
     LENGTH,
     Check,
+    Outcome,
+    check,
     nested_rhat,
     pareto_k,
+    stuck,
+    times,
 )
-from bwbayes.sampling.ensemble import advance_together, start
-from bwbayes.sampling.monitor import ConvergenceMonitor, Outcome
+from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import pilot_moves, sampling_moves, spreading_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
@@ -55,21 +60,9 @@ __all__ = [
     "sample",
 ]
 
-# Nested R-hat of the pilot's second half below which its ensembles have met. After so
-# many steps it is enough if each stays where it is: in modes far apart differential evolution would
-# keep them for ever, and a proposal fitted to all of them will not.
-PILOT_RHAT = 1.1
-APART_STEPS = 500
-
-# Blocks of the tuning, and how many it may become while walkers take less than this part of the
-# places that are proposed to them: four times as many where they hardly take any.
+# Blocks of the first round of the tuning, and part of the proposed places that walkers must take.
 TUNING_BLOCKS = 2
-MOST_TUNING_BLOCKS = 16
 TAKEN = 0.5
-HARDLY_TAKEN = 0.25
-
-# The part of the budget in which a proposal that does not cover its draws is followed by another.
-REFITTING = 0.5
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing. A proposal is fitted again to so many more at least.
@@ -77,11 +70,11 @@ FIRST_CHECK = 3
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
-# How much longer a chain is at the second of the two checks that it must pass: checks of nearly
-# the same draws would be one. For the first, a part of the draws that are to be reached is enough:
-# so that they are reached at the second.
-APART = 1.2
+# Of the two checks that a chain must pass: for the first, this part of the draws that are to be
+# reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
+# would be one.
 FIRST_PART = 0.5
+APART = 1.2
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
 Watcher = Callable[[Phase, Check | None], None]
@@ -120,59 +113,158 @@ def sample(
     The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of
     the result.
     """
-    while not chain.blocks("tuning") and not _pilot_done(posterior, plan, chain):
-        _extend(posterior, plan, chain, "pilot", executor, watcher)
-    if not chain.history("sampling"):
-        _tune(posterior, plan, chain, executor, watcher)
-    elif chain.refitted and chain.refit is None:
-        chain.refit = _refit(chain, chain.refitted)  # that of a file
-    while (outcome := _sampled(posterior, plan, chain, executor, watcher)) is None:
-        blocks = len(chain.history("sampling"))
-        early = blocks * plan.block <= REFITTING * plan.most_steps
-        chain.fall_back(blocks, _refit(chain, blocks) if early else None)
-    return replace(outcome, remarks=(*_remarks(chain), *_thinned(chain)))
+    return _Sampling(posterior, plan, chain, executor, watcher).run()
 
 
-def _sampled(
-    posterior: Posterior, plan: SamplingPlan, chain: Chain, executor: Executor, watcher: Watcher
-) -> Outcome | None:
-    """Sample to the end, or until the proposal turns out not to cover the draws: then None.
+@dataclass(frozen=True)
+class _Sampling:
+    """A chain on its way to convergence."""
 
-    A chain that has blocks already is judged where it was, or would have been, on its way.
+    posterior: Posterior
+    plan: SamplingPlan
+    chain: Chain
+    executor: Executor
+    watcher: Watcher
+
+    def run(self) -> Outcome:
+        plan, chain = self.plan, self.chain
+        while not chain.blocks("tuning") and not self._pilot_is_done():
+            self._extend("pilot")
+        if not chain.history("sampling"):
+            self._tune()
+        while (outcome := self._sampled()) is None:
+            blocks = chain.history("sampling")
+            early = len(blocks) * plan.block <= plan.most_steps / 2
+            chain.fall_back(len(blocks), _refit(chain) if early else None)
+        return replace(outcome, remarks=_remarks(chain))
+
+    def _extend(self, phase: Phase) -> None:
+        """Advance every ensemble by a block, wherever the executor likes."""
+        plan, chain = self.plan, self.chain
+        proposal, ends = chain.proposal_in_use(phase), chain.ends
+        spreads = phase == "tuning" and chain.blocks(phase) >= TUNING_BLOCKS
+        make = pilot_moves if phase == "pilot" else spreading_moves if spreads else sampling_moves
+        futures = []
+        for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
+            # Moves of its own for each: some of emcee's write to themselves.
+            moves = [make(proposal, plan.places) for _ in group]
+            futures.append(self.executor.submit(advance, self.posterior, moves, group, plan.block))
+        blocks: list[Block] = []
+        for future in futures:
+            for block in future.result():
+                blocks.append(block)
+                self.watcher(phase, None)
+        chain.append(phase, blocks)
+
+    def _pilot_is_done(self) -> bool:
+        """Tell whether the ensembles have met.
+
+        After 500 steps it is enough if each stays where it is: in modes far apart differential
+        evolution would keep them for ever, and a proposal fitted to all of them will not.
+        """
+        plan, steps = self.plan, self.chain.steps("pilot")
+        if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
+            return steps >= plan.most_pilot_steps
+        half = constrain_steps(self.posterior, self.chain.coordinates("pilot")[steps // 2 :])
+        if _agree(half):
+            return True
+        middle = len(half) // 2
+        return steps >= 500 and all(
+            _agree(np.stack([draws[:middle], draws[len(draws) - middle :]], axis=1))
+            for draws in np.moveaxis(half, 1, 0)
+        )
+
+    def _tune(self) -> None:
+        """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
+
+        At most 16 blocks, or 64 where walkers hardly take any place. A run that goes on within a
+        round fits again to what that round had begun with.
+        """
+        plan, chain = self.plan, self.chain
+        proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
+        begin, end, rate = 0, TUNING_BLOCKS, 0.0
+        while rate < TAKEN and end <= (16 if rate > 0.25 else 64):
+            if chain.blocks("tuning") < end:
+                chain.freeze("tuning", proposal)
+            while chain.blocks("tuning") < end:
+                self._extend("tuning")
+            proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
+            rate = _taken(chain.history("tuning")[begin:end])
+            begin, end = end, 2 * end
+        chain.freeze("sampling", proposal)
+
+    def _sampled(self) -> Outcome | None:
+        """Sample to the end, or until the proposal turns out not to cover the draws: then None.
+
+        A chain that has blocks already is judged where it was, or would have been, on its way.
+        """
+        plan, chain = self.plan, self.chain
+        # A chain may be longer than its budget, if that was made smaller.
+        budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+        blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
+        while True:
+            blocks = min(blocks, budget)
+            while chain.blocks("sampling") < blocks:
+                self._extend("sampling")
+            judgment = _Judgment(self.posterior, plan, chain, blocks)
+            required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
+            if required > blocks and blocks < budget:
+                blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
+                continue
+            latest = judgment.check()
+            self.watcher("sampling", latest)
+            missing = latest.shortcomings(plan.ess)
+            at_end = blocks == chain.blocks("sampling")
+            # One whose target was made smaller has converged before its end.
+            done = not missing and 0 < APART * passed <= blocks
+            if done and at_end:
+                return Outcome(True, "converged on two checks in a row", latest)
+            if blocks == budget:
+                why = "; ".join(missing) or "only the last check passed"
+                return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", latest)
+            fitted_to = chain.set_aside if chain.refit else 0
+            enough = chain.set_aside + blocks >= LEAST_STRETCH * fitted_to
+            if not latest.covered and at_end and enough:
+                return None
+            first = not latest.shortcomings(plan.ess, FIRST_PART)
+            passed = (passed or blocks) if first else 0
+            blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, latest)
+
+
+class _Judgment:
+    """What the first ``blocks`` blocks that count tell; what costs little is worked out at once.
+
+    Of many draws every second step is taken, or every fourth, and so on, to bound the memory; but
+    far more draws than are to be effective, so that none is missed.
     """
-    monitor = ConvergenceMonitor(posterior, chain, plan.ess)
-    # A chain may be longer than its budget, if that was made smaller.
-    budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
-    blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
-    while True:
-        blocks = min(blocks, budget)
-        while chain.blocks("sampling") < blocks:
-            _extend(posterior, plan, chain, "sampling", executor, watcher)
-        # Mostly the last thing that is missing, and cheap to see.
-        required = monitor.blocks_needed(blocks, 1.0 if passed else FIRST_PART)
-        if required > blocks and blocks < budget:
-            blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
-            continue
-        now = monitor(blocks)
-        watcher("sampling", now)
-        missing = now.shortcomings(plan.ess)
-        at_end = blocks == chain.blocks("sampling")
-        # One whose target was made smaller has converged before its end.
-        done = not missing and 0 < APART * passed <= blocks
-        if done and at_end:
-            return Outcome(True, "converged on two checks in a row", now)
-        if blocks == budget:
-            why = "; ".join(missing) or "only the last check passed"
-            return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", now)
-        if (
-            not now.covered
-            and at_end
-            and chain.set_aside + blocks >= LEAST_STRETCH * chain.refitted
-        ):
-            return None
-        first = not now.shortcomings(plan.ess, FIRST_PART)
-        passed = (passed or blocks) if first else 0
-        blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, now)
+
+    def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> None:
+        self.blocks, self.block = blocks, plan.block
+        most = max(chains.MOST_DRAWS, round(4 * plan.ess))
+        self.thin = thinning(chain.draws("sampling", blocks), most)
+        coordinates = chain.coordinates("sampling", self.thin, blocks)
+        self.accepted = chain.accepted("sampling")[:blocks]
+        self.draws = constrain_steps(posterior, coordinates)
+        self.times = times(self.draws, self.thin)
+        self.pareto_k: float | None = None
+        if (proposal := chain.proposal_in_use("sampling")) is not None:
+            density = chain.log_density("sampling", self.thin, blocks)
+            self.pareto_k = pareto_k((density - proposal.log_density(coordinates)).ravel())
+
+    def blocks_needed(self, fraction: float) -> float:
+        """Return how many blocks make a ``fraction`` of the autocorrelation times that are needed.
+
+        Mostly the last thing that is missing, and cheap to see. More than these if a walker is
+        stuck in them; none if the proposal does not cover them, because more would not help.
+        """
+        if self.pareto_k is not None and not self.pareto_k < LARGEST_PARETO_K:
+            return 0.0
+        more = self.blocks + 1.0 if stuck(self.accepted, self.block, self.times) else 0.0
+        return max(more, fraction * LENGTH * float(np.max(self.times)) / self.block)
+
+    def check(self) -> Check:
+        """Judge everything, which costs as much as many steps."""
+        return check(self.draws, self.accepted, self.block, self.thin, self.times, self.pareto_k)
 
 
 def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> int:
@@ -193,111 +285,14 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
 
 
-def _refit(chain: Chain, blocks: int) -> StudentMixture | None:
-    """Fit a proposal to the first blocks of the sampling, whether they count or not."""
-    fitted_to = Chain(chain.starts)
-    for block in chain.history("sampling")[:blocks]:
-        fitted_to.append("sampling", block)
-    return _fitted(fitted_to, "sampling", slice(None), thinning(fitted_to.draws("sampling")))
-
-
-def _remarks(chain: Chain) -> tuple[str, ...]:
-    """Say what a user should know of the moves."""
-    alone = "differential evolution and snooker moves alone made the draws that count"
-    first = chain.proposals["sampling"]
-    if first is None:
-        return (f"no proposal could be fitted to the draws of the tuning: {alone}",)
-    if not chain.set_aside:
-        return ()
-    aside = chain.history("sampling")[: chain.set_aside]
-    flat = [block for blocks in aside for block in blocks]
-    coordinates = np.concatenate([b.coordinates.reshape(-1, b.coordinates.shape[-1]) for b in flat])
-    density = np.concatenate([b.log_density.ravel() for b in flat])
-    shape = pareto_k(density - first.log_density(coordinates))
-    steps = sum(blocks[0].log_density.shape[0] for blocks in aside)
-    followed = "one that was fitted to them made the draws that count"
-    return (
-        f"the proposal did not cover the first {steps} steps (Pareto k {shape:.2f}): they are set "
-        f"aside, and {followed if chain.refitted == chain.set_aside else alone}",
-    )
-
-
-def _thinned(chain: Chain) -> tuple[str, ...]:
-    """Say that a long chain is not used as a whole."""
-    thin = thinning(chain.draws("sampling"))
-    if thin == 1:
-        return ()
-    return (f"of {chain.steps('sampling')} steps one in {thin} is reported, to limit the memory",)
-
-
-def _extend(
-    posterior: Posterior,
-    plan: SamplingPlan,
-    chain: Chain,
-    phase: Phase,
-    executor: Executor,
-    watcher: Watcher,
-) -> None:
-    """Advance every ensemble by a block, wherever the executor likes."""
-    proposal, ends = chain.proposal_in_use(phase), chain.ends
-    spreads = phase == "tuning" and chain.blocks(phase) >= TUNING_BLOCKS
-    make = pilot_moves if phase == "pilot" else spreading_moves if spreads else sampling_moves
-    futures = []
-    for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
-        # Moves of its own for each: some of emcee's write to themselves.
-        moves = [make(proposal, plan.places) for _ in group]
-        futures.append(executor.submit(advance_together, posterior, moves, group, plan.block))
-    blocks: list[Block] = []
-    for future in futures:
-        for block in future.result():
-            blocks.append(block)
-            watcher(phase, None)
-    chain.append(phase, blocks)
-
-
-def _pilot_done(posterior: Posterior, plan: SamplingPlan, chain: Chain) -> bool:
-    steps = chain.steps("pilot")
-    if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
-        return steps >= plan.most_pilot_steps
-    second_half = constrain_steps(posterior, chain.coordinates("pilot")[steps // 2 :])
-    if (nested_rhat(second_half) < PILOT_RHAT).all():
-        return True
-    return steps >= APART_STEPS and all(
-        _is_stationary(draws) for draws in np.moveaxis(second_half, 1, 0)
-    )
-
-
-def _is_stationary(draws: FloatArray) -> bool:
-    """Tell whether the halves of an ensemble's draws (steps, walkers, free) agree."""
-    half = len(draws) // 2
-    halves = np.stack([draws[:half], draws[len(draws) - half :]], axis=1)
-    return bool((nested_rhat(halves) < PILOT_RHAT).all())
-
-
-def _tune(
-    posterior: Posterior, plan: SamplingPlan, chain: Chain, executor: Executor, watcher: Watcher
-) -> None:
-    """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last of all.
-
-    A run that goes on within a round fits again to what that round had begun with.
-    """
-    proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
-    begin, end, rate = 0, TUNING_BLOCKS, 0.0
-    while rate < TAKEN and end <= (1 if rate > HARDLY_TAKEN else 4) * MOST_TUNING_BLOCKS:
-        if chain.blocks("tuning") < end:
-            chain.freeze("tuning", proposal)
-        while chain.blocks("tuning") < end:
-            _extend(posterior, plan, chain, "tuning", executor, watcher)
-        proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
-        rate = _taken(chain.history("tuning")[begin:end])
-        begin, end = end, 2 * end
-    chain.freeze("sampling", proposal)
+def _agree(draws: FloatArray) -> bool:
+    """Tell whether ensembles of a pilot (steps, ensembles, walkers, free) are at one place."""
+    return bool((nested_rhat(draws) < 1.1).all())
 
 
 def _taken(blocks: Sequence[Sequence[Block]]) -> float:
     """Return which part of the places that the proposal proposed was taken; 1 without one."""
     independent = MOVES.index("mixture")
-    # Blocks count the moves that were offered to them, and blocks from a file all that there are.
     counts = [block.moves[independent:][:1] for ensembles in blocks for block in ensembles]
     proposed, accepted = np.sum(np.concatenate(counts), axis=0)
     return float(accepted / proposed) if proposed else 1.0
@@ -311,3 +306,35 @@ def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentM
         return StudentMixture.fitted(draws.reshape(-1, draws.shape[-1]), log_density.ravel())
     except np.linalg.LinAlgError:
         return None
+
+
+def _refit(chain: Chain) -> StudentMixture | None:
+    """Fit a proposal to all blocks of the sampling, whether they count or not."""
+    fitted_to = Chain(chain.starts)
+    for blocks in chain.history("sampling"):
+        fitted_to.append("sampling", blocks)
+    return _fitted(fitted_to, "sampling", slice(None), thinning(fitted_to.draws("sampling")))
+
+
+def _remarks(chain: Chain) -> tuple[str, ...]:
+    """Say what a user should know of the moves, and that a long chain is not used as a whole."""
+    remarks = []
+    alone = "differential evolution and snooker moves alone made the draws that count"
+    first = chain.proposals["sampling"]
+    if first is None:
+        remarks.append(f"no proposal could be fitted to the draws of the tuning: {alone}")
+    elif chain.set_aside:
+        flat = [b for blocks in chain.history("sampling")[: chain.set_aside] for b in blocks]
+        log_weights = [b.log_density - first.log_density(b.coordinates) for b in flat]
+        shape = pareto_k(np.concatenate([weights.ravel() for weights in log_weights]))
+        steps = sum(len(block.log_density) for block in flat) // len(chain.starts)
+        followed = "one that was fitted to them made the draws that count"
+        remarks.append(
+            f"the proposal did not cover the first {steps} steps (Pareto k {shape:.2f}): they are "
+            f"set aside, and {followed if chain.refit else alone}"
+        )
+    thin = thinning(chain.draws("sampling"))
+    if thin > 1:
+        steps = chain.steps("sampling")
+        remarks.append(f"of {steps} steps one in {thin} is reported, to limit the memory")
+    return tuple(remarks)

@@ -19,8 +19,7 @@ from bwbayes.report.run import run_report
 from bwbayes.results.bands import KINDS, LEVELS, Bands
 from bwbayes.results.result import Result, summary
 from bwbayes.results.scores import Scores
-from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Check, Outcome
 from tests.declared import declared
 
 

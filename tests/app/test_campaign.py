@@ -169,7 +169,7 @@ def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_pa
     bw.write_record(record(18), records / "s001.csv")
     shutil.copyfile(records / "s000.csv", records / "broken.csv")
     (records / "s002.csv").unlink()
-    before = {path: path.stat().st_mtime_ns for path in folder.path.glob("records/*/chain.h5")}
+    before = {path: path.stat().st_mtime_ns for path in folder.path.glob("records/*/chain")}
     second = ended(folder)
     assert 0 == second.exit_status
     assert ["broken", "new", "s000", "s001"] == [row.name for row in second.rows]

@@ -388,8 +388,9 @@ def test_existing_run_is_kept_with_a_hint(bwbayes: Type, tmp_path: Path) -> None
     assert_one_line(bwbayes("predict", "results/small", "--signal", "step10"), "chain")
     for ess in ("nan", "inf"):
         assert_one_line(bwbayes("resume", "results/small", "--ess", ess), "ess")
-    folder.chain.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(1000))
-    assert_one_line(bwbayes("resume", "results/small"), "chain.h5: the chain cannot be read")
+    folder.chain.mkdir()
+    (folder.chain / "start.npz").write_bytes(b"PK" + bytes(1000))
+    assert_one_line(bwbayes("resume", "results/small"), "chain: the chain cannot be read")
     assert before == folder.config.read_bytes()
 
 

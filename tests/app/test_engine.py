@@ -6,7 +6,6 @@ import json
 from io import StringIO
 from pathlib import Path
 
-import h5py
 import pytest
 from rich.console import Console
 
@@ -21,9 +20,9 @@ from tests.app import small
 
 def test_chain_file_and_summary_name_the_engine(run: Path) -> None:
     assert "numba" == load(RunFolder(run).config).sampling.engine
-    with h5py.File(RunFolder(run).chain) as file:
-        assert "numba" == file.attrs["engine"]
-        assert "numba" in json.loads(file.attrs["versions"])
+    attributes = ChainFile.read(RunFolder(run).chain).attributes()
+    assert "numba" == attributes["engine"]
+    assert "numba" in json.loads(str(attributes["versions"]))
     assert "numba" in small.numbers(run)["versions"]
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
+import numpy as np
 import pytest
 
 from bwbayes.app.commands.predict import predict
@@ -52,7 +52,7 @@ def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], obj
     with pytest.raises(InputError) as caught:
         use(copy)
     text = str(caught.value)
-    assert "chain.h5: parameters.d.prior was lognormal (" in text
+    assert "chain: parameters.d.prior was lognormal (" in text
     assert text.endswith("; undo the edit or start a new run")
 
 
@@ -81,8 +81,11 @@ def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key:
 def test_chain_without_a_fingerprint_is_refused(
     copy: RunFolder, use: Callable[[RunFolder], object]
 ) -> None:
-    with h5py.File(copy.chain, "r+") as file:
-        del file.attrs["posterior"]
+    with np.load(copy.chain / "start.npz") as file:
+        arrays = dict(file)
+    text = json.loads(str(arrays["text"]))
+    del text["attributes"]["posterior"]
+    np.savez(copy.chain / "start.npz", allow_pickle=False, **arrays | {"text": json.dumps(text)})
     with pytest.raises(InputError, match=r"does not say which priors .* start a new run"):
         use(copy)
 

@@ -116,7 +116,7 @@ def blocks(phase: Phase, count: int) -> Moment:
     """Return the moment when so many blocks of a phase are in the file."""
 
     def reached(folder: Path) -> bool:
-        path = folder / "chain.h5"
+        path = folder / "chain"
         try:
             return path.exists() and ChainFile.read(path).blocks(phase) >= count
         except InputError:  # replaced at this moment
@@ -198,7 +198,7 @@ def test_a_request_that_falls_into_a_callback_is_not_lost() -> None:
     [
         (signal.SIGTERM, False, soon_after(appears(".lock"))),
         (signal.SIGTERM, True, blocks("pilot", 1)),
-        (signal.SIGINT, True, soon_after(appears("chain.h5"))),
+        (signal.SIGINT, True, soon_after(appears("chain"))),
         (signal.SIGINT, True, blocks("pilot", 1)),
     ],
     ids=["terminate point fit", "terminate pilot", "Ctrl-C starting workers", "Ctrl-C pilot"],
@@ -266,7 +266,7 @@ def test_kills_at_random_end_in_the_same_bits(run: Path, tmp_path: Path) -> None
                 process.join()
                 assert process.exitcode in (0, -signal.SIGKILL)
                 kills += process.exitcode == -signal.SIGKILL
-            now = counted(tmp_path / "a/chain.h5")
+            now = counted(tmp_path / "a/chain")
             assert all(n >= b for n, b in zip(now, before, strict=True))
             before = now
         assert (0, "", "") == finished(tmp_path, *go_on(tmp_path))

@@ -38,7 +38,7 @@ LEVELS = {"50", "90", "95"}
 def test_run_leaves_these_files(run: Path) -> None:
     assert {
         "config.toml",
-        "chain.h5",
+        "chain",
         "posterior.nc",
         "summary.json",
         "bands.csv",
@@ -75,7 +75,7 @@ def test_summary_says_how_the_run_ended(run: Path) -> None:
 
 def test_summary_tells_the_acceptance_of_each_move_and_pareto_k(run: Path) -> None:
     answer = json.loads((run / "summary.json").read_text())
-    chain = ChainFile.read(run / "chain.h5")
+    chain = ChainFile.read(run / "chain")
     moves = chain.moves("sampling")
     assert {"differential evolution", "snooker", "mixture"} == set(moves)
     sampling = answer["sampling"]
@@ -204,7 +204,7 @@ def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: Run
     required = float(np.ceil(1.3 * fewest))
     result = resume(copy, small.quiet(), workers=1, ess=required)
     assert result.outcome.converged
-    first, longer = ChainFile.read(run / "chain.h5"), ChainFile.read(copy.chain)
+    first, longer = ChainFile.read(run / "chain"), ChainFile.read(copy.chain)
     steps = first.steps("sampling")
     assert steps < longer.steps("sampling")
     np.testing.assert_array_equal(

@@ -31,9 +31,8 @@ from bwbayes.app.running.workers import executor
 from bwbayes.inference import pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.diagnostics import TAIL, Check, as_chains
+from bwbayes.sampling.diagnostics import TAIL, Check, Outcome, as_chains
 from bwbayes.sampling.ensemble import advance
-from bwbayes.sampling.monitor import Outcome
 from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.benchmarks.cases import ENGINES, MODELS, Effort, on_engine, problem
@@ -104,7 +103,7 @@ def from_posterior(run: Run, walkers: int = WALKERS) -> list[EnsembleState]:
 
 def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
     """Move an ensemble by emcee's default move."""
-    return advance(posterior, [(StretchMove(), 1.0)], state, steps)
+    return advance(posterior, [[(StretchMove(), 1.0)]], [state], steps)[0]
 
 
 def sampling(effort: Effort) -> list[Table]:
@@ -174,7 +173,7 @@ def _thread_table(run: Run, rounds: int) -> Table:
     proposal = run.chain.proposal_in_use("sampling")
 
     def call() -> Block:
-        return advance(posterior, sampling_moves(proposal), state, THREAD_STEPS)
+        return advance(posterior, [sampling_moves(proposal)], [state], THREAD_STEPS)[0]
 
     with ThreadPoolExecutor(2) as pool:
         row = speed_up(call, pool, rounds)

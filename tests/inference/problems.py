@@ -32,7 +32,7 @@ from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.proposals import StudentProposal
+from bwbayes.sampling.proposals import StudentMixture
 from tests.declared import NAMES, context, declared, joint, parameter
 
 __all__ = [
@@ -50,6 +50,7 @@ __all__ = [
     "ring_bender",
     "short_posterior",
     "single",
+    "student",
     "target",
     "truth",
     "worst_score",
@@ -233,9 +234,14 @@ class Known:
     free: int
     log_density: Callable[[FloatArray], FloatArray]
     draw: Callable[[np.random.Generator, int], FloatArray]
-    proposal: StudentProposal
+    proposal: StudentMixture
     moments: FloatArray
     view: Callable[[FloatArray], FloatArray] = lambda x: x
+
+
+def student(center: FloatArray, factor: FloatArray) -> StudentMixture:
+    """Return one Student-t distribution as a proposal."""
+    return StudentMixture(np.ones(1), center[np.newaxis], factor[np.newaxis])
 
 
 def nine_dimensional_gaussian() -> Known:
@@ -245,7 +251,7 @@ def nine_dimensional_gaussian() -> Known:
         9,
         posterior.log_density,
         lambda generator, count: generator.standard_normal((count, 9)) @ factor.T,
-        StudentProposal(np.full(9, 0.1), factor),
+        student(np.full(9, 0.1), factor),
         np.array([[0.0] * 9, [1.0] * 9]),
     )
 
@@ -260,7 +266,7 @@ def banana() -> Known:
         first, second = generator.standard_normal((2, count))
         return np.stack([first, first**2 + 0.5 * second], axis=1)
 
-    proposal = StudentProposal(np.array([0.0, 1.0]), np.diag([1.2, 1.6]))
+    proposal = student(np.array([0.0, 1.0]), np.diag([1.2, 1.6]))
     return Known(2, log_density, draw, proposal, np.array([[0.0, 1.0], [1.0, 3.25]]))
 
 
@@ -274,7 +280,7 @@ def bounded() -> Known:
     def draw(generator: np.random.Generator, count: int) -> FloatArray:
         return np.stack([generator.exponential(size=count), generator.uniform(size=count)], axis=1)
 
-    proposal = StudentProposal(np.array([1.0, 0.5]), np.diag([1.0, 0.3]))
+    proposal = student(np.array([1.0, 0.5]), np.diag([1.0, 0.3]))
     return Known(2, log_density, draw, proposal, np.array([[1.0, 0.5], [2.0, 1 / 3]]))
 
 
@@ -292,7 +298,7 @@ def bimodal() -> Known:
         x[:, 0] = 0.7 * x[:, 0] + np.where(generator.uniform(size=count) < 0.3, -2, 2)
         return x
 
-    proposal = StudentProposal(np.zeros(3), np.diag([2.0, 1.0, 1.0]))
+    proposal = student(np.zeros(3), np.diag([2.0, 1.0, 1.0]))
     return Known(3, log_density, draw, proposal, np.array([[0.8, 0.0, 0.0], [4.49, 1.0, 1.0]]))
 
 
@@ -309,7 +315,7 @@ def wedge() -> Known:
         return np.stack([first, first - generator.exponential(0.02, count)], axis=1)
 
     # Shaped as the ridge: the second coordinate follows the first.
-    proposal = StudentProposal(np.array([1.0, 0.98]), np.array([[0.1, 0.0], [0.1, 0.02]]))
+    proposal = student(np.array([1.0, 0.98]), np.array([[0.1, 0.0], [0.1, 0.02]]))
     moments = np.array([[1.0, 0.02], [1.01, 8e-4]])
     return Known(2, log_density, draw, proposal, moments, _with_gap)
 
@@ -333,7 +339,7 @@ def far_modes() -> Known:
         x[:, 0] += np.where(generator.uniform(size=count) < 0.3, -10, 10)
         return x
 
-    proposal = StudentProposal(np.zeros(3), np.diag([10.0, 1.0, 1.0]))
+    proposal = student(np.zeros(3), np.diag([10.0, 1.0, 1.0]))
     return Known(3, log_density, draw, proposal, np.array([[4.0, 0.0, 0.0], [101.0, 1.0, 1.0]]))
 
 
@@ -362,7 +368,7 @@ def worst_score(
         flat = target(lambda x: np.zeros(len(x)), known.free)
         state = start(flat, replace(point, mode=origin), 0, walkers, generator)
         state = replace(state, coordinates=draws, log_density=known.log_density(draws))
-        chain = known.view(advance(posterior, moves, state, steps).coordinates)
+        chain = known.view(advance(posterior, [moves], [state], steps)[0].coordinates)
         result.append([np.mean(chain**power, axis=(0, 1)) for power in (1, 2)])
     means = np.array(result)
     error = np.std(means, axis=0, ddof=1) / np.sqrt(REPLICATES)

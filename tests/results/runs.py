@@ -207,10 +207,10 @@ def run(text: str, folder: Path) -> tuple[Problem, Result]:
         point = pointfit.fit(posterior, generator(seed, "point fit"))
         first = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
         noted = {"versions": json.dumps(versions(posterior.engine))}
-        path = folder / "chain.h5"
-        with ChainFile.create(path, first, point, problem.plan.block, noted) as chain:
-            outcome = sample(posterior, problem.plan, chain, pool)
-            result = assemble(problem, chain, outcome)
+        path = folder / "chain"
+        chain = ChainFile.create(path, first, point, problem.plan.block, noted)
+        outcome = sample(posterior, problem.plan, chain, pool)
+        result = assemble(problem, chain, outcome)
     assert outcome.converged, outcome.stop_reason
     return problem, result
 

@@ -24,7 +24,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.results.prediction import forecast
 from bwbayes.sampling.diagnostics import smoothed_weights
-from bwbayes.sampling.proposals import StudentProposal
+from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior
 from tests.measured import keep
 
@@ -74,7 +74,9 @@ def replicate(seed: int) -> Replicate:
 def drawn(posterior: Posterior, source: np.random.Generator) -> FloatArray:
     """Return draws (KEPT, free): places of a Student-t about the point fit, by their weights."""
     point = pointfit.fit(posterior, source)
-    proposal = StudentProposal(point.mode, np.linalg.cholesky(point.covariance))
+    proposal = StudentMixture(
+        np.ones(1), point.mode[np.newaxis], np.linalg.cholesky(point.covariance)[np.newaxis]
+    )
     places = proposal.draw(np.random.RandomState(source.bit_generator), PLACES)
     weights, shape = smoothed_weights(posterior.log_density(places) - proposal.log_density(places))
     assert shape < 0.7

@@ -9,17 +9,9 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.pointfit import PointFit
-from bwbayes.sampling.chain import (
-    MOVES,
-    PHASES,
-    RANDOM_STATE_WORDS,
-    Block,
-    Chain,
-    EnsembleState,
-    Phase,
-)
-from bwbayes.sampling.curvature import QuadraticMap, pairs
-from bwbayes.sampling.proposals import COMPONENTS, StudentMixture, StudentProposal
+from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
+from bwbayes.sampling.curvature import QuadraticMap
+from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
 ENSEMBLES, WALKERS, FREE, STEPS = 4, 16, 8, 50
@@ -35,7 +27,7 @@ PLAN: tuple[tuple[Phase, int], ...] = (("pilot", 2), ("tuning", 2), ("sampling",
 
 
 def state(generator: np.random.Generator) -> EnsembleState:
-    words = generator.integers(2**32, size=RANDOM_STATE_WORDS, dtype=np.uint32)
+    words = generator.integers(2**32, size=628, dtype=np.uint32)
     coordinates = generator.standard_normal((WALKERS, FREE))
     return EnsembleState(coordinates, generator.standard_normal(WALKERS), words)
 
@@ -58,23 +50,21 @@ def blocks(phase: Phase, number: int) -> list[Block]:
 
 def proposal(phase: Phase) -> StudentMixture:
     generator = np.random.default_rng(PHASES.index(phase))
-    factors = np.tril(generator.standard_normal((COMPONENTS, FREE, FREE)))
-    centers = generator.standard_normal((COMPONENTS, FREE))
-    parts = tuple(StudentProposal(*pair) for pair in zip(centers, factors, strict=True))
-    bends = np.zeros((pairs(FREE), FREE))
+    factors = np.tril(generator.standard_normal((4, FREE, FREE)))
+    centers = generator.standard_normal((4, FREE))
+    bends = np.zeros((FREE * (FREE + 1) // 2, FREE))
     bends[0, 1] = generator.standard_normal()
-    bend = QuadraticMap(centers[0], factors[0], bends)
-    return StudentMixture(generator.dirichlet(np.ones(COMPONENTS)), parts, bend)
+    bend = QuadraticMap(centers[0], factors[0], bends) if phase == "sampling" else None
+    return StudentMixture(generator.dirichlet(np.ones(4)), centers, factors, bend)
 
 
-def new(path: Path, blocks_before: int = 0, steps: int = STEPS) -> ChainFile:
+def new(path: Path) -> ChainFile:
     generator = np.random.default_rng(0)
     mode = generator.standard_normal(FREE)
     point = PointFit(mode, np.eye(FREE), -3.5, np.stack([mode, -mode]), 4 * np.eye(FREE))
     chain = Chain([state(generator) for _ in range(ENSEMBLES)])
-    for number in range(blocks_before):
-        chain.append("pilot", blocks("pilot", number))
-    return ChainFile.create(path, chain, point, steps, ATTRIBUTES)
+    chain.freeze("pilot", proposal("pilot"))
+    return ChainFile.create(path, chain, point, STEPS, ATTRIBUTES)
 
 
 def finish(chain: Chain) -> None:
@@ -97,14 +87,15 @@ def arrays(chain: ChainFile) -> dict[str, Any]:
         if chain.blocks(phase):
             for name in ("coordinates", "log_density", "accepted"):
                 held[f"{phase} {name}"] = getattr(chain, name)(phase)
-        for number in range(chain.blocks(phase)):
-            ends = [block.end.random_state for block in chain.block_of(phase, number)]
+        for number, row in enumerate(chain.history(phase)):
+            ends = [block.end.random_state for block in row]
             held[f"{phase} {number} random states"] = np.stack(ends)
-        mixture = chain.proposals[phase]
+        mixture = chain.proposal_in_use(phase)
         if mixture is not None:
-            held[f"{phase} weights"] = mixture.weights
-            held[f"{phase} centers"] = np.stack([c.center for c in mixture.components])
-            held[f"{phase} factors"] = np.stack([c.factor for c in mixture.components])
+            for name in ("weights", "centers", "factors", "freedom"):
+                held[f"{phase} {name}"] = np.array(getattr(mixture, name))
+            if mixture.bend is not None:
+                held[f"{phase} bends"] = mixture.bend.bends
     for kind, states in (("start", chain.starts), ("end", chain.ends)):
         for name in ("coordinates", "log_density", "random_state"):
             held[f"{kind} {name}"] = np.stack([getattr(one, name) for one in states])
@@ -115,11 +106,3 @@ def assert_same(expected: dict[str, Any], got: dict[str, Any]) -> None:
     assert expected.keys() == got.keys()
     for name, value in expected.items():
         np.testing.assert_array_equal(value, got[name], err_msg=name)
-
-
-def committed(path: Path) -> list[int]:
-    """Return how many blocks of each phase a file has."""
-    if not path.exists():
-        return [0] * len(PHASES)
-    chain = ChainFile.read(path)
-    return [chain.blocks(phase) for phase in PHASES]

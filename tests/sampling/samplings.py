@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.sampling.chain import PHASES, Chain, Phase
-from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
@@ -24,7 +23,7 @@ PLAN = SamplingPlan(
     most_pilot_steps=400,
     most_steps=1000,
 )
-LONG = replace(PLAN, most_steps=10_000)
+LONG = replace(PLAN, most_steps=4_000)
 POSTERIOR, POINT = gaussian(3)
 
 
@@ -58,11 +57,8 @@ def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None)
     if one is None or two is None:
         assert one is two
         return
-    np.testing.assert_array_equal(one.weights, two.weights)
-    for mine, yours in zip(one.components, two.components, strict=True):
-        assert mine.freedom == yours.freedom
-        np.testing.assert_array_equal(mine.center, yours.center)
-        np.testing.assert_array_equal(mine.factor, yours.factor)
+    for name in ("weights", "centers", "factors", "freedom"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     if one.bend is None or two.bend is None:
         assert one.bend is two.bend
         return

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import gammaln
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.curvature import LONGEST, QuadraticMap, pairs
+from bwbayes.sampling.curvature import LONGEST, QuadraticMap
 from bwbayes.sampling.proposals import StudentMixture
 
 # A ridge a hundred times as long as wide, whose ends lie some twenty widths off its middle.
@@ -33,7 +32,8 @@ def log_banana(x: FloatArray) -> FloatArray:
 def any_bend(free: int, seed: int) -> QuadraticMap:
     """Return a bend with coefficients of size one wherever there may be any."""
     generator = np.random.default_rng(seed)
-    bends = generator.standard_normal((pairs(free), free))
+    longest = min(free, LONGEST)
+    bends = generator.standard_normal((longest * (longest + 1) // 2, free))
     place = 0
     for k in range(min(free, LONGEST)):
         bends[place : place + k + 1, : k + 1] = 0.0
@@ -126,11 +126,8 @@ def test_the_density_is_that_of_the_draws() -> None:
     Over 20,000 draws its error is 0.01.
     """
     bent = StudentMixture.fitted(banana(4000))
-    freedom, free = bent.components[0].freedom, 3
-    constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)
-    constant -= free / 2 * np.log(freedom * np.pi)
     y = bent.draw(np.random.RandomState(10), 20_000)
-    ridge = log_banana(y) - free / 2 * np.log(2 * np.pi) - np.log(WIDTH)
-    ratio = np.exp(ridge - bent.log_density(y) - constant)
+    ridge = log_banana(y) - 1.5 * np.log(2 * np.pi) - np.log(WIDTH)
+    ratio = np.exp(ridge - bent.log_density(y))
     assert np.std(ratio) / np.sqrt(ratio.size) < 0.02
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.06)

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from bwbayes.sampling.chain import PHASES, Phase
-from bwbayes.sampling.diagnostics import Check
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
@@ -53,30 +52,28 @@ class Stopper:
 
 def begin(path: Path, seed: int = 1) -> None:
     chain = first_chain(POSTERIOR, POINT, PLAN, np.random.default_rng(seed))
-    ChainFile.create(path, chain, POINT, PLAN.block, {}).close()
+    ChainFile.create(path, chain, POINT, PLAN.block, {})
 
 
 def go_on(path: Path, executor: Executor, blocks: int = 0, together: int = 1) -> Outcome:
     plan = replace(PLAN, together=together)
-    with ChainFile.resume(path) as chain:
-        return sample(POSTERIOR, plan, chain, executor, Stopper(blocks))
+    return sample(POSTERIOR, plan, ChainFile.resume(path), executor, Stopper(blocks))
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Outcome]:
-    path = tmp_path_factory.mktemp("straight") / "chain.h5"
+    path = tmp_path_factory.mktemp("straight") / "chain"
     begin(path)
     with ThreadPoolExecutor(1) as executor:
         outcome = go_on(path, executor)
     return arrays(ChainFile.read(path)), outcome
 
 
-@pytest.fixture(scope="module", params=["thread", "2 threads", "process", "2 processes"])
+@pytest.fixture(scope="module", params=["2 threads", "2 processes"])
 def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
-    workers = 2 if "2" in request.param else 1
-    pool: Executor = ThreadPoolExecutor(workers)
+    pool: Executor = ThreadPoolExecutor(2)
     if "process" in request.param:
-        pool = ProcessPoolExecutor(workers, mp_context=FORKS)
+        pool = ProcessPoolExecutor(2, mp_context=FORKS)
     with pool:
         yield pool
 
@@ -93,22 +90,22 @@ def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any]
         )
 
 
-@pytest.mark.parametrize("together", [1, 3, 4])
+@pytest.mark.parametrize("together", [1, 3])
 def test_straight(
     tmp_path: Path,
     executor: Executor,
     expected: tuple[dict[str, Any], Outcome],
     together: int,
 ) -> None:
-    begin(tmp_path / "chain.h5")
-    outcome = go_on(tmp_path / "chain.h5", executor, together=together)
-    assert_same_end(tmp_path / "chain.h5", outcome, expected)
+    begin(tmp_path / "chain")
+    outcome = go_on(tmp_path / "chain", executor, together=together)
+    assert_same_end(tmp_path / "chain", outcome, expected)
 
 
 def test_in_five_pieces(
     tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], Outcome]
 ) -> None:
-    path = tmp_path / "chain.h5"
+    path = tmp_path / "chain"
     begin(path)
     total = sum(int(expected[0][f"{phase} blocks"]) for phase in PHASES)
     piece = total // PIECES

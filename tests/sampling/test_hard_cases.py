@@ -25,8 +25,7 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.diagnostics import check
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome, check
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.inference.problems import TARGETS, gaussian, target

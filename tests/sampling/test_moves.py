@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import emcee
@@ -23,10 +24,11 @@ from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import (
     AmongPlaces,
     SnookerMove,
+    Weighted,
+    near,
     sampling_moves,
     spreading_moves,
 )
-from bwbayes.sampling.nearby import Nearby
 from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import ALARM, TARGETS, gaussian, target, worst_score
 
@@ -68,30 +70,22 @@ class Eager(AmongPlaces):
         return one, np.ones_like(taken), chosen
 
 
-def wrong_mixture(name: str) -> Moves:
-    moves = sampling_moves(fitted(name))
-    assert isinstance(moves[2][0], MHMove)
-    planted(moves[2][0], forgotten)
-    return moves
-
-
-Moves = list[tuple[Move, float]]
-RIGHT: dict[str, Callable[[str], Moves]] = {
+RIGHT: dict[str, Callable[[str], Weighted]] = {
     "differential evolution": lambda _: [(DEMove(), 1.0)],
     "snooker": lambda _: [(SnookerMove(), 1.0)],
+    "a place": lambda name: [(AmongPlaces(fitted(name)), 1.0)],
     "one of several places": lambda name: [(AmongPlaces(TARGETS[name].proposal, 5), 1.0)],
-    "nearby": lambda name: [(MHMove(Nearby(fitted(name))), 1.0)],
+    "nearby": lambda name: [(MHMove(partial(near, fitted(name))), 1.0)],
     "those that sample": lambda name: sampling_moves(fitted(name)),
     "those that spread": lambda name: spreading_moves(fitted(name)),
 }
 # Differential evolution that accepts too easily, moves without their factor, and steps that take
 # every place that was chosen: the best of two is no draw of the target.
-WRONG: dict[str, Callable[[str], Moves]] = {
+WRONG: dict[str, Callable[[str], Weighted]] = {
     "differential evolution": lambda _: [(planted(DEMove(), eager), 1.0)],
     "snooker": lambda _: [(planted(SnookerMove(), forgotten), 1.0)],
     "one of several places": lambda name: [(Eager(TARGETS[name].proposal, 2), 1.0)],
-    "nearby": lambda name: [(planted(MHMove(Nearby(fitted(name))), forgotten), 1.0)],
-    "those that sample": wrong_mixture,
+    "nearby": lambda name: [(planted(MHMove(partial(near, fitted(name))), forgotten), 1.0)],
 }
 
 
@@ -121,7 +115,7 @@ def spread_score(move: Move) -> float:
         state = start(normal, point, 0, 4, generator)
         draws = generator.standard_normal((4, 1))
         state = replace(state, coordinates=draws, log_density=normal.log_density(draws))
-        chain = advance(normal, [(move, 1.0)], state, 1500).coordinates
+        chain = advance(normal, [[(move, 1.0)]], [state], 1500)[0].coordinates
         variances.append(np.mean(np.mean(chain, axis=(1, 2)) ** 2))
     error = np.std(variances, ddof=1) / np.sqrt(len(variances))
     return float((np.mean(variances) - 1 / 4) / error)

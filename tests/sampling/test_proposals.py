@@ -1,80 +1,44 @@
 """Proposals propose what their density says, and their acceptance ratio keeps a distribution.
 
-How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong, is told there.
+How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong, is told there; that
+right proposals leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import emcee
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.proposals import COMPONENTS, Proposal, StudentMixture, StudentProposal
-from tests.inference.problems import ALARM, TARGETS, Known, worst_score
-
-KINDS = ("student", "mixture")
+from bwbayes.sampling.moves import AmongPlaces
+from bwbayes.sampling.proposals import StudentMixture
+from tests.inference.problems import ALARM, TARGETS, Known, student, worst_score
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
 MIXTURE = StudentMixture(
     np.array([0.2, 0.7, 0.1]),
-    (
-        StudentProposal(np.array([-40.0, 3.0]), np.array([[1.0, 0.0], [0.5, 2.0]]), 6.0),
-        StudentProposal(np.array([40.0, 0.0]), np.array([[0.5, 0.0], [-1.0, 0.4]]), 6.0),
-        StudentProposal(np.array([0.0, 200.0]), np.diag([3.0, 3.0]), 6.0),
-    ),
+    np.array([[-40.0, 3.0], [40.0, 0.0], [0.0, 200.0]]),
+    np.array([[[1.0, 0.0], [0.5, 2.0]], [[0.5, 0.0], [-1.0, 0.4]], [[3.0, 0.0], [0.0, 3.0]]]),
 )
 
 
-def proposal_for(kind: str, known: Known) -> Proposal:
-    """Return the target's own Student-t, or a mixture fitted to exact draws."""
-    if kind == "student":
-        return known.proposal
-    return StudentMixture.fitted(known.draw(np.random.default_rng(21), 2000))
-
-
-def score(name: str, proposal: Proposal, steps: int = 120) -> float:
-    return worst_score(TARGETS[name], [(emcee.moves.MHMove(proposal), 1.0)], steps)
-
-
-@pytest.mark.parametrize("name", TARGETS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_proposal_leaves_the_right_distribution(kind: str, name: str) -> None:
-    assert score(name, proposal_for(kind, TARGETS[name])) < ALARM
+def fitted(name: str) -> StudentMixture:
+    return StudentMixture.fitted(TARGETS[name].draw(np.random.default_rng(21), 2000))
 
 
 @dataclass(frozen=True)
-class Scaled:
-    """A proposal whose ratio is wrong: −1 is the wrong way round, 0 as if it were symmetric."""
+class Scaled(StudentMixture):
+    """A proposal whose density is wrong: −1 is the wrong way round, 0 as if it were symmetric."""
 
-    right: Proposal
-    by: float
+    by: float = 1.0
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Return what the wrong ratio is made of."""
-        return self.by * self.right.log_density(coordinates)
-
-    def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
-        """Draw from the right distribution."""
-        return self.right.draw(random, count)
-
-    def __call__(
-        self, coordinates: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose with the wrong ratio."""
-        proposed, ratio = self.right(coordinates, random)
-        return proposed, self.by * ratio
-
-
-@pytest.mark.parametrize("name", TARGETS)
-@pytest.mark.parametrize("by", [-1.0, 0.0])
-@pytest.mark.parametrize("kind", KINDS)
-def test_twin_a_wrong_ratio_is_found(kind: str, by: float, name: str) -> None:
-    assert score(name, Scaled(proposal_for(kind, TARGETS[name]), by), steps=30) > ALARM
+        return self.by * super().log_density(coordinates)
 
 
 class Unweighted(StudentMixture):
@@ -82,57 +46,49 @@ class Unweighted(StudentMixture):
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Return the density of equal weights."""
-        equal = np.full(len(self.components), 1 / len(self.components))
-        return StudentMixture(equal, self.components).log_density(coordinates)
+        equal = np.full(len(self.weights), 1 / len(self.weights))
+        return StudentMixture(equal, self.centers, self.factors).log_density(coordinates)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("by", [-1.0, 0.0])
+def test_twin_a_wrong_ratio_is_found(by: float, name: str) -> None:
+    wrong = Scaled(**vars(fitted(name)) | {"by": by})
+    assert worst_score(TARGETS[name], [(AmongPlaces(wrong), 1.0)], steps=30) > ALARM
 
 
 def test_twin_forgotten_weights_are_found() -> None:
-    right = StudentMixture.fitted(TARGETS["bimodal"].draw(np.random.default_rng(21), 2000))
-    assert score("bimodal", Unweighted(right.weights, right.components), steps=60) > ALARM
+    right = fitted("bimodal")
+    wrong = Unweighted(right.weights, right.centers, right.factors)
+    assert worst_score(TARGETS["bimodal"], [(AmongPlaces(wrong), 1.0)], steps=60) > ALARM
 
 
-def scipys_density(proposal: StudentProposal, x: FloatArray) -> FloatArray:
-    shape = proposal.factor @ proposal.factor.T
-    scipys = stats.multivariate_t(proposal.center, shape, df=int(proposal.freedom))
-    return np.asarray(scipys.logpdf(x))
-
-
-def test_the_student_density_is_scipys() -> None:
-    factor = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-0.3, 0.1, 0.4]])
-    proposal = StudentProposal(np.array([1.0, -1.0, 0.5]), factor, freedom=4.0)
-    x = np.random.default_rng(2).normal(0, 3, (50, 3))
-    difference = scipys_density(proposal, x) - proposal.log_density(x)
-    np.testing.assert_allclose(difference[0], difference, atol=1e-10)
-
-
-def test_the_mixtures_density_is_that_of_scipys_mixture() -> None:
-    """Up to one constant, near each component and far from all of them."""
+def test_the_density_is_that_of_scipys_mixture() -> None:
+    """Near each component and far from all of them."""
     x = np.random.default_rng(2).uniform([-60, -20], [60, 220], (200, 2))
-    parts = np.stack([scipys_density(component, x) for component in MIXTURE.components])
+    parts = np.stack(
+        [
+            stats.multivariate_t(center, factor @ factor.T, df=6).logpdf(x)
+            for center, factor in zip(MIXTURE.centers, MIXTURE.factors, strict=True)
+        ]
+    )
     expected = logsumexp(parts, axis=0, b=MIXTURE.weights[:, np.newaxis])
-    difference = expected - MIXTURE.log_density(x)
-    np.testing.assert_allclose(difference[0], difference, atol=1e-10)
+    np.testing.assert_allclose(expected, MIXTURE.log_density(x), atol=1e-10)
 
 
-def mixture_cdf(mixture: StudentMixture, direction: FloatArray, x: FloatArray) -> FloatArray:
-    parts = [
-        weight
-        * stats.t.cdf(x, c.freedom, c.center @ direction, np.linalg.norm(direction @ c.factor))
-        for weight, c in zip(mixture.weights, mixture.components, strict=True)
-    ]
-    return np.asarray(np.sum(parts, axis=0))
-
-
-@pytest.mark.parametrize("proposal", [MIXTURE, MIXTURE.components[0]], ids=["mixture", "student"])
-def test_draws_have_the_distribution(proposal: StudentMixture | StudentProposal) -> None:
+def test_draws_have_the_distribution() -> None:
     """Each coordinate, and one direction across, by Kolmogorov-Smirnov at one in 10,000."""
-    alone = StudentMixture(np.ones(1), (MIXTURE.components[0],))
-    mixture = proposal if isinstance(proposal, StudentMixture) else alone
-    draws = proposal.draw(np.random.RandomState(3), 20_000)  # emcee's generator
+    draws = MIXTURE.draw(np.random.RandomState(3), 20_000)  # emcee's generator
     for direction in np.array([[1.0, 0.0], [0.0, 1.0], [0.6, -0.8]]):
-        along = draws @ direction
-        expected = lambda x, d=direction: mixture_cdf(mixture, d, x)  # noqa: E731
-        assert stats.kstest(along, expected).pvalue > 1e-4
+
+        def cdf(x: FloatArray, direction: FloatArray = direction) -> FloatArray:
+            widths = np.linalg.norm(direction @ MIXTURE.factors, axis=1)
+            return np.asarray(
+                stats.t.cdf(x[:, np.newaxis], 6, MIXTURE.centers @ direction, widths)
+                @ MIXTURE.weights
+            )
+
+        assert stats.kstest(draws @ direction, cdf).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -140,62 +96,53 @@ def test_a_fitted_mixture_has_the_mean_and_covariance_of_the_draws(name: str) ->
     """Its scales as covariances; what each takes from all together leaves their mean as it is."""
     draws = TARGETS[name].draw(np.random.default_rng(6), 2000)
     mixture = StudentMixture.fitted(draws)
-    centers = np.stack([component.center for component in mixture.components])
-    scales = np.stack([component.factor @ component.factor.T for component in mixture.components])
+    scales = mixture.factors @ mixture.factors.transpose(0, 2, 1)
     whole = np.cov(draws, rowvar=False)
     assert 1.0 == pytest.approx(np.sum(mixture.weights))
-    np.testing.assert_allclose(np.mean(draws, axis=0), mixture.weights @ centers, atol=1e-10)
+    np.testing.assert_allclose(
+        np.mean(draws, axis=0), mixture.weights @ mixture.centers, atol=1e-10
+    )
     within = np.einsum("j,jkl->kl", mixture.weights, scales)
-    away = centers - np.mean(draws, axis=0)
+    away = mixture.centers - np.mean(draws, axis=0)
     between = np.einsum("j,jk,jl->kl", mixture.weights, away, away)
     np.testing.assert_allclose(whole, within + between, rtol=1e-3, atol=1e-3)
 
 
-def efficiency(known: Known, proposal: StudentMixture | StudentProposal) -> float:
+def efficiency(known: Known, proposal: StudentMixture) -> float:
     """Effective draws of importance sampling from a proposal, (Σw)² / Σw², a draw."""
     draws = proposal.draw(np.random.RandomState(8), 20_000)
     logs = known.log_density(draws) - proposal.log_density(draws)
     return float(np.exp(2 * logsumexp(logs) - logsumexp(2 * logs)) / len(draws))
 
 
-def efficiencies(name: str) -> tuple[float, float]:
-    """Efficiency of one fitted Student-t, and of a fitted mixture."""
-    known = TARGETS[name]
+def efficiencies(known: Known) -> tuple[float, float]:
+    """Efficiency of one Student-t of the draws' covariance, and of a fitted mixture."""
     draws = known.draw(np.random.default_rng(9), 4000)
-    one = efficiency(known, StudentProposal.fitted(draws))
+    factor = np.linalg.cholesky(np.atleast_2d(np.cov(draws, rowvar=False)))
+    one = efficiency(known, student(np.mean(draws, axis=0), factor))
     return one, efficiency(known, StudentMixture.fitted(draws))
 
 
-@pytest.mark.parametrize("name", ["banana", "bounded", "bimodal"])
+EXPONENTIAL = Known(
+    1,
+    lambda x: np.where(x[:, 0] > 0, -x[:, 0], -np.inf),
+    lambda generator, count: generator.exponential(size=(count, 1)),
+    student(np.ones(1), np.eye(1)),
+    np.array([[1.0], [2.0]]),
+)
+
+
+@pytest.mark.parametrize("name", ["banana", "bounded", "bimodal", "one parameter"])
 def test_a_mixture_covers_a_skewed_target_better_than_one_student(name: str) -> None:
-    one, mixture = efficiencies(name)
+    one, mixture = efficiencies(TARGETS.get(name, EXPONENTIAL))
     assert mixture > 1.1 * one
 
 
 def test_modes_far_apart_do_not_widen_each_other() -> None:
     """Each component is as wide as its mode: 0.8 and not 0.3 of the draws are effective."""
-    one, mixture = efficiencies("far modes")
+    one, mixture = efficiencies(TARGETS["far modes"])
     assert mixture > 0.6
     assert mixture > 2 * one
-
-
-def exponential() -> Known:
-    """Return one coordinate alone, with a wall and a tail."""
-    return Known(
-        1,
-        lambda x: np.where(x[:, 0] > 0, -x[:, 0], -np.inf),
-        lambda generator, count: generator.exponential(size=(count, 1)),
-        StudentProposal(np.ones(1), np.eye(1)),
-        np.array([[1.0], [2.0]]),
-    )
-
-
-def test_one_free_parameter_is_fitted_and_sampled() -> None:
-    known = exponential()
-    draws = known.draw(np.random.default_rng(10), 4000)
-    mixture = StudentMixture.fitted(draws)
-    assert efficiency(known, mixture) > 1.1 * efficiency(known, StudentProposal.fitted(draws))
-    assert worst_score(known, [(emcee.moves.MHMove(mixture), 1.0)]) < ALARM
 
 
 GENERATOR = np.random.default_rng(12)
@@ -210,12 +157,9 @@ FLAT = {
 
 
 @pytest.mark.parametrize("name", FLAT)
-@pytest.mark.parametrize("kind", [StudentProposal, StudentMixture])
-def test_draws_that_do_not_span_the_space_give_no_proposal(
-    kind: type[StudentProposal] | type[StudentMixture], name: str
-) -> None:
+def test_draws_that_do_not_span_the_space_give_no_proposal(name: str) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="do not span the space"):
-        kind.fitted(FLAT[name])
+        StudentMixture.fitted(FLAT[name])
 
 
 def stuck(generator: np.random.Generator) -> FloatArray:
@@ -236,12 +180,11 @@ TINY = {
 @pytest.mark.parametrize("name", TINY)
 def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
     mixture = StudentMixture.fitted(TINY[name], np.zeros(len(TINY[name])))
-    assert (COMPONENTS,) == mixture.weights.shape
+    assert (4,) == mixture.weights.shape
     assert (mixture.weights > 0).all()
     assert np.isfinite(mixture.log_density(TINY[name])).all()
-    proposed, ratio = mixture(TINY[name][:500], np.random.RandomState(14))
-    assert np.isfinite(proposed).all()
-    assert np.isfinite(ratio).all()
+    proposed = mixture.draw(np.random.RandomState(14), 500)
+    assert np.isfinite(mixture.log_density(proposed)).all()
 
 
 def test_a_component_of_its_own_covers_what_the_others_cover_worst() -> None:

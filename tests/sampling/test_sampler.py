@@ -15,9 +15,9 @@ from bwbayes.errors import InputError
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain, draws
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import FIRST_CHECK, MOST_TUNING_BLOCKS, first_chain, sample
+from bwbayes.sampling.sampler import FIRST_CHECK, first_chain, sample
 from tests.inference.problems import target
 from tests.sampling.samplings import (
     PLAN,
@@ -54,14 +54,14 @@ def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
     assert chain.proposals["sampling"] is not None
 
 
-@pytest.mark.parametrize("blocks", [3, 5, MOST_TUNING_BLOCKS])
+@pytest.mark.parametrize("blocks", [3, 5, 16])
 def test_a_long_tuning_is_fitted_to_its_last_round_and_goes_on_in_any(
     monkeypatch: pytest.MonkeyPatch, blocks: int
 ) -> None:
     """Each is twice as long; interrupted in one or after the last, it comes to the same end."""
     monkeypatch.setattr(sampler, "TAKEN", 1.1)
     expected, outcome = run()
-    assert MOST_TUNING_BLOCKS == expected.blocks("tuning")
+    assert 16 == expected.blocks("tuning")
     draws, log_density = expected.coordinates("tuning"), expected.log_density("tuning")
     proposals = expected.proposals["tuning"], expected.proposals["sampling"]
     for last, proposal in zip((slice(80, 160), slice(160, None)), proposals, strict=True):

@@ -40,7 +40,7 @@ from bwbayes.results.result import Result, summary
 from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
 from bwbayes.sampling.chain import draws, log_densities
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.shown import head
 
@@ -353,7 +353,7 @@ class Fit:
 
         copied = RunFolder.create(Path(folder), self.problem, overwrite)
         with copied.locked():
-            shutil.copyfile(self.folder.chain, copied.chain)
+            shutil.copytree(self.folder.chain, copied.chain)
             run.write_files(self, copied)
         return copied.path
 

@@ -32,7 +32,7 @@ from bwbayes.results.scores import score
 from bwbayes.results.steps import measure_steps
 from bwbayes.results.verdict import Background
 from bwbayes.sampling.chain import draws, log_densities
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
 
 __all__ = ["assemble", "load_result", "save_result"]

@@ -105,8 +105,8 @@ class RunFolder(Folder):
 
     @property
     def chain(self) -> Path:
-        """The chain, appended block by block."""
-        return self.path / "chain.h5"
+        """The folder of the chain, which grows by a file a block."""
+        return self.path / "chain"
 
     @property
     def result(self) -> Path:

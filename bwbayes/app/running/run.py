@@ -39,7 +39,7 @@ from bwbayes.report.page import render
 from bwbayes.report.saving import draw_pictures
 from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.monitor import Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
@@ -67,8 +67,7 @@ def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
     """
     with folder.locked(), one_thread():
         problem, chain = _chain(folder, Console(quiet=True))
-        with chain:
-            return problem, chain.point
+        return problem, chain.point
 
 
 def draw(folder: RunFolder) -> Fit:
@@ -81,7 +80,7 @@ def draw(folder: RunFolder) -> Fit:
     """
     with folder.locked(), one_thread():
         problem, chain = _chain(folder, Console(quiet=True))
-        with chain, executor(1, problem.posterior.engine) as pool:
+        with executor(1, problem.posterior.engine) as pool:
             outcome = sample(problem.posterior, problem.plan, chain, pool)
         return Fit(problem, chain, folder).knowing(outcome=outcome)
 
@@ -140,7 +139,6 @@ def resume(
             show(folder.problem())
         problem, chain = _chain(folder, console, engine)
         with (
-            chain,
             executor(workers, problem.posterior.engine, backend) as pool,
             Progress(console, problem.plan) as progress,
         ):
@@ -189,7 +187,6 @@ def _chain(
     first_engine, now = chain.attributes()["engine"], problem.posterior.engine
     if first_engine != now:
         if requested is None:
-            chain.close()
             raise InputError(
                 f"{folder.chain}: was sampled with the {first_engine} engine, not {now}; set "
                 f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
