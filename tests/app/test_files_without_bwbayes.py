@@ -11,9 +11,10 @@ import pytest
 
 from tests.app import small
 
-# What a colleague types who has arviz, xarray, pandas, corner and h5py, and no bwbayes.
+# What a colleague types who has arviz, xarray, pandas and corner, and no bwbayes.
 SCRIPT = """
 import json, sys
+from pathlib import Path
 
 class Absent:
     def find_spec(self, name, path=None, target=None):

@@ -44,12 +44,12 @@ def assert_refused(path: Path, problem: Problem, *, overwrite: bool, why: str) -
 def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Problem) -> None:
     path = tmp_path / "a"
     made = RunFolder.create(path, problem, overwrite=False)
-    made.chain.write_bytes(b"draws")
+    made.summary.write_bytes(b"{}")
     before = content(path)
     assert_refused(path, problem, overwrite=False, why=rf"`bwbayes\.resume\('{path}'\)`")
     assert before == content(path)
     RunFolder.create(path, problem, overwrite=True)
-    assert not made.chain.exists()
+    assert not made.summary.exists()
     assert made.config.is_file()
 
 
