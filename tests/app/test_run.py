@@ -217,20 +217,6 @@ def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: Run
 # Files that do not fit together
 
 
-<<<<<<< HEAD
-=======
-def test_chain_of_another_record_is_refused(copy: RunFolder) -> None:
-    path = copy.path / "records/record.h5"
-    record = read_record(path)
-    write_record(replace(record, voltage=record.voltage + 1e-9), path)
-    before = sorted(copy.chain.iterdir())
-    with pytest.raises(InputError, match="belongs to another record"):
-        resume(copy, small.quiet(), workers=1)
-    assert copy.summary.exists()
-    assert before == sorted(copy.chain.iterdir())
-
-
->>>>>>> 887c6c6 (Follow the chain's folder in the tests of runs)
 # Drawing again
 
 
