@@ -135,20 +135,14 @@ class DriveStep:
     def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return the drive, its slope and the memory once voltages (models,) have gone there."""
         w, slope, after = self.step.go(memory, voltage)
-        if self.gain is None:
-            return Gone(w, slope, after)
-        x = self.gain.scaled(voltage)
-        for name in self.gain.terms:
-            w = w + self.column[name] * x ** TERMS[name].power
+        if self.gain is not None:
+            level, *slopes = self.gain.powers(self.column)
+            w = w + level + voltage * (slopes[0] + voltage * (slopes[1] + voltage * slopes[2]))
         return Gone(w, slope + self.added_slope(voltage), after)
 
     def added_slope(self, voltage: FloatArray) -> FloatArray:
         """Return the gain's own slope, um/V, at voltages (models,) or (any, 1)."""
-        added = np.zeros(np.broadcast_shapes(voltage.shape, self.column["offset"].shape))
-        if self.gain is None or not self.gain.reference.half > 0:
-            return added
-        x = self.gain.scaled(voltage)
-        for name in self.gain.terms:
-            power = TERMS[name].power
-            added += self.column[name] * power * x ** (power - 1) / self.gain.reference.half
-        return added
+        if self.gain is None:
+            return np.zeros_like(voltage)
+        _, first, second, third = self.gain.powers(self.column)
+        return np.asarray(first + voltage * (2 * second + voltage * 3 * third))

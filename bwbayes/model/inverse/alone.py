@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -21,11 +20,11 @@ from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.inverse.dynamics import undone
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.stretch import reached
+from bwbayes.model.inverse.stretch import first_crossing, reached
 from bwbayes.model.linear import Recursion, Sections
 from bwbayes.model.operator import UNIT
 
-__all__ = ["One", "Path"]
+__all__ = ["SHORTEST", "One", "Path"]
 
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
@@ -41,6 +40,9 @@ ROUNDS, AGREED = 200, 1e-14
 
 # Rounds whose changes are so many times the displacement do not come back.
 RUNAWAY = 1e3
+
+# The first reach, V at least, in which the voltage at which a record starts is looked for.
+SHORTEST = 1e-9
 
 
 @dataclass(frozen=True)
@@ -231,22 +233,11 @@ class One:
     def _first(self, drive: float, path: Path) -> float:
         """Return the first voltage, at which the state is what θ's initial one says."""
 
-        def off(voltage: float) -> float:
-            at = self._begin(voltage, from_rest=False)
-            return float(self._along(np.array([voltage]), at)[0][0]) - drive
+        def off(voltage: FloatArray) -> FloatArray:
+            at = self._begin(float(voltage[0]), from_rest=False)
+            return self._along(voltage, at)[0] - drive
 
-        low, high = path.low, path.high
-        center = min(max(self.span.middle, low), high)
-        s = -1.0 if off(center) > 0 else 1.0
-        reach = max(self.span.half, abs(off(center)) / self.slope if self.slope > 0 else 0.0, 1e-9)
-        edge = high if s > 0 else low
-        while s * (edge - center) > reach and s * off(center + s * reach) < 0:
-            reach = 2 * reach
-        bracket = center + s * min(reach, abs(edge - center))
-        if s * off(bracket) < 0:
-            return bracket
-        return float(
-            scipy.optimize.brentq(
-                off, center, bracket, xtol=1e-15 * max(abs(bracket), 1.0), rtol=1e-14
-            )
-        )
+        center = np.clip([self.span.middle], path.low, path.high)
+        guess = abs(float(off(center)[0])) / self.slope if self.slope > 0 else 0.0
+        reach = np.array([max(self.span.half, guess, SHORTEST)])
+        return float(first_crossing(off, center, reach, path.low, path.high)[0])

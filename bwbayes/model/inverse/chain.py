@@ -12,6 +12,8 @@ side instead, which is much faster (:mod:`bwbayes.model.inverse.together`).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
@@ -19,7 +21,6 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.inverse.alone import One
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.rows import of_rows
 from bwbayes.model.inverse.together import together
 from bwbayes.model.operator import UNIT
 
@@ -91,6 +92,20 @@ def inverse(
             solution = result[row] if solved[row] else None
             result[row] = single.voltage(target[row], limits or Limits(), nearest, solution)
     return result
+
+
+def of_rows(memory: Any, rows: slice) -> Any:
+    """Return a memory with its arrays (models, ...) cut to some models, whatever it is made of."""
+    if isinstance(memory, np.ndarray):
+        return memory[rows]
+    if isinstance(memory, tuple):
+        parts = [of_rows(member, rows) for member in memory]
+        return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
+    if hasattr(memory, "__dataclass_fields__"):
+        return type(memory)(
+            **{name: of_rows(getattr(memory, name), rows) for name in memory.__dataclass_fields__}
+        )
+    return memory
 
 
 def _checked(displacement: ArrayLike, models: int) -> FloatArray:

@@ -7,19 +7,20 @@ walked along.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["reached", "searched"]
+__all__ = ["first_crossing", "reached"]
 
 # Places at which a curve is looked at first.
 GRID = 33
 
 # Doublings of the first reach, and rounds of the root search; each ends by far earlier.
-DOUBLINGS, ROUNDS = 60, 100
+DOUBLINGS, ROUNDS = 40, 100
 
 EPSILON = float(np.finfo(np.float64).eps)
 
@@ -103,6 +104,32 @@ def _in_order(
     values = np.empty_like(voltage)
     values[order] = along(voltage[order])
     return values
+
+
+def first_crossing(
+    off: Callable[[FloatArray], FloatArray],
+    center: FloatArray,
+    reach: FloatArray,
+    low: float = -math.inf,
+    high: float = math.inf,
+) -> FloatArray:
+    """Return the voltages (models,), V, at which a rising function ``off`` passes zero.
+
+    Looked for from a center (models,) on, at first within a reach (models,), and between low and
+    high: where it is zero nowhere, the last voltage looked at is returned.
+    """
+    start = off(center)
+    s = np.where(start > 0, -1.0, 1.0)
+    edge = np.where(s > 0, high, low)
+    for _ in range(DOUBLINGS):
+        end = np.clip(center + s * reach, low, high)
+        beyond = off(end)
+        short = (s * beyond < 0) & (end != edge)
+        if not short.any():
+            break
+        reach = np.where(short, 2 * reach, reach)
+    found = searched(off, (center, end), (start, beyond))
+    return np.where(s * beyond < 0, end, found)
 
 
 def searched(

@@ -16,8 +16,8 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.actuator import State
 from bwbayes.model.gain import DriveStep
-from bwbayes.model.inverse.alone import One
-from bwbayes.model.inverse.stretch import searched
+from bwbayes.model.inverse.alone import SHORTEST, One
+from bwbayes.model.inverse.stretch import first_crossing
 from bwbayes.model.linear import Sections
 from bwbayes.model.operator import Operator
 
@@ -25,9 +25,6 @@ __all__ = ["MANY", "together"]
 
 # From so many models on they go from sample to sample.
 MANY = 50
-
-# Doublings of the first reach, V at least, for the voltage at which a record starts.
-DOUBLINGS, SHORTEST = 30, 1e-9
 
 # By rounding a zero may be so far beyond the unit circle, and a voltage so far from its limit.
 ROUNDED = 1e-6
@@ -135,16 +132,7 @@ def _first(
         return np.asarray(factor * w - displacement)
 
     center = np.full_like(displacement, span.middle)
-    missing = off(center)
-    s = np.where(missing > 0, -1.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        guess = np.where(slope > 0, np.abs(missing) / slope, 0.0)
-    reach = np.maximum(guess, max(span.half, SHORTEST))
-    for _ in range(DOUBLINGS):
-        beyond = off(center + s * reach)
-        short = s * beyond < 0
-        if not short.any():
-            break
-        reach = np.where(short, 2 * reach, reach)
+        guess = np.where(slope > 0, np.abs(off(center)) / slope, 0.0)
     # Where there is none it is so far away that the inverse does not begin there.
-    return searched(off, (center, center + s * reach), (missing, beyond))
+    return first_crossing(off, center, np.maximum(guess, max(span.half, SHORTEST)))
