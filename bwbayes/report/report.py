@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 # A figure of matplotlib, which is loaded when something is drawn.
-type Figure = figure.Figure
+type Figure = "figure.Figure"  # quoted, for those who evaluate it
 
 Target = Literal["both", "page", "screen", "nowhere"]
 Kind = Literal["good", "note", "bad"]
