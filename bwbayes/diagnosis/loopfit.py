@@ -188,7 +188,6 @@ def _products(first: FloatArray, second: FloatArray) -> FloatArray:
 def _inverse(products: FloatArray) -> FloatArray:
     """Return the inverse of a matrix of products, without directions that are nearly dependent."""
     scale = np.sqrt(np.maximum(np.diag(products), 1e-300))
-    sizes, directions = np.linalg.eigh(products / np.outer(scale, scale))
-    axes = directions[:, sizes > 1e-9 * sizes[-1]] / scale[:, np.newaxis]
-    result: FloatArray = (axes / sizes[sizes > 1e-9 * sizes[-1]]) @ axes.T
+    scales = np.outer(scale, scale)
+    result: FloatArray = np.linalg.pinv(products / scales, rcond=1e-9, hermitian=True) / scales
     return result

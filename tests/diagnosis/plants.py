@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data import Record
@@ -115,12 +116,9 @@ def play(values: FloatArray, threshold: float) -> FloatArray:
 
 def lagged(values: FloatArray, time: float) -> FloatArray:
     """Follow values by a lag, at the fine steps."""
-    followed, reached = np.empty_like(values), float(values[0])
     kept = np.exp(-1 / RATE / FINE / time)
-    for number, value in enumerate(values.tolist()):
-        reached = value + (reached - value) * kept
-        followed[number] = reached
-    return followed
+    moved = lfilter([1 - kept], [1.0, -kept], values - values[0])
+    return np.asarray(values[0] + moved)
 
 
 def resonant(values: FloatArray, frequency: float, quality: float) -> FloatArray:
@@ -215,10 +213,11 @@ def added(
 def noise(kind: str, part: Plant, voltage: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return discrepancy and noise along a voltage (samples,), um."""
     kept = np.exp(-1 / RATE / part.memory)
-    slow, state = np.empty(voltage.size), rng.normal()
-    for number, shock in enumerate(rng.normal(size=voltage.size)):
-        slow[number] = state
-        state = kept * state + np.sqrt(1 - kept**2) * shock
+    shocks = (
+        np.r_[1.0, np.full(voltage.size - 1, np.sqrt(1 - kept**2))]
+        * rng.normal(size=voltage.size + 1)[:-1]
+    )
+    slow = lfilter([1.0], [1.0, -kept], shocks)
     white = rng.normal(size=voltage.size)
     speed = np.abs(np.gradient(voltage))
     match kind:

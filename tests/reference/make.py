@@ -184,8 +184,8 @@ def main(names: list[str]) -> None:
     for name in names:
         case, wanted_evidence = name.removesuffix("_evidence"), name.endswith("_evidence")
         made = reference_evidence(case) if wanted_evidence else reference(case)
-        text = json.dumps(made, indent=2) + "\n"
-        (FOLDER / f"{name}.json").write_text(text, encoding="utf-8")
+        lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in made.items())
+        (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
