@@ -96,7 +96,7 @@ FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
 def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     kind: str, tmp_path: Path
 ) -> None:
-    best = max(FAMILIES[kind](scene(kind, 0, tmp_path)), key=lambda found: found.nats)
+    best = max(FAMILIES[kind](scene(kind, 0, tmp_path, 5.0)), key=lambda found: found.nats)
     assert best.kind in CAUSES[kind]
     assert best.nats > LIMIT
 
