@@ -35,6 +35,13 @@ LOG_TWO_PI = float(np.log(2 * np.pi))
 # A covariance that changes by less of itself from reading to reading has settled.
 SETTLED = 2e-15
 
+# That is looked at after so many readings.
+LOOK = 8
+
+# Of the two states, (models, series) each, and three elements of their covariance, (models,).
+_Mean = tuple[FloatArray, FloatArray]
+_Covariance = tuple[FloatArray, FloatArray, FloatArray]
+
 
 class Filtered(NamedTuple):
     """Innovations of series, and what is known of the discrepancy after the last reading.
@@ -146,40 +153,49 @@ class Noise(ABC):
         Once the covariance of all models stays as it is, only the means go on.
         """
         sd, sensor_sd = self.marginal_sd(theta)
-        sensor = sensor_sd**2
-        mean = np.zeros((*series.shape[:2], 2))
-        covariance = (sd**2)[:, np.newaxis, np.newaxis] * np.eye(2)
-        usual = self.transition(theta), self.fresh(theta)
+        sensor, always, two = sensor_sd**2, sd**2, self.states > 1
         white, log_determinant = np.empty_like(series), np.zeros(len(series))
+        mean: _Mean = np.zeros(series.shape[:2]), np.zeros(series.shape[:2])
+        covariance: _Covariance = always, np.zeros_like(always), always
+        predicted = covariance
+        usual = self.step(theta)
         gaps = [] if skipped is None else np.flatnonzero(skipped[1:]).tolist()
         starts = [0, *(gap + 1 for gap in gaps)]
         for first, last in zip(starts, [*starts[1:], series.shape[2]], strict=True):
-            kept, fresh = usual
+            step = usual
             if first and skipped is not None:
-                readings = 1.0 + float(skipped[first])
-                kept, fresh = self.transition(theta, readings), self.fresh(theta, readings)
-            before = np.full_like(covariance, np.inf)
+                step = self.step(theta, 1.0 + float(skipped[first]))
             for t in range(first, last):
-                forward = np.swapaxes(kept, 1, 2)
-                predicted = kept @ covariance @ forward + fresh
-                variance = predicted[:, 0, 0] + sensor
-                gain = predicted[:, :, 0] / variance[:, np.newaxis]
-                if _stays(before, predicted):
-                    rest = slice(t, last)
-                    mean = _settled(kept, gain, mean, series[..., rest], white[..., rest])
-                    white[..., rest] /= np.sqrt(variance)[:, np.newaxis, np.newaxis]
+                before = predicted
+                expected, predicted = _predicted(step, mean, covariance, two=two)
+                p, p_12, p_22 = predicted
+                variance = p + sensor
+                gain, rest = p / variance, sensor / variance
+                gain_2 = p_12 / variance if two else p_12
+                if t > first and t % LOOK == 0 and _stays(before, predicted):
+                    ahead = slice(t, last)
+                    gains = gain, gain_2
+                    mean = _settled(step, gains, mean, series[..., ahead], white[..., ahead], two)
+                    white[..., ahead] /= np.sqrt(variance)[:, np.newaxis, np.newaxis]
                     log_determinant += (last - t) * np.log(variance)
                     break
-                mean = mean @ forward
-                innovation = series[..., t] - mean[..., 0]
-                mean += gain[:, np.newaxis] * innovation[..., np.newaxis]
+                innovation = series[..., t] - expected[0]
                 white[..., t] = innovation / np.sqrt(variance)[:, np.newaxis]
                 log_determinant += np.log(variance)
-                covariance = predicted * (sensor / variance)[:, np.newaxis, np.newaxis]
-                covariance[:, 1, 1] = predicted[:, 1, 1] - gain[:, 1] * predicted[:, 0, 1]
-                before = predicted
-                kept, fresh = usual
-        return Filtered(white, log_determinant, mean, covariance)
+                mean = expected[0] + gain[:, np.newaxis] * innovation, expected[1]
+                covariance = p * rest, p_12, p_22
+                if two:
+                    mean = mean[0], expected[1] + gain_2[:, np.newaxis] * innovation
+                    covariance = p * rest, p_12 * rest, p_22 - gain_2 * p_12
+                step = usual
+        c, c_12, c_22 = covariance
+        matrices = np.stack([c, c_12, c_12, c_22], axis=1).reshape(-1, 2, 2)
+        return Filtered(white, log_determinant, np.stack(mean, axis=2), matrices)
+
+    def step(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return a, b, d of F, and Q's first row and its last element, (6, models)."""
+        parts = self.transition(theta, readings), self.fresh(theta, readings)
+        return np.concatenate([part[:, [0, 0, 1], [0, 1, 1]] for part in parts], axis=1).T
 
     def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
         """One-sided amplitude spectral density (frequencies,), um/√Hz, at one θ (1, parameters).
@@ -209,34 +225,62 @@ class Noise(ABC):
         return discrepancy, theta[0, 0] * generator.standard_normal(samples)
 
 
-def _stays(before: FloatArray, after: FloatArray) -> bool:
-    """Tell whether covariances (models, 2, 2) are the same, each for the size of its parts."""
-    size = np.sqrt(np.einsum("mii->mi", after))
-    scale = size[:, :, np.newaxis] * size[:, np.newaxis]
-    return bool(np.all(np.abs(after - before) <= SETTLED * scale))
+def _predicted(
+    step: FloatArray, mean: _Mean, covariance: _Covariance, *, two: bool
+) -> tuple[_Mean, _Covariance]:
+    """Return mean and covariance after a step; of one state alone, the other is not touched."""
+    a, b, d, q, q_12, q_22 = step
+    p, p_12, p_22 = covariance
+    x, x_2 = mean
+    if not two:
+        return (a[:, np.newaxis] * x, x_2), (a * a * p + q, p_12, p_22)
+    top, bottom = a * p + b * p_12, a * p_12 + b * p_22
+    low, end = d * p_12 - b * p, d * p_22 - b * p_12
+    after = a * top + b * bottom + q, d * bottom - b * top + q_12, d * end - b * low + q_22
+    a, b, d = step[:3, :, np.newaxis]
+    return (a * x + b * x_2, d * x_2 - b * x), after
+
+
+def _stays(before: _Covariance, after: _Covariance) -> bool:
+    """Tell whether covariances are the same, each for the size of its parts."""
+    scales = after[0], np.sqrt(after[0] * after[2]), after[2]
+    triples = zip(before, after, scales, strict=True)
+    return all(bool(np.all(np.abs(new - old) <= SETTLED * size)) for old, new, size in triples)
 
 
 def _settled(
-    kept: FloatArray, gain: FloatArray, mean: FloatArray, series: FloatArray, white: FloatArray
-) -> FloatArray:
-    """Follow series (models, series, readings) with a gain (models, 2) that stays.
+    step: FloatArray,
+    gains: tuple[FloatArray, FloatArray],
+    mean: _Mean,
+    series: FloatArray,
+    innovations: FloatArray,
+    two: bool,
+) -> _Mean:
+    """Follow series (models, series, readings) with gains that stay.
 
-    Writes the innovations, um, and returns the states' mean (models, series, 2) after them.
+    Writes the innovations, um, and returns the states' mean after them.
     """
-    after = np.empty_like(mean)
+    after = np.empty_like(mean[0]), np.zeros_like(mean[1])
     for model, values in enumerate(series):
-        (a, b), (_, d) = kept[model]
-        trace, determinant = a + d, a * d + b * b
-        g, g_2 = gain[model]
-        # From the state that is predicted; z for a filter in transposed form.
-        first, second = mean[model] @ kept[model].T[:, 0], mean[model] @ kept[model].T[:, 1]
-        delays = np.stack([-first, d * first - b * second], axis=1)
-        bottom = (1.0, a * g + b * g_2 - trace, determinant * (1 - g))
-        top = (1.0, -trace, determinant)
+        a, b, d = step[:3, model]
+        g, g_2 = gains[0][model], gains[1][model]
+        x, x_2 = mean[0][model], mean[1][model]
+        top: tuple[float, ...] = (1.0, -a)
+        bottom: tuple[float, ...] = (1.0, a * g - a)
+        # From the state that is predicted, as a filter in transposed form keeps it.
+        first, second = a * x + b * x_2, d * x_2 - b * x
+        delays = -first[:, np.newaxis]
+        if two:
+            determinant = a * d + b * b
+            top = 1.0, -a - d, determinant
+            bottom = 1.0, a * g + b * g_2 - a - d, determinant * (1 - g)
+            delays = np.stack([-first, d * first - b * second], axis=1)
         innovation, _ = scipy.signal.lfilter(top, bottom, values, zi=delays)
-        seen = values - (1 - g) * innovation
-        earlier = np.concatenate([mean[model, :, :1], seen[:, :-1]], axis=1)
-        pull, before = g_2 * innovation - b * earlier, d * mean[model, :, 1:]
-        other, _ = scipy.signal.lfilter((1.0,), (1.0, -d), pull, zi=before)
-        white[model], after[model] = innovation, np.stack([seen[:, -1], other[:, -1]], axis=1)
+        innovations[model] = innovation
+        after[0][model] = values[:, -1] - (1 - g) * innovation[:, -1]
+        if two:
+            seen = values[:, :-1] - (1 - g) * innovation[:, :-1]
+            pull = g_2 * innovation - b * np.concatenate([x[:, np.newaxis], seen], axis=1)
+            other, _ = scipy.signal.lfilter((1.0,), (1.0, -d), pull, zi=d * x_2[:, np.newaxis])
+            after[1][model] = other[:, -1]
     return after

@@ -146,12 +146,6 @@ def test_free_exponent_widens_beta_and_no_more_than_its_own_prior_says() -> None
     assert sigma(wide) > 1.05 * sigma(1.0)
 
 
-@pytest.mark.parametrize("arguments", [{"lower": 0.0, "upper": 0.9}, {"lower": 1.0, "upper": 1e4}])
-def test_odd_prior_of_the_exponent_leaves_numbers(arguments: dict[str, float]) -> None:
-    ranges = Ranges(100.0, 60.0, 0.0, 0.5)
-    assert prior("d", ranges, Distribution("uniform", arguments)).arguments["median"] > 0
-
-
 @pytest.mark.parametrize("offset", [12_345.6, -98_765.4321, 1e-4])
 def test_offset_is_as_exact_as_the_displacements_range_asks(offset: float) -> None:
     """A sensor far from its zero: the prior's mean is off by a hundredth of its sd at most."""
@@ -171,15 +165,6 @@ def test_missing_readings_do_not_matter() -> None:
     one, other = (ranges_of(voltage, reading, 1e-3) for reading in (whole, holes))
     assert one.time == other.time
     assert other.displacement == pytest.approx(one.displacement, rel=1e-3)
-
-
-def test_windows_alone_give_the_ranges() -> None:
-    voltage = np.concatenate([drive(), drive(10.0)])
-    reading = displacement(voltage)
-    window = slice(10_000, 20_000)
-    ranges = ranges_of(voltage, reading, 1e-3, [window])
-    assert ranges.voltage == pytest.approx(np.ptp(voltage[window]) / 2)
-    assert ranges.displacement == pytest.approx(np.ptp(reading[window]) / 2)
 
 
 # Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.

@@ -28,10 +28,12 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 
 
+WAYS: list[tuple[str, Hold]] = [("none", "zero"), ("lag", "first"), ("second-order", "first")]
+
+
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("parts", PARTS)
-@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
-@pytest.mark.parametrize("hold", ["first", "zero"])
+@pytest.mark.parametrize(("dynamics", "hold"), WAYS)
 def test_the_unknown_start_is_integrated_out(
     engine: str, parts: str, dynamics: str, hold: Hold
 ) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.engine import Engine
@@ -23,8 +22,6 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.table import JointTable
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.identifiability import spectrum
-from bwbayes.results.prediction import predict_windows
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
 
 ENGINES = get_args(Engine)
@@ -188,45 +185,12 @@ def test_bounds_hold_in_every_record() -> None:
     assert (np.abs(column["gamma"]) <= least).all()
 
 
-def test_a_point_fit_of_two_records_finds_the_truth_of_both() -> None:
-    """And leaves less open than one record does."""
-    fixed = joint(LOOPS, SLOW)
-    point = pointfit.fit(fixed, np.random.default_rng(4))
-    place = dict(zip(fixed.names, point.mode, strict=True))
-    free = dict(zip(fixed.names, fixed.prior.constrain(point.mode[np.newaxis])[0][0], strict=True))
-    assert place.keys() == free.keys()
-    assert free["offset[loops]"] == pytest.approx(3.0, abs=2.0)
-    assert free["offset[slow]"] == pytest.approx(-2.0, abs=2.0)
-    assert free["d"] == pytest.approx(0.7, rel=0.1)
-    left = spectrum(fixed, point)[0]
-    alone = fixed.alone("loops")
-    one = pointfit.fit(alone, np.random.default_rng(4))
-    assert left.max() < spectrum(alone, one)[0].max()
-
-
 def test_outliers_are_found_in_the_record_that_has_them() -> None:
     spoilt = SLOW.displacement.copy()
     spoilt[40] += 60.0
     both = joint(LOOPS, replace(SLOW, displacement=spoilt))
     aside = outliers(both.without, np.random.default_rng(6))
     assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
-
-
-def test_windows_of_a_record_are_predicted_with_its_own_parameters() -> None:
-    both = joint(LOOPS, SLOW)
-    free = both.prior.draw(np.random.default_rng(7), 20)
-    shifted = free.copy()
-    shifted[:, both.names.index("offset[slow]")] += 5.0
-    means = []
-    for draws in (free, shifted):
-        _, alone, its = list(both.each(draws))[1]
-        record = Record(SLOW.voltage, SLOW.displacement, 0.025)
-        (bands,) = predict_windows(
-            alone, its, record, {"slow": slice(0, 150)}, np.random.default_rng(8)
-        )
-        means.append(bands.mean)
-    # From an unknown start, which the readings tell, all but what dies out moves with the offset.
-    assert np.median(means[1] - means[0]) == pytest.approx(5.0, abs=0.1)
 
 
 @pytest.mark.parametrize(

@@ -169,8 +169,8 @@ def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
 
 
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
-@pytest.mark.parametrize("missing", [0.0, 0.1, 0.7])
-@pytest.mark.parametrize("stride", [1, 2, 8])
+@pytest.mark.parametrize("missing", [0.1, 0.7])
+@pytest.mark.parametrize("stride", [1, 8])
 @pytest.mark.parametrize("training", [None, (slice(3, 4), slice(20, 90), slice(90, 180))])
 def test_missing_readings_are_left_out_and_nothing_else(
     engine: str, missing: float, stride: int, training: tuple[slice, ...] | None

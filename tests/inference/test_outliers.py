@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import linalg
 
 from bwbayes.errors import InputError
 from bwbayes.inference import pointfit
 from bwbayes.inference.outliers import outliers, surprise
 from bwbayes.inference.posterior import Posterior
-from tests.inference.problems import INTERVAL, short_posterior
+from tests.inference.problems import short_posterior
 
 
 def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
@@ -59,27 +58,6 @@ def test_the_sensors_sd_grows_without_it() -> None:
         free = posterior.prior.constrain(point.mode[np.newaxis])[0][0]
         sds.append(free[posterior.names.index("sensor_sd")])
     assert sds[1] > 3 * sds[0]
-
-
-def test_surprise_is_that_of_a_dense_matrix() -> None:
-    """(V⁻¹ r)ᵢ / √(V⁻¹)ᵢᵢ is a reading's distance from what all the others predict."""
-    posterior = short_posterior(samples=120, training=(slice(5, 60), slice(80, 120)))
-    place = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(7), 1))[0]
-    value = dict(
-        zip(
-            posterior.prior.names,
-            posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])[0],
-            strict=True,
-        )
-    )
-    rows = posterior.only.readings.rows
-    apart = np.abs(np.subtract.outer(rows, rows)) * INTERVAL / value["discrepancy_time"]
-    dense = value["discrepancy_sd"] ** 2 * np.exp(-apart)
-    inverse = linalg.inv(dense + value["sensor_sd"] ** 2 * np.eye(rows.size))
-    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
-    residual = posterior.only.readings.values - posterior.simulate(theta, rows)[0]
-    expected = inverse @ residual / np.sqrt(np.diag(inverse))
-    np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-6)
 
 
 def test_a_record_full_of_outliers_is_refused() -> None:

@@ -62,12 +62,9 @@ PRIORS = {
     "default": joint_prior(ALL, RANGES, {}),
     "cut": cut_prior(),
     "alpha fixed": cut_prior(alpha=0.6),
-    "d fixed": cut_prior(d=0.4),
     "gamma fixed": cut_prior(gamma=-0.03),
-    "beta fixed": cut_prior(beta=0.01),
     "exponent fixed": cut_prior(exponent=1.0),
     "active": active(cut_prior()),
-    "active, gamma fixed": active(cut_prior(gamma=0.03)),
     "active, beta fixed": active(cut_prior(beta=0.01)),
     "active, initial fixed": active(cut_prior(initial=3.0)),
 }
@@ -223,14 +220,6 @@ def test_what_is_positive_stays_positive_under_any_prior(name: str) -> None:
     x, log_prior = prior.constrain(np.linspace(-20, 20, 81)[:, np.newaxis])
     assert (x[np.isfinite(log_prior)] > 0).all()
     assert np.isfinite(log_prior[np.abs(np.linspace(-20, 20, 81)) < 7]).all()
-
-
-def test_theta_puts_fixed_parameters_in_their_columns() -> None:
-    prior = cut_prior(alpha=0.2, exponent=1.0)
-    assert ("d", "beta", "gamma", "initial") == prior.free_names
-    assert 4 == prior.dimensions
-    theta = prior.theta(np.array([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]]))
-    np.testing.assert_array_equal([[1, 0.2, 2, 3, 1, 4], [5, 0.2, 6, 7, 1, 8]], theta)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
 from bwbayes.inference.posterior import Posterior
-from tests.inference.problems import INTERVAL, short_posterior, single, truth
+from tests.inference.problems import INTERVAL, short_posterior, single
 
 
 def scalar_displacement(theta: dict[str, float], voltage: FloatArray) -> FloatArray:
@@ -90,17 +90,6 @@ def test_a_batch_is_its_rows(size: int) -> None:
     np.testing.assert_allclose(alone[1:], together[1:], rtol=1e-12)
 
 
-def test_samples_outside_the_training_windows_do_not_count() -> None:
-    posterior = short_posterior("white", 150, training=WINDOWS)
-    theta = truth(posterior)
-    before = posterior.log_likelihood(theta)
-    held_out = np.ones(150, dtype=bool)
-    for window in WINDOWS:
-        held_out[window] = False
-    posterior.only.displacement[held_out] = np.nan
-    np.testing.assert_array_equal(before, posterior.log_likelihood(theta))
-
-
 def test_fixed_parameters_take_their_value() -> None:
     """The posterior with d fixed is the whole posterior at that d, up to d's prior."""
     whole = short_posterior("white", 100)
@@ -135,13 +124,6 @@ def test_a_likelihood_that_is_not_finite_is_no_evidence(value: float) -> None:
     expected = sound.log_density(z)
     expected[::2] = -np.inf
     np.testing.assert_array_equal(expected, broken.log_density(z))
-
-
-def test_coordinates_that_are_not_numbers_have_no_density() -> None:
-    posterior = short_posterior("white", 50)
-    z = np.zeros((3, len(posterior.names)))
-    z[1, 2], z[2, 0] = np.nan, np.inf
-    assert [True, False, False] == np.isfinite(posterior.log_density(z)).tolist()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from bwbayes.inference.compiled.walk import walk
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
-from tests.inference.test_gain_and_creep import GAIN, PARTS
+from tests.inference.test_gain_and_creep import GAIN, PARTS, WAYS
 from tests.inference.test_likelihood import moving
 from tests.inference.test_stages import OPERATORS, models
 from tests.model.operators.differential import SPAN, paths
@@ -38,8 +38,7 @@ def assert_walks_as(actuator: Actuator, theta: FloatArray, voltage: FloatArray, 
     assert (np.abs(got - expected) <= 1e-11 * size).all()
 
 
-@pytest.mark.parametrize("dynamics", ["none", "lag", "second-order"])
-@pytest.mark.parametrize("hold", ["first", "zero"])
+@pytest.mark.parametrize(("dynamics", "hold"), WAYS)
 @pytest.mark.parametrize("parts", ["none", *PARTS])
 @pytest.mark.parametrize("count", [1, LANES + 3])
 def test_bouc_wen_walks_as_with_numpy(dynamics: str, hold: Hold, parts: str, count: int) -> None:

@@ -59,9 +59,9 @@ def moments(
     table = ParameterTable(actuator, noise)
     column, parameters = table.columns(theta), table.noise(theta)
     missing, gaps = np.unique(np.append(skipped, (-1.0, 0.0)), return_inverse=True)
-    usual = _step(noise, parameters, 1.0)
+    usual = noise.step(parameters)
     sensor, process = (sd**2 for sd in reversed(noise.marginal_sd(parameters)))
-    steps = np.array([_step(noise, parameters, number) for number in missing[2:].tolist()])
+    steps = np.array([noise.step(parameters, number).T for number in missing[2:].tolist()])
     steps = steps.reshape(-1, len(theta), lanes.STEP)
     # What is None is left out when it is compiled.
     second = True if noise.states > 1 else None
@@ -73,7 +73,7 @@ def moments(
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
         named = physics(actuator, column, equilibrium, voltage)
-        named |= dict(zip(lanes.PARAMETERS[lanes.KEPT // lanes.LANES :], usual.T, strict=False))
+        named |= dict(zip(lanes.PARAMETERS[lanes.KEPT // lanes.LANES :], usual, strict=False))
         named |= {"process": process, "sensor": sensor}
         responses = actuator.sections(column).recursions[0].free
         for unknown, tap in np.ndindex(responses.shape[1:]):
@@ -91,14 +91,8 @@ def moments(
     for i in range(size):
         for j in range(i + 1):
             products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
-    typical = np.count_nonzero(skipped >= 0) * np.log(usual[:, 3] + sensor)
+    typical = np.count_nonzero(skipped >= 0) * np.log(usual[3] + sensor)
     return products, typical + sums[lanes.LOG_DETERMINANT]
-
-
-def _step(noise: Noise, theta: FloatArray, readings: float) -> FloatArray:
-    """Return the filter's step over so many readings (models, rows)."""
-    parts = noise.transition(theta, readings), noise.fresh(theta, readings)
-    return np.concatenate([part[:, [0, 0, 1], [0, 1, 1]] for part in parts], axis=1)
 
 
 def _staged(
