@@ -34,19 +34,12 @@ __all__ = [
 MOST_SAMPLES = 10**7
 
 
-def _require_finite(where: str, value: float) -> None:
+def _require(where: str, value: float, kind: Literal["finite", "positive", "not negative"]) -> None:
+    """Refuse a number that is not finite, or has the wrong sign."""
     if not math.isfinite(value):
         raise InputError(f"{where}: {value} is not finite; give a finite number")
-
-
-def _require_positive(where: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{where}: {value} is not above zero; give a positive, finite number")
-
-
-def _require_not_negative(where: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0):
-        raise InputError(f"{where}: {value} is below zero or not finite; give zero or more")
+    if (kind == "positive" and value <= 0) or (kind == "not negative" and value < 0):
+        raise InputError(f"{where}: {value} is not {kind}; give a {kind} number")
 
 
 class Carrier(Protocol):
@@ -70,9 +63,9 @@ class _Periodic:
 
     def __post_init__(self) -> None:
         where = type(self).__name__.lower()
-        _require_finite(f"{where}: amplitude", self.amplitude)
-        _require_positive(f"{where}: frequency", self.frequency)
-        _require_finite(f"{where}: phase", self.phase)
+        _require(f"{where}: amplitude", self.amplitude, "finite")
+        _require(f"{where}: frequency", self.frequency, "positive")
+        _require(f"{where}: phase", self.phase, "finite")
 
     @property
     def highest_frequency(self) -> float:
@@ -133,8 +126,8 @@ class Staircase:
         if not self.levels:
             raise InputError("staircase: levels: there is none; give at least one voltage")
         for level in self.levels:
-            _require_finite("staircase: levels", level)
-        _require_positive("staircase: dwell", self.dwell)
+            _require("staircase: levels", level, "finite")
+        _require("staircase: dwell", self.dwell, "positive")
 
     @property
     def highest_frequency(self) -> float:
@@ -173,8 +166,8 @@ class Decay:
     kind: Literal["linear", "exponential"] = "linear"
 
     def __post_init__(self) -> None:
-        _require_finite("decay: start", self.start)
-        _require_not_negative("decay: rate", self.rate)
+        _require("decay: start", self.start, "finite")
+        _require("decay: rate", self.rate, "not negative")
         if self.kind not in ("linear", "exponential"):
             raise InputError(f"decay: kind: no {self.kind!r}; give 'linear' or 'exponential'")
 
@@ -217,9 +210,9 @@ class Waveform:
     bias: float = 0.0
 
     def __post_init__(self) -> None:
-        _require_positive("waveform: duration", self.duration)
-        _require_not_negative("waveform: start", self.start)
-        _require_finite("waveform: bias", self.bias)
+        _require("waveform: duration", self.duration, "positive")
+        _require("waveform: start", self.start, "not negative")
+        _require("waveform: bias", self.bias, "finite")
         if self.start >= self.duration:
             raise InputError(
                 f"waveform: start: {self.start:g} s is not before the end at "
@@ -250,7 +243,7 @@ class Waveform:
         Raises :class:`InputError` if the rate is not above zero or too low for the carrier, or the
         duration holds fewer than two samples or more than ten million.
         """
-        _require_positive("sampling: rate", rate)
+        _require("sampling: rate", rate, "positive")
         lowest = 2 * self.carrier.highest_frequency
         if rate <= lowest:
             raise InputError(

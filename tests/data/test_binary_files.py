@@ -159,6 +159,16 @@ def test_a_cut_off_file_is_refused(tmp_path: Path, kind: Kind, part: int) -> Non
     assert "; " in fault(path)
 
 
+def test_numbers_that_are_damaged_are_refused(tmp_path: Path) -> None:
+    """A MATLAB file keeps dimensions and numbers apart: here of 24 numbers as if they were 56."""
+    path = store(tmp_path, "mat", GOOD)
+    data = bytearray(path.read_bytes())
+    dimensions = data.index(struct.pack("<IIII", 5, 8, 1, SAMPLES))
+    struct.pack_into("<I", data, dimensions + 12, 56)
+    path.write_bytes(data)
+    assert ": time_s: damaged or cut off (cannot reshape" in fault(path)
+
+
 def test_version_4_is_refused_by_name(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "record.mat", GOOD, format="4")
     assert "save it with -v7" in fault(tmp_path / "record.mat")

@@ -9,7 +9,7 @@ the sample, counted from 0.
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from bwbayes.errors import InputError
 
 __all__ = [
     "MINIMUM_SAMPLES",
-    "Checked",
     "VoltageIs",
     "checked",
     "checked_reference",
@@ -31,21 +30,6 @@ VoltageIs = Literal["command", "output"]
 """What a voltage column is: the command that a DAC holds, or the amplifier's output."""
 
 MINIMUM_SAMPLES = 10
-
-_SMALLEST = 1e-9  # V or um: a range below it is none
-
-
-class Checked(TypedDict):
-    """What a record is made of, in the package's units and with their checks behind them."""
-
-    voltage: FloatArray
-    displacement: FloatArray | None
-    interval: float
-    start: float
-    voltage_is: VoltageIs
-    origin: str
-    truth: FloatArray | None
-    time_offset: float
 
 
 def require_voltage_is(text: str) -> VoltageIs:
@@ -58,8 +42,8 @@ def require_voltage_is(text: str) -> VoltageIs:
 
 def checked(
     table: FileTable, *, voltage_is: VoltageIs | None = None, need_displacement: bool = True
-) -> Checked:
-    """Return what a table's record is made of, after all checks that do not depend on the format.
+) -> dict[str, Any]:
+    """Return a record's arguments, after all checks that do not depend on the format.
 
     Parameters
     ----------
@@ -92,20 +76,22 @@ def checked(
     if not need_displacement and np.isnan(values.get("displacement", 0.0)).all():
         del values["displacement"]
     if "displacement" in values:
-        _check_readings(table, values["displacement"])
+        read = values["displacement"][~np.isnan(values["displacement"])]
+        if read.size < MINIMUM_SAMPLES:
+            problem = f"too few readings: {read.size}; give at least {MINIMUM_SAMPLES}"
+            raise table.error(problem, "displacement")
+        _check_moving(table, "displacement", read)
     if grid.places is not None:
         values = {name: _filled(column, grid.places, name) for name, column in values.items()}
-    origin = table.notes.get("origin") or table.path.name
-    return Checked(
-        voltage=values["voltage"],
-        displacement=values.get("displacement"),
-        interval=grid.interval,
-        start=grid.start,
-        voltage_is=kind,
-        origin=origin,
-        truth=values.get("truth"),
-        time_offset=grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
-    )
+    return {
+        "displacement": None,
+        **values,
+        "interval": grid.interval,
+        "start": grid.start,
+        "voltage_is": kind,
+        "origin": table.notes.get("origin") or table.path.name,
+        "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
+    }
 
 
 def checked_reference(table: FileTable) -> tuple[FloatArray, float]:
@@ -137,10 +123,10 @@ def _check_lengths(table: FileTable) -> None:
 
 def _filled(values: FloatArray, places: IntArray, quantity: str) -> FloatArray:
     """Return a column on the whole grid: the voltage held in the gaps, all else missing there."""
+    if quantity == "voltage":
+        return np.repeat(values, np.diff(places, append=places[-1] + 1))
     full = np.full(int(places[-1]) + 1, np.nan)
     full[places] = values
-    if quantity == "voltage":
-        full = np.repeat(values, np.diff(places, append=places[-1] + 1))
     return full
 
 
@@ -149,14 +135,6 @@ def _check_moving(table: FileTable, quantity: str, values: FloatArray) -> None:
     if extent == 0:
         problem = f"constant at {values[0]:g}; give a record in which it moves"
         raise table.error(problem, quantity)
-    if extent < _SMALLEST:
+    if extent < 1e-9:  # V or um
         problem = f"moves by {extent:.3g} at most, which is absurdly little; check the unit"
         raise table.error(problem, quantity)
-
-
-def _check_readings(table: FileTable, displacement: FloatArray) -> None:
-    read = displacement[~np.isnan(displacement)]
-    if read.size < MINIMUM_SAMPLES:
-        problem = f"too few readings: {read.size}; give at least {MINIMUM_SAMPLES}"
-        raise table.error(problem, "displacement")
-    _check_moving(table, "displacement", read)

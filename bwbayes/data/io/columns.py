@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bwbayes.data.io.series import Series, Source, require_real
+from bwbayes.arrays import FloatArray
+from bwbayes.data.io.series import Series, Source, real_numbers
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 
 __all__ = [
@@ -330,18 +331,20 @@ def _listed(series: Sequence[Series]) -> str:
 
 def _rises(series: Series) -> bool:
     """Tell whether a series may be the time."""
-    try:
-        return bool(np.all(np.diff(np.asarray(series.load(), dtype=np.float64)) > 0))
-    except ValueError:
-        return False
+    values = _finite(series)
+    return values.size == series.size and bool(np.all(np.diff(values) > 0))
 
 
 def _extent(series: Series) -> tuple[float, float]:
     """Return the least and the largest number of a series; nan if it has none."""
+    values = _finite(series)
+    return (values.min(), values.max()) if values.size else (np.nan, np.nan)
+
+
+def _finite(series: Series) -> FloatArray:
+    """Return the finite numbers of a series; none of one that has something else."""
     try:
-        values = np.asarray(series.load())
-        require_real(series.name, values.dtype.kind)
-    except ValueError:
-        return np.nan, np.nan
-    values = values[np.isfinite(values)]
-    return (values.min() + 0.0, values.max() + 0.0) if values.size else (np.nan, np.nan)
+        values = real_numbers(series, series.name).astype(np.float64)
+    except InputError:
+        return np.empty(0)
+    return values[np.isfinite(values)] + 0.0

@@ -19,9 +19,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.data.io.series import Series, Source, vectors
+from bwbayes.data.io.series import Series, Source, damaged, vectors
 from bwbayes.data.record import Record
-from bwbayes.errors import InputError
 
 __all__ = ["is_hdf5", "read_hdf5", "record_arrays", "write_hdf5"]
 
@@ -61,16 +60,13 @@ def read_hdf5(path: Path) -> Source:
                     load = partial(_loaded, path, dataset.name)
                     series += vectors(prefix, leaf, dataset.shape, dataset.dtype, load, unit)
             return Source(path, tuple(series), notes)
-    except Exception as error:  # a damaged file fails in whatever way HDF5 stumbles over it
-        raise InputError(f"{path}: damaged or cut off ({_brief(error)}); write it again") from error
+    except Exception as error:
+        raise damaged(path, error) from error
 
 
 def _loaded(path: Path, name: str) -> Any:
-    try:
-        with h5py.File(path, "r") as file:
-            return file[name][()]
-    except Exception as error:
-        raise InputError(f"{path}: {name}: damaged ({_brief(error)}); write it again") from error
+    with h5py.File(path, "r") as file:
+        return file[name][()]
 
 
 def write_hdf5(record: Record, path: Path) -> None:
@@ -186,7 +182,3 @@ def _text(value: Any) -> str:
         return ""
     first = np.ravel(value)[0]
     return first.decode("utf-8", errors="replace") if isinstance(first, bytes) else str(first)
-
-
-def _brief(error: Exception) -> str:
-    return " ".join(str(error).split())[:80] or type(error).__name__

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.data.io.series import Series, Source
+from bwbayes.data.io.series import Series, Source, damaged
 from bwbayes.errors import InputError
 
 __all__ = ["is_lvm", "plain_lvm", "read_tdms"]
@@ -105,9 +105,8 @@ def read_tdms(path: Path) -> Source:
             )
             for channel in channels
         ]
-    except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
-        reason = " ".join(str(error).split())[:80] or type(error).__name__
-        raise InputError(f"{path}: damaged or cut off ({reason}); write it again") from error
+    except Exception as error:
+        raise damaged(path, error) from error
     step = steps.pop() if len(steps) == 1 else None
     return Source(
         path,
@@ -122,6 +121,4 @@ def _values(channel: Any) -> NDArray[Any]:
     values = np.asarray(channel[:])
     if values.dtype.kind == "M":
         values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-    if values.dtype.kind not in "iuf":
-        raise InputError(f"{channel.name}: not numbers; choose another channel")
     return values

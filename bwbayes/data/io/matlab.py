@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 
 from bwbayes.data.io.hdf5 import read_hdf5, record_arrays
-from bwbayes.data.io.series import MAXIMUM_SAMPLES, Series, Source, vectors
+from bwbayes.data.io.series import MAXIMUM_SAMPLES, Series, Source, damaged, vectors
 from bwbayes.data.record import Record
 from bwbayes.errors import InputError
 
@@ -62,10 +62,8 @@ def read_mat(path: Path) -> Source:
         return _read_5(path)
     except InputError:
         raise
-    except Exception as error:  # a damaged file fails in whatever way the reader stumbles over it
-        reason = " ".join(str(error).split())[:80] or type(error).__name__
-        problem = f"not a MATLAB file, damaged or cut off ({reason})"
-        raise InputError(f"{path}: {problem}; save it again") from error
+    except Exception as error:
+        raise damaged(path, error) from error
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:

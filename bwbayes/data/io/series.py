@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAXIMUM_SAMPLES", "Series", "Source", "require_real", "vectors"]
+from bwbayes.errors import InputError
+
+__all__ = ["MAXIMUM_SAMPLES", "Series", "Source", "damaged", "real_numbers", "vectors"]
 
 MAXIMUM_SAMPLES = 10**8
 
@@ -107,15 +109,28 @@ def _column(load: Any, number: int, by_row: bool) -> NDArray[Any]:
     return column
 
 
-def require_real(name: str, kind: str) -> None:
-    """Refuse an array whose kind of numbers, as NumPy's dtypes call it, is not real.
+def damaged(where: object, error: Exception) -> InputError:
+    """Return the error of a file that a reader stumbled over, in whatever way it did."""
+    reason = " ".join(str(error).split())[:80] or type(error).__name__
+    return InputError(f"{where}: damaged or cut off ({reason}); write it again")
+
+
+def real_numbers(series: Series, where: str) -> NDArray[Any]:
+    """Return the numbers of a series, which stands ``where``.
 
     Raises
     ------
-    ValueError
-        With the text ``problem; what to do``.
+    InputError
+        They are not real numbers, or damaged.
     """
-    if kind not in "iuf":
+    try:
+        values = np.asarray(series.load())
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(where, error) from error
+    if values.dtype.kind not in "iuf":
         kinds = {"c": "complex numbers", "b": "logical values"}
-        problem = kinds.get(kind, "text or another type that is not a number")
-        raise ValueError(f"{name}: holds {problem}; store real numbers")
+        problem = kinds.get(values.dtype.kind, "text or another type that is not a number")
+        raise InputError(f"{where}: holds {problem}; store real numbers")
+    return values

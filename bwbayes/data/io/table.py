@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray
 from bwbayes.data.io.columns import COMMON_NAMES, QUANTITIES, Naming, choose, is_own, power_of
-from bwbayes.data.io.series import Source, require_real
+from bwbayes.data.io.series import Source, real_numbers
 from bwbayes.errors import InputError, InputWarning, one_line
 
 __all__ = ["AT_EVERY_SAMPLE", "FileColumn", "FileTable", "converted", "scaled", "table_of"]
@@ -72,13 +72,10 @@ def table_of(source: Source, naming: Naming, needed: Collection[str] = QUANTITIE
     chosen = choose(source, naming, needed)
     columns: dict[str, FileColumn] = {}
     for quantity, (series, unit) in chosen.items():
-        values = np.asarray(series.load())
-        try:
-            require_real(series.name, values.dtype.kind)
-        except ValueError as error:
-            raise InputError(f"{source.path}: {error}") from None
+        where = f"{source.path}: {series.name}"
+        values = real_numbers(series, where)
         if values.shape != (series.size,):
-            raise InputError(f"{source.path}: {series.name}: damaged or cut off; write it again")
+            raise InputError(f"{where}: damaged or cut off; write it again")
         columns[quantity] = FileColumn(series.name, values, unit)
     if "time" not in columns:
         interval = source.interval if naming.fs is None else 1 / naming.fs
