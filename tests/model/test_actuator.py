@@ -129,15 +129,6 @@ def test_constant_voltage_leaves_the_actuator_at_rest(actuator: Actuator) -> Non
 
 
 @every_kind
-def test_a_model_does_not_depend_on_its_batch(actuator: Actuator) -> None:
-    theta = batch_of(actuator, 12)
-    together = actuator.displacement(theta, random_walk(10))
-    assert (12, 151) == together.shape
-    for row in range(12):
-        assert_close(actuator.displacement(theta[row], random_walk(10))[0], together[row], 1e-12)
-
-
-@every_kind
 def test_arguments_stay_as_they_are(actuator: Actuator) -> None:
     theta, voltage = batch_of(actuator, 3), random_walk(11)
     _, state = actuator.advance(theta, voltage)

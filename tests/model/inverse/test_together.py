@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
@@ -18,7 +15,7 @@ from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.together import MANY
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.bouc_wen import BoucWen, hysteresis
+from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.one_state import StateMemory
 from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
@@ -79,38 +76,6 @@ def followed(
         patch.setattr(side, "MANY", 1)
         right = side.together(ones, columns, here, drive, made)
     return made, right
-
-
-def test_steps_as_large_as_the_range_against_a_search() -> None:
-    """Zero is crossed within a step, with β near 0, γ = β and states beyond the ceiling too."""
-    column = {
-        "d": np.array([0.7, 0.7, 0.7, 0.7]),
-        "alpha": np.array([0.3, 0.3, 0.3, 0.2]),
-        "beta": np.array([0.027, 0.02, 0.03, 1e-9]),
-        "gamma": np.array([0.017, 0.02, 0.0, 0.0]),
-    }
-    state = np.array([-5.0, 3.0, 12.0, 0.0])
-    drive = np.array([[30.0, -25.0, 10.0, 10.0, 12.0, -30.0]]).repeat(4, axis=0)
-    made, right = followed(BoucWen(), column, state, drive)
-    assert right.all()
-    for row in range(4):
-        d = float(column["d"][row])
-        shape = {name: column[name][row] for name in ("alpha", "beta", "gamma")}
-        u, h = 0.0, float(state[row])
-        for t, goal in enumerate(drive[row]):
-
-            def moved(v: float, u: float = u, h: float = h, shape: Any = shape) -> float:
-                return float(hysteresis([u, v], **shape, initial=h)[0, -1])
-
-            v = brentq(
-                lambda v, d=d, goal=goal, moved=moved: d * v - moved(v) - goal,
-                -300.0,
-                300.0,
-                xtol=1e-12,
-                rtol=1e-14,
-            )
-            u, h = v, moved(v)
-            assert made[row, t] == pytest.approx(u, abs=1e-9)
 
 
 def test_models_that_cannot_go_side_by_side_go_alone() -> None:

@@ -69,25 +69,6 @@ def test_the_mirrored_drive_and_start_give_mirrored_h(
     parameters=any_model,
     share=inside,
     path=corners,
-    holds=st.lists(st.integers(1, 4), min_size=8, max_size=8),
-)
-def test_h_does_not_depend_on_the_pace(
-    parameters: Model, share: float, path: list[float], holds: list[int]
-) -> None:
-    """Waiting at any sample, even within a stretch, changes nothing after it."""
-    start, repeats = share * top_of(parameters), np.array(holds[: len(path)])
-    expected = hysteresis(np.array(path), *parameters, initial=start)[0]
-    held = hysteresis(np.repeat(path, repeats), *parameters, initial=start)[0]
-    np.testing.assert_allclose(
-        held, np.repeat(expected, repeats), rtol=0, atol=1e-12 * top_of(parameters)
-    )
-
-
-@few
-@given(
-    parameters=any_model,
-    share=inside,
-    path=corners,
     pieces=st.lists(st.integers(1, 9), min_size=7, max_size=7),
 )
 def test_refining_the_drive_changes_nothing(
@@ -122,26 +103,6 @@ def test_h_stays_below_the_ceiling_from_any_start_inside(
     h = hysteresis(np.array(path), *parameters, initial=share * top)
     assert np.isfinite(h).all()
     assert np.abs(h).max() <= top * (1 + 1e-11)
-
-
-@few
-@given(
-    batch=st.sampled_from([(1.0,), (1.3, 2.0, 5.0)]).flatmap(
-        lambda exponents: st.lists(
-            st.tuples(models(every_ratio, exponents), inside), min_size=2, max_size=9
-        )
-    ),
-    path=corners,
-)
-def test_a_row_does_not_depend_on_its_batch(
-    batch: list[tuple[Model, float]], path: list[float]
-) -> None:
-    starts = [share * top_of(parameters) for parameters, share in batch]
-    alpha, beta, gamma, exponent = np.array([parameters for parameters, _ in batch]).T
-    together = hysteresis(np.array(path), alpha, beta, gamma, exponent, np.array(starts))
-    for (parameters, _), start, row in zip(batch, starts, together, strict=True):
-        alone = hysteresis(np.array(path), *parameters, initial=start)[0]
-        np.testing.assert_allclose(row, alone, rtol=0, atol=1e-12 * top_of(parameters))
 
 
 @few

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import conflicts
@@ -17,10 +19,11 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.operator import Span
+from bwbayes.model.operator import Operator, Span
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.results import identifiability
 from tests.inference.problems import decaying_sine, posterior_of
+from tests.model.operators.differential import RANGES, SPAN, prior_draws, w_of
 
 every_operator = pytest.mark.parametrize("name", HYSTERESIS)
 
@@ -70,6 +73,89 @@ def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
         parts.append(part)
     size = np.ptp(whole)
     np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, atol=1e-9 * size)
+
+
+def models(name: str, size: int, seed: int) -> tuple[Operator, dict[str, FloatArray]]:
+    """Return an operator and some models that hold, drawn from its default priors."""
+    operator = made("hysteresis", name, HYSTERESIS, {})
+    column = prior_draws(operator, 3 * size + 20, seed)
+    holds = np.flatnonzero(np.broadcast_to(operator.holds(column), 3 * size + 20))[:size]
+    return operator, {name: values[holds] for name, values in column.items()}
+
+
+def assert_near(name: str, expected: FloatArray, got: FloatArray) -> None:
+    """Compare to the error that is promised, in units of the range."""
+    tolerance = 1e-6 if name in ("jiles-atherton", "domain-wall") else 1e-12
+    size = np.ptp(expected, axis=1, keepdims=True) + np.abs(expected[:, :1]) + 1e-9
+    assert (np.abs(got - expected) <= tolerance * size).all()
+
+
+corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=6)
+
+
+@every_operator
+@settings(deadline=None, max_examples=10)
+@given(path=corners, seed=st.integers(0, 9), holds=st.lists(st.integers(1, 3), min_size=6))
+def test_neither_the_pace_nor_the_batch_matters(
+    name: str, path: list[float], seed: int, holds: list[int]
+) -> None:
+    """Waiting at any sample changes nothing, and a model does not feel its neighbors."""
+    operator, column = models(name, 5, seed)
+    w = w_of(operator, column, np.array(path))
+    repeats = np.array(holds[: len(path)])
+    slow = w_of(operator, column, np.repeat(path, repeats))
+    assert_near(name, np.repeat(w, repeats, axis=1), slow)
+    for row in (0, 4):
+        alone = w_of(operator, {k: v[row : row + 1] for k, v in column.items()}, np.array(path))
+        np.testing.assert_allclose(alone[0], w[row], rtol=1e-13, atol=1e-13)
+
+
+@every_operator
+def test_from_rest_the_voltage_came_straight_from_zero(name: str) -> None:
+    operator, column = models(name, 5, 6)
+    memory = operator.begin(column, 35.0, SPAN, from_rest=True)
+    w, _ = operator.advance(column, np.array([35.0, 20.0]), memory)
+    again, _ = operator.advance(column, np.array([35.0, 20.0]), memory)
+    np.testing.assert_array_equal(again, w)
+    at_zero = operator.begin(column, 0.0, SPAN, from_rest=True)
+    whole, _ = operator.advance(column, np.array([0.0, 35.0, 20.0]), at_zero)
+    assert_near(name, whole[:, 1:], w)
+
+
+@every_operator
+def test_draws_of_the_default_priors_have_displacements_of_the_right_size(name: str) -> None:
+    """The median range of w is within a factor of three of the record's."""
+    operator, column = models(name, 50, 1)
+    voltage = RANGES.bias + RANGES.voltage * np.sin(np.linspace(0, 12, 60))
+    size = np.ptp(w_of(operator, column, voltage)[:, 20:], axis=1)
+    assert 1 / 3 < np.median(size) / (2 * RANGES.displacement) < 3
+
+
+@every_operator
+def test_the_initial_curve_rises(name: str) -> None:
+    """From zero volts either way, and from no hysteresis; Duhem's is in its own tests."""
+    operator, column = models(name, 50, 3)
+    column["initial"] = np.zeros_like(column["initial"])
+    for sign in (1.0, -1.0) if name != "duhem" else ():
+        memory = operator.begin(column, 0.0, SPAN, from_rest=True)
+        w, _ = operator.advance(column, sign * np.linspace(0, 60, 100), memory)
+        assert (np.diff(sign * w, axis=1) >= -1e-9 * np.abs(w[:, -1:])).all()
+
+
+@every_operator
+@settings(deadline=None, max_examples=5)
+@given(ends=st.tuples(st.integers(-100, 100), st.integers(-100, 100)), seed=st.integers(0, 9))
+def test_a_settled_loop_loses_energy(name: str, ends: tuple[int, int], seed: int) -> None:
+    """∮ u dw ≥ 0, by the trapezium rule on a loop that is gone through again and again."""
+    operator, column = models(name, 5, seed)
+    back_and_forth = np.interp(np.linspace(0, 8, 1601), np.arange(9), [*ends] * 4 + [ends[0]])
+    w = w_of(operator, column, back_and_forth.astype(float))
+    # Whole periods, which differ by what has not settled.
+    u, last = back_and_forth[-401:], w[:, -401:]
+    lost = np.sum((u[1:] + u[:-1]) / 2 * np.diff(last, axis=1), axis=1)
+    unsettled = np.abs(last[:, 0] - last[:, -1]) * np.abs(u).max()
+    size = np.ptp(u) * np.ptp(last, axis=1)
+    assert (lost >= -1e-4 * size - unsettled - 1e-9).all()
 
 
 @every_operator

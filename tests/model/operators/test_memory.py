@@ -166,52 +166,6 @@ def test_densities_are_the_limit_of_many_relays(name: str, width: float) -> None
 
 @every_case
 @settings(max_examples=15, deadline=None)
-@given(voltage=paths, span=spans, cuts=st.lists(st.integers(0, 30), max_size=6))
-def test_pieces_do_not_matter(
-    case: Case, voltage: FloatArray, span: Span | None, cuts: list[int]
-) -> None:
-    whole = run(case.operator, case.column, voltage, span)
-    cut = run(case.operator, case.column, voltage, span, [min(k, voltage.size) for k in cuts])
-    np.testing.assert_array_equal(whole, cut)
-
-
-@every_case
-@settings(max_examples=15, deadline=None)
-@given(voltage=paths, span=spans)
-def test_a_model_does_not_feel_its_neighbors(
-    case: Case, voltage: FloatArray, span: Span | None
-) -> None:
-    together = run(case.operator, case.column, voltage, span)
-    for row, alone in enumerate(together):
-        column = {name: values[row : row + 1] for name, values in case.column.items()}
-        np.testing.assert_array_equal(alone, run(case.operator, column, voltage, span)[0])
-
-
-@every_case
-def test_advancing_leaves_the_memory_as_it_was(case: Case) -> None:
-    voltage = walk(9)
-    memory = case.operator.begin(case.column, float(voltage[0]), Span(-9, 99), from_rest=False)
-    once = case.operator.advance(case.column, voltage, memory)[0]
-    np.testing.assert_array_equal(once, case.operator.advance(case.column, voltage, memory)[0])
-
-
-@every_case
-@settings(max_examples=15, deadline=None)
-@given(voltage=paths, span=spans, samples=st.integers(2, 5))
-def test_pace_does_not_matter(
-    case: Case, voltage: FloatArray, span: Span | None, samples: int
-) -> None:
-    slow = np.interp(
-        np.arange(samples * (voltage.size - 1) + 1) / samples, np.arange(voltage.size), voltage
-    )
-    got = run(case.operator, case.column, slow, span)[:, ::samples]
-    np.testing.assert_allclose(
-        run(case.operator, case.column, voltage, span), got, rtol=0, atol=1e-11
-    )
-
-
-@every_case
-@settings(max_examples=15, deadline=None)
 @given(voltage=paths, inside=paths)
 def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: FloatArray) -> None:
     """A detour that stays between a record's end and its turn before leaves no trace."""
@@ -276,25 +230,6 @@ def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
     got = run(case.operator, case.column, path_down, None)
     first = run(case.operator, case.column, np.array([0.0, min(travel, top) / 2]), None)
     np.testing.assert_allclose(got[:, -2] - got[:, -1], 2 * first[:, -1], rtol=0, atol=1e-11)
-
-
-@every_case
-def test_the_initial_curve_rises(case: Case) -> None:
-    up = run(case.operator, case.column, np.linspace(0.0, 300.0, 500), None)
-    assert np.min(np.diff(up, axis=1)) > 0
-
-
-@every_case
-@settings(max_examples=15, deadline=None)
-@given(voltage=paths, loop=paths)
-def test_a_closed_cycle_loses_energy(case: Case, voltage: FloatArray, loop: FloatArray) -> None:
-    cycle = np.concatenate([loop, loop[:1]])
-    fine = np.interp(np.linspace(0, cycle.size - 1, 40 * cycle.size), np.arange(cycle.size), cycle)
-    twice = np.concatenate([voltage, fine, fine])
-    w = run(case.operator, case.column, twice, SPANS[0])[:, -fine.size :]
-    u = twice[-fine.size :]
-    lost = np.sum((u[1:] + u[:-1]) / 2 * np.diff(w, axis=1), axis=1)
-    assert np.min(lost) >= -1e-9
 
 
 @every_case

@@ -16,7 +16,7 @@ from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.one_state import OneState
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
-from tests.model.operators.differential import RANGES, SPAN, prior_draws, w_of
+from tests.model.operators.differential import SPAN, prior_draws, w_of
 
 OPERATORS: dict[str, OneState] = {
     "backlash-like": BacklashLike(),
@@ -61,44 +61,6 @@ def assert_near(operator: OneState, expected: FloatArray, got: FloatArray) -> No
     assert (np.abs(got - expected) <= tolerance(operator) * size).all()
 
 
-@every
-def test_draws_of_the_default_priors_have_displacements_of_the_right_size(name: str) -> None:
-    """The median range of w is within a factor of three of the record's, as is d's of a tenth."""
-    operator = OPERATORS[name]
-    column = models(operator, 300, 1)
-    voltage = RANGES.bias + RANGES.voltage * np.sin(np.linspace(0, 12, 60))
-    size = np.ptp(w_of(operator, column, voltage)[:, 20:], axis=1)
-    assert 1 / 3 < np.median(size) / (2 * RANGES.displacement) < 3
-    low, high = np.quantile(size, [0.05, 0.95]) / (2 * RANGES.displacement)
-    assert low < 0.7
-    assert 1.4 < high < 60
-
-
-@every
-@few
-@given(path=corners, seed=st.integers(0, 9), holds=st.lists(st.integers(1, 3), min_size=8))
-def test_the_pace_does_not_matter(
-    name: str, path: list[float], seed: int, holds: list[int]
-) -> None:
-    operator = OPERATORS[name]
-    column, repeats = models(operator, 3, seed), np.array(holds[: len(path)])
-    expected = np.repeat(w_of(operator, column, np.array(path)), repeats, axis=1)
-    got = w_of(operator, column, np.repeat(path, repeats))
-    assert_near(operator, expected, got)
-
-
-@every
-@few
-@given(path=corners, seed=st.integers(0, 9))
-def test_a_row_does_not_depend_on_its_batch(name: str, path: list[float], seed: int) -> None:
-    operator = OPERATORS[name]
-    column, voltage = models(operator, 7, seed), np.array(path)
-    together = w_of(operator, column, voltage)
-    for row in range(0, column["d"].size, 3):
-        alone = w_of(operator, rows(column, row), voltage)
-        np.testing.assert_allclose(alone[0], together[row], rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize("name", ODD)
 @few
 @given(path=corners, seed=st.integers(0, 9))
@@ -110,39 +72,6 @@ def test_the_mirrored_drive_and_start_give_the_mirrored_displacement(
     mirrored = {**column, "initial": -column["initial"]}
     expected = -w_of(operator, column, voltage)
     np.testing.assert_array_equal(w_of(operator, mirrored, -voltage), expected)
-
-
-@pytest.mark.parametrize(
-    "name", ["backlash-like", "bouc-wen-asymmetric", "jiles-atherton", "domain-wall"]
-)
-def test_the_initial_curve_rises(name: str) -> None:
-    """From zero volts either way, and from no hysteresis; Duhem's is in its own tests."""
-    operator = OPERATORS[name]
-    column = models(operator, 300, 3)
-    column["initial"] = np.zeros_like(column["initial"])
-    for sign in (1.0, -1.0):
-        w = w_of(operator, column, sign * np.linspace(0, 60, 200))
-        assert (np.diff(sign * w, axis=1) >= -1e-9 * np.abs(w[:, -1:])).all()
-
-
-@every
-@few
-@given(
-    ends=st.tuples(st.integers(-100, 100), st.integers(-100, 100)),
-    seed=st.integers(0, 9),
-)
-def test_a_settled_loop_loses_energy(name: str, ends: tuple[int, int], seed: int) -> None:
-    """∮ u dw ≥ 0, by the trapezium rule on a loop that is gone through again and again."""
-    operator = OPERATORS[name]
-    column = models(operator, 10, seed)
-    back_and_forth = np.interp(np.linspace(0, 8, 1601), np.arange(9), [*ends] * 4 + [ends[0]])
-    w = w_of(operator, column, back_and_forth.astype(float))
-    # Whole periods, which differ by what has not settled.
-    u, last = back_and_forth[-401:], w[:, -401:]
-    lost = np.sum((u[1:] + u[:-1]) / 2 * np.diff(last, axis=1), axis=1)
-    unsettled = np.abs(last[:, 0] - last[:, -1]) * np.abs(u).max()
-    size = np.ptp(u) * np.ptp(last, axis=1)
-    assert (lost >= -1e-4 * size - unsettled - 1e-9).all()
 
 
 @every
@@ -159,16 +88,6 @@ def test_a_minor_loop_is_not_forgotten_and_not_congruent(name: str) -> None:
     after_more = w_of(operator, column, np.array([0.0, 60.0, 0.0, 40.0, 0.0, 40.0]))
     heights = [np.diff(w[:, -2:], axis=1)[:, 0] for w in (after_less, after_more)]
     assert np.median(np.abs(heights[0] - heights[1]) / np.abs(heights[0])) > 1e-4
-
-
-@every
-def test_from_rest_the_voltage_came_straight_from_zero(name: str) -> None:
-    operator = OPERATORS[name]
-    column = models(operator, 5, 6)
-    memory = operator.begin(column, 35.0, SPAN, from_rest=True)
-    w, _ = operator.advance(column, np.array([35.0, 20.0]), memory)
-    expected = w_of(operator, column, np.array([0.0, 35.0, 20.0]))[:, 1:]
-    assert_near(operator, expected, w)
 
 
 @every
