@@ -29,17 +29,8 @@ from bwbayes.model.operator import UNIT, Span
 
 __all__ = ["MOST_TIMES", "Creep", "creep_times"]
 
-# Prior mean and sd of the creep per decade of time, as a part of the displacement: published are
-# 0.5 to 3 %. A normal prior, of which one in twenty-five is below zero: strengths are linear in the
-# displacement, and so their posterior is nearly normal too, which a sampler knows how to take.
-PER_DECADE, PER_DECADE_SD = 0.0175, 0.01
-
-# Prior scale of how much more the creep is at the largest voltage, as a part of it.
-GROWTH = 1.0
-
-# Times that a model may have, and of the record's: samples to the shortest, records to the longest.
+# Times that a model may have.
 MOST_TIMES = 8
-SHORTEST, LONGEST = 10.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +95,7 @@ class Creep:
             "-",
             r"\kappa",
             "growth of the creep from no voltage to the largest, as a part of it",
-            lambda _: Distribution("halfnormal", {"scale": GROWTH}),
+            lambda _: Distribution("halfnormal", {"scale": 1.0}),
             floor=0.0,
         )
         return (*strengths, growth)
@@ -115,7 +106,9 @@ class Creep:
         decades = 1.0
         if len(self.times) > 1:
             decades = math.log10(self.times[-1] / self.times[0]) / (len(self.times) - 1)
-        return normal(PER_DECADE * decades, PER_DECADE_SD * decades)
+        # Published are 0.5 to 3 % a decade. A normal prior, of which one in twenty-five is below
+        # zero: strengths are linear in the displacement, and so their posterior is nearly normal.
+        return normal(0.0175 * decades, 0.01 * decades)
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite, or the growth negative."""
@@ -140,10 +133,10 @@ class Creep:
 
 
 def creep_times(interval: float, duration: float) -> Sequence[float]:
-    """Return powers of ten in s, from some samples to some lengths of a record.
+    """Return powers of ten in s, from ten samples to three lengths of a record.
 
     At least one: that next to the record's length.
     """
-    first = math.ceil(math.log10(SHORTEST * interval))
-    last = max(math.floor(math.log10(LONGEST * duration)), first)
+    first = math.ceil(math.log10(10 * interval))
+    last = max(math.floor(math.log10(3 * duration)), first)
     return [10.0**power for power in range(max(first, last - MOST_TIMES + 1), last + 1)]

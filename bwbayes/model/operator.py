@@ -20,11 +20,6 @@ from bwbayes.model.step import HysteresisStep
 
 __all__ = ["UNIT", "Operator", "Span", "narrower"]
 
-# Ranges of earlier drives that are told apart: how far down, and how much further up they went.
-# Fewer leave steps that show; more take longer.
-REACHES = 16
-FURTHER = (0.8, 1.0, 1.25)
-
 
 class Span(NamedTuple):
     """The least and the largest voltage that earlier drives may have had, V."""
@@ -46,7 +41,7 @@ class Span(NamedTuple):
 UNIT = Span(-1.0, 1.0)
 
 
-def narrower(span: Span, further: tuple[float, ...] = FURTHER) -> tuple[Span, ...]:
+def narrower(span: Span, further: tuple[float, ...] = (0.8, 1.0, 1.25)) -> tuple[Span, ...]:
     """Return ranges about a span's middle, evenly from next to nothing to all of it.
 
     ``further`` is how far up they go, as parts of how far down.
@@ -54,11 +49,8 @@ def narrower(span: Span, further: tuple[float, ...] = FURTHER) -> tuple[Span, ..
     low, center, half = span.low, span.middle, span.half
     if not half > 0:
         return (span,)
-    ends = [
-        (down / REACHES, min(up * down / REACHES, 1.0))
-        for down in range(1, REACHES + 1)
-        for up in further
-    ]
+    # Fewer ranges leave steps that show; more take longer.
+    ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in further]
     return tuple(
         dict.fromkeys(Span(max(center - down * half, low), center + up * half) for down, up in ends)
     )

@@ -29,18 +29,6 @@ __all__ = ["SHORTEST", "One", "Path"]
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
 
-# Steps of the drive below this part of its range are rounding: they turn nothing.
-QUANTUM = 1e-13
-
-# A voltage beyond so many times what a straight line would need is not looked for.
-FARTHEST = 30.0
-
-# Rounds in which creep and drive are made to agree, and the part of the range to which they do.
-ROUNDS, AGREED = 200, 1e-14
-
-# Rounds whose changes are so many times the displacement do not come back.
-RUNAWAY = 1e3
-
 # The first reach, V at least, in which the voltage at which a record starts is looked for.
 SHORTEST = 1e-9
 
@@ -98,7 +86,8 @@ class One:
     def anywhere(self, peak: float) -> Path:
         """Return a range of voltages that is wide for displacements up to a peak, um."""
         size = peak / self.slope if self.slope > 0 else 1.0
-        extent = FARTHEST * max(size, abs(self.span.low), abs(self.span.high))
+        # Beyond so many times what a straight line would need no voltage is looked for.
+        extent = 30.0 * max(size, abs(self.span.low), abs(self.span.high))
         return Path(-extent, extent)
 
     def drive(
@@ -115,8 +104,8 @@ class One:
         states = sections.begin(None) if self.state is None else self.state.filter
         strengths = [float(gain[0]) for gain in sections.gains[1:]]
         drive = displacement / (1 + sum(strengths))
-        close = AGREED * float(np.max(np.abs(displacement)))
-        for _ in range(ROUNDS):
+        size = float(np.max(np.abs(displacement)))
+        for _ in range(200):
             crept = drive[np.newaxis]
             if creep.growing:
                 assert path is not None
@@ -128,10 +117,10 @@ class One:
                 remainder -= strength * (equilibrium + moved)
             before, drive = drive, self._driven(remainder, dynamics)
             change = float(np.max(np.abs(drive - before)))
-            if change <= close:
+            if change <= 1e-14 * size:
                 return drive
-            if not change < RUNAWAY * float(np.max(np.abs(displacement))):
-                break
+            if not change < 1e3 * size:
+                break  # which does not come back
         raise InputError(
             f"reference: creep of {sum(strengths):.3g} of the drive cannot be undone; check the "
             "model's creep and gain"
@@ -167,7 +156,8 @@ class One:
 
     def _static(self, drive: FloatArray, path: Path) -> FloatArray:
         """Return the voltage (samples,) with which hysteresis and gain make a drive (samples,)."""
-        quantum = QUANTUM * float(np.ptp(drive))
+        # Steps of the drive below this part of its range are rounding: they turn nothing.
+        quantum = 1e-13 * float(np.ptp(drive))
         if quantum > 0:
             drive = drive[0] + quantum * np.round((drive - drive[0]) / quantum)
         result = np.empty_like(drive)

@@ -16,13 +16,8 @@ from bwbayes.arrays import FloatArray
 
 __all__ = ["first_crossing", "reached"]
 
-# Places at which a curve is looked at first.
-GRID = 33
-
-# Doublings of the first reach, and rounds of the root search; each ends by far earlier.
-DOUBLINGS, ROUNDS = 40, 100
-
-EPSILON = float(np.finfo(np.float64).eps)
+# Doublings of the first reach, of which it needs a few.
+DOUBLINGS = 40
 
 
 def reached(
@@ -61,13 +56,13 @@ def reached(
     )
     if room == 0.0:
         return np.full(target.shape, farthest)
-    points = start + s * room * np.linspace(0.0, 1.0, GRID)
+    points = start + s * room * np.linspace(0.0, 1.0, 33)
     points[-1] = farthest
     heights = np.concatenate([[0.0], s * (along(points[1:]) - here)])
     heights = np.maximum.accumulate(heights)
     if goal[0] >= heights[-1]:
         return np.full(target.shape, farthest)
-    above = np.clip(np.searchsorted(heights, goal), 1, GRID - 1)
+    above = np.clip(np.searchsorted(heights, goal), 1, points.size - 1)
     result = searched(
         lambda voltage: s * (_in_order(along, voltage, s) - here) - goal,
         (points[above - 1], points[above]),
@@ -142,7 +137,7 @@ def searched(
     c, fc = a.copy(), fa.copy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         fraction = np.clip(np.nan_to_num(fa / (fa - fb), nan=0.5), 0.0, 1.0)
-        for _ in range(ROUNDS):
+        for _ in range(100):  # it ends by far earlier
             x = a + fraction * (b - a)
             fx = function(x)
             same = np.sign(fx) == np.sign(fa)
@@ -151,7 +146,7 @@ def searched(
             a, fa = x, fx
             best = np.where(np.abs(fa) < np.abs(fb), a, b)
             smallest = np.minimum(np.abs(fa), np.abs(fb))
-            narrow = 2 * EPSILON * np.abs(best) / np.abs(b - a)
+            narrow = 2 * np.finfo(np.float64).eps * np.abs(best) / np.abs(b - a)
             if ((smallest == 0) | (narrow >= 0.5) | (a == b)).all():
                 return best
             xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values, check
-from bwbayes.model.operator import Span
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.one_state import (
     OneState,
     alpha,
-    below_d,
     beta,
     d,
     initial,
@@ -48,21 +46,9 @@ class BacklashLike(OneState):
         """d, α, β and the initial h."""
         return d(), alpha(), beta(), initial()
 
-    def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is not finite, d or β negative, or α ≤ 0."""
-        check(self.parameters, column, ("d", "beta"))
-
-    def holds(self, column: Values) -> BoolArray:
-        """Tell where α < d."""
-        return below_d(column)
-
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
         return RelaxingStep.alike(column["d"], column["alpha"], column["beta"], column["beta"])
-
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
-        """Return d."""
-        return column["d"]
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""

@@ -26,18 +26,15 @@ from bwbayes.model.declaration import (
     Declaration,
     Ranges,
     Values,
-    check,
     lognormal,
     normal,
     refuse,
 )
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     HIGHEST_CEILING,
     OneState,
     alpha,
-    below_d,
     d,
     initial,
 )
@@ -48,21 +45,6 @@ from bwbayes.model.step import HysteresisStep
 __all__ = ["BoucWen", "ceiling", "hysteresis"]
 
 SHAPE = ("alpha", "beta", "gamma", "exponent")
-
-# Of β and γ, in units of the rate scale. |γ| ≤ β cuts the joint prior, which takes small β away:
-# what remains for β has its median a little above 1/U, and room for a factor of thirty either way.
-BETA, BETA_SIGMA = 0.15, 2.3
-GAMMA = 4.0
-
-# Beyond this the hysteresis hardly changes: a prior that goes further still gets a scale for this.
-LARGEST_EXPONENT = 20.0
-
-# γ presses against β when more than this share of draws lies within the margin below it.
-PRESSING_SHARE = 0.25
-PRESSING_MARGIN = 0.05
-
-# The remedy where γ presses against ±β.
-NOT_PASSIVE = "this actuator may need a gamma beyond it: give passive = false under [model]"
 
 
 @dataclass(frozen=True)
@@ -96,7 +78,8 @@ class BoucWen(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, α, β, γ, n and the initial h."""
-        pressed = {"lower": NOT_PASSIVE, "upper": NOT_PASSIVE} if self.passive else {}
+        advice = "this actuator may need a gamma beyond it: give passive = false under [model]"
+        pressed = dict.fromkeys(("lower", "upper"), advice) if self.passive else {}
         return (
             d(),
             alpha(),
@@ -139,7 +122,7 @@ class BoucWen(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a model is outside of the domain, or h may run away."""
-        check(self.parameters, column, ("d", "beta"))
+        super().check(column)
         gamma, initial = column["gamma"], column["initial"]
         refuse("gamma", column["beta"] + gamma < 0, gamma, "beta + gamma must not be negative")
         # A state may exceed the ceiling by its rounding.
@@ -147,13 +130,9 @@ class BoucWen(OneState):
         demand = "must lie inside the ceiling (alpha/(beta + gamma))^(1/n)"
         refuse("initial", above, initial, f"{demand}, unless n = 1 and gamma <= beta")
 
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
-        """Return d."""
-        return column["d"]
-
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d, and h is where the model has a solution: see ``check``."""
-        inside = below_d(column)
+        inside = super().holds(column)
         if not {*SHAPE, "initial"} <= column.keys() or not np.any(column["initial"]):
             return inside
         return inside & (_anywhere(column) | (np.abs(column["initial"]) <= _top(column)))
@@ -162,12 +141,12 @@ class BoucWen(OneState):
         """Say that a posterior presses against γ ≤ β, if it does."""
         if not self.passive or "gamma" not in free:
             return []
-        share = float(np.mean(column["gamma"] > (1 - PRESSING_MARGIN) * column["beta"]))
-        if not share > PRESSING_SHARE:
+        share = float(np.mean(column["gamma"] > 0.95 * column["beta"]))
+        if not share > 0.25:
             return []
         return [
             f"the posterior presses against |gamma| <= beta ({share:.0%} of the draws have gamma "
-            f"within {PRESSING_MARGIN:.0%} of beta); if the actuator need not be passive, set "
+            f"within 5% of beta); if the actuator need not be passive, set "
             "[model] passive = false"
         ]
 
@@ -298,13 +277,15 @@ def _rate_unit(stated: Mapping[str, float | Distribution]) -> str:
 def _beta(context: Context) -> Distribution:
     """Return β's default prior; its scale follows the exponent, and it allows for γ's cut."""
     low, center, high = (_log_rate(n, context.ranges) for n in _likely(context))
-    factor = BETA if context.value("gamma") is None else 1.0
-    return lognormal(factor * _exp(center), math.hypot(BETA_SIGMA, (high - low) / 4))
+    # |γ| ≤ β cuts the joint prior, which takes small β away: what remains for β has its median a
+    # little above 1/U, and room for a factor of thirty either way.
+    factor = 0.15 if context.value("gamma") is None else 1.0
+    return lognormal(factor * _exp(center), math.hypot(2.3, (high - low) / 4))
 
 
 def _gamma(context: Context) -> Distribution:
     low, _, high = (_log_rate(n, context.ranges) for n in _likely(context))
-    return normal(0.0, GAMMA * _exp(max(low, high)))
+    return normal(0.0, 4.0 * _exp(max(low, high)))
 
 
 def _log_rate(exponent: float, ranges: Ranges) -> float:
@@ -329,5 +310,6 @@ def _likely(context: Context) -> tuple[float, float, float]:
     if below >= 1:
         return 1.0, 1.0, 1.0
     likely = exponent.frozen.ppf(below + (1 - below) * np.array([0.025, 0.5, 0.975]))
-    low, center, high = (float(n) for n in np.minimum(likely, LARGEST_EXPONENT))
+    # Beyond 20 the hysteresis hardly changes: a prior that goes further gets the scale for that.
+    low, center, high = (float(n) for n in np.minimum(likely, 20.0))
     return low, center, high

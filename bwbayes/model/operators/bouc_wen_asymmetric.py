@@ -17,13 +17,11 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Declaration, Values, check, normal, refuse
-from bwbayes.model.operator import Span
+from bwbayes.model.declaration import Declaration, Values, normal, refuse
 from bwbayes.model.operators.one_state import (
     HIGHEST_CEILING,
     OneState,
     alpha,
-    below_d,
     beta,
     d,
     initial_anywhere,
@@ -130,13 +128,13 @@ class BoucWenAsymmetric(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite or |γ'| > β' for a pair of signs."""
-        check(self.parameters, column, ("d", "beta"))
+        super().check(column)
         demand = "with beta and b2 to b6 the loop must be passive, |gamma'| <= beta'"
         refuse("gamma", ~_passive(column), column["gamma"], demand)
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d and, for all four pairs of signs, |γ'| ≤ β'."""
-        inside = below_d(column)
+        inside = super().holds(column)
         if "beta" not in column or "gamma" not in column:
             return inside
         return inside & _passive(column)
@@ -150,10 +148,6 @@ class BoucWenAsymmetric(OneState):
             for sign in (-1.0, 1.0)
         )
         return replace(plain, against=against, ahead=ahead)
-
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
-        """Return d."""
-        return column["d"]
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""

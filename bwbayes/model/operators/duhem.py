@@ -16,7 +16,6 @@ from bwbayes.model.declaration import (
     Context,
     Declaration,
     Values,
-    check,
     normal,
     refuse,
     rounded,
@@ -26,7 +25,6 @@ from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import (
     OneState,
     alpha,
-    below_d,
     beta,
     d,
     initial_anywhere,
@@ -35,9 +33,6 @@ from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import Gone, HysteresisStep
 
 __all__ = ["Duhem"]
-
-# Voltages at which a slope is looked at; stands for a rate of zero times a range of voltages.
-LOOKED, SLOW = 1001, 1e-6
 
 # Bounds that other parameters put on one may be rounded.
 SLACK = 1e-12
@@ -112,7 +107,7 @@ class Duhem(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite, α ≤ 0, β < 0, or energy comes in."""
-        check(self.parameters, column, ("d", "beta"))
+        super().check(column)
         demand = "must not be above 4 alpha beta^2"
         if not self.odd:
             demand = "beta^2 (4 alpha alpha2 - alpha1^2) must be at least alpha2^2"
@@ -120,7 +115,7 @@ class Duhem(OneState):
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d and the hysteresis is passive at any voltage."""
-        inside = below_d(column)
+        inside = super().holds(column)
         if not {"alpha", "beta", "alpha2"} <= set(column):
             return inside
         return inside & _passive(column)
@@ -151,7 +146,7 @@ class DuhemStep(RelaxingStep):
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return f′ − α(u) ∓ β h, with h on the loop over all of the limits: none is larger."""
         low, high = limits
-        beta = np.maximum(self.ahead[0, 0], SLOW / (high - low))
+        beta = np.maximum(self.ahead[0, 0], 1e-6 / (high - low))  # a rate may be zero
         rate = np.broadcast_to(beta, self.ahead.shape)
         symmetric = replace(self, against=rate, ahead=rate)
         decay = np.exp(-beta * (high - low))
@@ -164,7 +159,7 @@ class DuhemStep(RelaxingStep):
         at_high = (decay * fall + rise) / (1 - decay**2)
         at_low = decay * at_high + fall
         lowest, highest = np.full_like(beta, np.inf), np.full_like(beta, -np.inf)
-        for u in np.linspace(low, high, LOOKED):
+        for u in np.linspace(low, high, 1001):
             up, down = swept(low, u, at_low), swept(high, u, at_high)
             h = np.maximum(up.memory[:, 1], -down.memory[:, 1])
             # Without any h it is f′ − α.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, check, lognormal
+from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.one_state import OneState, d, initial_anywhere
 from bwbayes.model.relaxing import RelaxingStep
@@ -42,10 +42,6 @@ class NoHysteresis(OneState):
         )
         return slope, replace(initial_anywhere(), default=lambda _: 0.0)
 
-    def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is not finite, or d negative."""
-        check(self.parameters, column, ("d",))
-
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -64,7 +60,3 @@ class NoHysteresis(OneState):
         del voltage, span
         nothing = np.zeros_like(column["d"])
         return nothing, nothing
-
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
-        """Return d."""
-        return column["d"]

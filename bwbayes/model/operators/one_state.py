@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal, normal
+from bwbayes.model.declaration import Declaration, Values, check, lognormal, normal
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.step import OneStateStep
 
@@ -25,7 +25,6 @@ __all__ = [
     "StateMemory",
     "alpha",
     "below_ceiling",
-    "below_d",
     "beta",
     "d",
     "initial",
@@ -47,6 +46,21 @@ class StateMemory(NamedTuple):
 
 class OneState(Operator):
     """An operator that remembers the last voltage and one displacement in each model."""
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError that names the parameter where a model is outside of the domain.
+
+        d and β may be zero.
+        """
+        check(self.parameters, column, ("d", "beta"))
+
+    def holds(self, column: Values) -> BoolArray:
+        """Tell where α < d, or one of them is missing: there the initial curve rises."""
+        return np.asarray(column.get("alpha", -np.inf) < column.get("d", np.inf))
+
+    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+        """Return d."""
+        return column["d"]
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
@@ -142,12 +156,6 @@ def alpha() -> Declaration:
         loop=True,
         aliases=("a",),
     )
-
-
-def below_d(column: Values) -> BoolArray:
-    """Tell which models (models,) have α < d, or lack one of them."""
-    inside: BoolArray = np.asarray(column.get("alpha", -np.inf) < column.get("d", np.inf))
-    return inside
 
 
 def beta(scale: float = 1.0, bounds: Bounds | None = None) -> Declaration:

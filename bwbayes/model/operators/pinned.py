@@ -18,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal, refuse
+from bwbayes.model.declaration import Declaration, Values, check, lognormal, refuse
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
@@ -140,7 +140,7 @@ class Pinned(OneState):
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite or outside of its bounds."""
-        super().check(column)
+        check(self.parameters, column)
         for name in ("coupling", "reversible"):
             refuse(name, column[name] > STRONGEST, column[name], f"must be at most {STRONGEST:g}")
         weak = column["pinning"] < (1 - 1e-9) * WEAKEST * self.walls(column).field
@@ -153,10 +153,6 @@ class Pinned(OneState):
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return U/k."""
         return half_range / column["pinning"]
-
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # at zero volts
-        """Return d."""
-        return column["d"]
 
     def anhysteretic(self, column: Values, voltage: float) -> FloatArray:
         """Return the displacement (models,) without hysteresis at a voltage, um."""
