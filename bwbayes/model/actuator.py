@@ -117,9 +117,16 @@ class Actuator:
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
-        added = self.gain.parameters if self.gain else ()
-        crept = self.creep.parameters if self.creep else ()
-        return (*self.hysteresis.parameters, *added, *self.filter.parameters, *crept, OFFSET)
+        drive = (*self.hysteresis.parameters, *self._added)
+        return (*drive, *self.filter.parameters, *self._crept, OFFSET)
+
+    @property
+    def _added(self) -> tuple[Declaration, ...]:
+        return self.gain.parameters if self.gain else ()
+
+    @property
+    def _crept(self) -> tuple[Declaration, ...]:
+        return self.creep.parameters if self.creep else ()
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -248,11 +255,7 @@ class Actuator:
         """Raise an InputError where a model is outside of the domain of a part."""
         self.hysteresis.check(column)
         self.filter.check(column)
-        if self.gain is not None:
-            self.gain.check(column)
-        if self.creep is not None:
-            self.creep.check(column)
-        check((OFFSET,), column)
+        check((*self._added, *self._crept, OFFSET), column, ("creep_growth",))
 
     def sections(self, column: Values) -> Sections:
         """Return dynamics and creep of models given by the columns (models,) of θ."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, check, normal
+from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag
 from bwbayes.model.operator import UNIT, Span
@@ -109,10 +109,6 @@ class Creep:
         # Published are 0.5 to 3 % a decade. A normal prior, of which one in twenty-five is below
         # zero: strengths are linear in the displacement, and so their posterior is nearly normal.
         return normal(0.0175 * decades, 0.01 * decades)
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError where a parameter is not finite, or the growth negative."""
-        check(self.parameters, column, ("creep_growth",))
 
     def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""

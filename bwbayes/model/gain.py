@@ -16,7 +16,7 @@ from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Declaration, Values, check, normal
+from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.operator import UNIT, Span
 from bwbayes.model.step import Gone, HysteresisStep
 
@@ -78,10 +78,6 @@ class PolynomialGain:
             loop=True,
             aliases=(f"q{power}",),
         )
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError where a coefficient is not finite."""
-        check(self.parameters, column)
 
     def scaled(self, voltage: FloatArray) -> FloatArray:
         """Return x (samples,) of voltages (samples,), V."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Context, Ranges
+from bwbayes.model.declaration import Context, Ranges, check
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
 
@@ -27,7 +27,7 @@ def test_coefficients_are_displacements_at_the_edge_of_the_range() -> None:
 @pytest.mark.parametrize("term", ["quadratic", "cubic"])
 def test_a_single_term_needs_no_other_column(term: str) -> None:
     gain, column = PolynomialGain((term,), SPAN), {term: np.array([3.0])}
-    gain.check(column)
+    check(gain.parameters, column)
     assert [declared.name for declared in gain.parameters] == [term]
     np.testing.assert_allclose(gain.displacement(column, np.array([100.0])), [[3.0]])
 
@@ -47,7 +47,7 @@ def test_says_what_is_wrong_by_name() -> None:
     with pytest.raises(InputError, match="gain: 'cubik' is unknown; did you mean cubic"):
         PolynomialGain(("cubik",))
     with pytest.raises(InputError, match="cubic: nan in model 1; must be finite"):
-        PolynomialGain(("cubic",)).check({"cubic": np.array([0.0, np.nan])})
+        check(PolynomialGain(("cubic",)).parameters, {"cubic": np.array([0.0, np.nan])})
 
 
 def displaced(term: str, voltage: list[float]) -> FloatArray:

@@ -15,13 +15,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values, refuse
 from bwbayes.model.operators.memory import INITIAL
-from bwbayes.model.operators.prandtl_ishlinskii import (
-    InParallel,
-    PlaysStep,
-    checked_thresholds,
-    numbered,
-    of_gain,
-)
+from bwbayes.model.operators.prandtl_ishlinskii import InParallel, of_gain
 
 __all__ = ["MaxwellSlip"]
 
@@ -49,21 +43,13 @@ class MaxwellSlip(InParallel):
     thresholds
         As in :class:`Plays <bwbayes.model.operators.prandtl_ishlinskii.Plays>`.
 
-    Raises
-    ------
-    InputError
-        No threshold, or thresholds that are not positive and increasing.
-
     Notes
     -----
     Source: M. Goldfarb and N. Celanovic, Modeling piezoelectric stack actuators for control of
     micromanipulation, IEEE Control Systems 17 (1997) 69-79.
     """
 
-    thresholds: int | tuple[float, ...] = 10
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
+    weight = "alpha", r"\alpha", "element"
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -79,21 +65,16 @@ class MaxwellSlip(InParallel):
             stated_bounds="the sum of all alpha <= d",
             loop=True,
         )
-        elements = numbered(self.thresholds, "alpha", r"\alpha", "of element")
-        return (slope, *(_below_d(element) for element in elements), INITIAL)
+        return (slope, *(_below_d(element) for element in self.elements()), INITIAL)
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         super().check(column)
-        back = self._slope(column) < -ROUNDING * column["d"]
+        back = self.slope(column) < -ROUNDING * column["d"]
         demand = "must not be less than the sum of all alpha, or the displacement turns back"
         refuse("d", back, column["d"], demand)
 
-    def step(self, column: Values) -> PlaysStep:
-        """Return the plays; what the elements hold back of d is not in their slope."""
-        return PlaysStep.of(self.thresholds, "alpha", self._slope(column), column)
-
-    def _slope(self, column: Values) -> FloatArray:
+    def slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""
         return np.asarray(column["d"] - _held(column))
 

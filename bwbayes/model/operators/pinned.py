@@ -50,14 +50,8 @@ WEAKEST, STRONGEST = 1e-3, 0.98
 class Pinned(OneState):
     """Hysteresis by pinned walls, with an error below 1e-6 of the range.
 
-    The displacement P in um follows the voltage u in V, to which the field is proportional, by
-
-        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
-        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
-
-    with s the voltage's direction; where P_an − P_irr does not have the sign of s, P_irr is
-    constant. L is the anhysteretic curve, L(±∞) = ±1; E₀ in V is the scale of the field, and a P in
-    V the field that the displacement itself makes, a in V/um. Parameters are
+    P_an = P_s L((u + a P)/E₀), as :class:`JilesAtherton` and :class:`DomainWall` say in full.
+    Parameters are
 
     - d = P_s L′(0) / (E₀ (1 − η)), the slope of the anhysteretic displacement at zero, um/V,
     - P_s, the displacement at saturation, um,
@@ -267,10 +261,18 @@ def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
 
 @dataclass(frozen=True)
 class JilesAtherton(Pinned):
-    """Jiles-Atherton hysteresis: pinned walls with L(y) = coth y − 1/y, to 1e-6 of the range.
+    """Jiles-Atherton hysteresis, with L(y) = coth y − 1/y and an error below 1e-6 of the range.
 
-    Made for ferromagnets and used for ferroelectrics: the field is the voltage, the magnetization
-    the displacement. Equation and parameters are those of :class:`Pinned`, with L′(0) = 1/3.
+    The displacement P in um follows the voltage u in V, by
+
+        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
+        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
+
+    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
+    s. P_s in um is the displacement at saturation, E₀ in V the scale of the field, a P in V the
+    field that the displacement itself makes (a in V/um), k in V the pinning, and c the reversible
+    part. In place of E₀ and a, the parameters are the slope d = P_s L′(0) / (E₀ (1 − η)) in um/V
+    and the coupling η = a P_s L′(0) / E₀, with L′(0) = 1/3.
 
     Notes
     -----
@@ -283,10 +285,18 @@ class JilesAtherton(Pinned):
 
 @dataclass(frozen=True)
 class DomainWall(Pinned):
-    """Domain wall hysteresis: pinned walls with L(y) = tanh y, to 1e-6 of the range.
+    """Domain wall hysteresis, with L(y) = tanh y and an error below 1e-6 of the range.
 
-    The displacement is proportional to the polarization. Equation and parameters are those of
-    :class:`Pinned`, with L′(0) = 1.
+    The displacement P in um follows the voltage u in V, to which the field is proportional, by
+
+        P_an = P_s tanh((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
+        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
+
+    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
+    s. P_s in um is the displacement at saturation, E₀ in V the scale of the field, a P in V the
+    field that the displacement itself makes (a in V/um), k in V the pinning, and c the reversible
+    part. In place of E₀ and a, the parameters are the slope d = P_s L′(0) / (E₀ (1 − η)) in um/V
+    and the coupling η = a P_s L′(0) / E₀, with L′(0) = 1.
 
     Notes
     -----

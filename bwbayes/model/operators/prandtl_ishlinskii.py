@@ -9,10 +9,10 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -31,10 +31,7 @@ __all__ = [
     "Plays",
     "PlaysStep",
     "PrandtlIshlinskii",
-    "checked_thresholds",
-    "numbered",
     "of_gain",
-    "threshold_volts",
 ]
 
 
@@ -113,12 +110,75 @@ class PrandtlIshlinskii(RemembersExtrema):
         return numbers[0] * travel - numbers[1] * gone(travel / numbers[2])
 
 
+@dataclass(frozen=True)
 class InParallel(RemembersExtrema):
-    """Plays in parallel: E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0)."""
+    """Plays in parallel: E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0); see :class:`Plays`."""
+
+    thresholds: int | tuple[float, ...] = 10
+
+    # What a weight is called: its name, its symbol, and of which element it is.
+    weight: ClassVar[tuple[str, str, str]]
+
+    def __post_init__(self) -> None:
+        if isinstance(self.thresholds, int):
+            if self.thresholds < 1:
+                raise InputError(f"thresholds: {self.thresholds} is too few; give 1 or more")
+            return
+        volts = tuple(float(threshold) for threshold in self.thresholds)
+        rising = np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all()
+        if not volts or not rising:
+            raise InputError(
+                f"thresholds: {list(volts)}; give positive volts, each larger than the one before"
+            )
+        object.__setattr__(self, "thresholds", volts)
 
     @abstractmethod
+    def slope(self, column: Values) -> FloatArray:
+        """Return the slope just after a turn (models,), um/V."""
+
+    @property
+    def count(self) -> int:
+        """How many plays there are."""
+        return self.thresholds if isinstance(self.thresholds, int) else len(self.thresholds)
+
+    def elements(self) -> tuple[Declaration, ...]:
+        """Declare a weight for each threshold, and the threshold that an even row ends at.
+
+        The sum of the weights is about 0.4 Y/U by default, however many they are.
+        """
+        name, symbol, element = self.weight
+        weights = tuple(
+            Declaration(
+                name=f"{name}_{j}",
+                unit="um/V",
+                label=rf"{symbol}_{{{j}}}",
+                description=f"weight of {element} {j}",
+                default=of_gain(0.4 / self.count, 1.0),
+                floor=0.0,
+                reaches_floor=True,
+                loop=True,
+            )
+            for j in range(1, self.count + 1)
+        )
+        last = Declaration(
+            name="threshold",
+            unit="V",
+            label="U",
+            description="voltage up to which the thresholds are spread",
+            default=lambda context: rounded(context.ranges.voltage),
+            floor=0.0,
+            loop=True,
+        )
+        return (*weights, last) if isinstance(self.thresholds, int) else weights
+
     def step(self, column: Values) -> PlaysStep:
         """Return the plays."""
+        volts = np.array([self.thresholds], dtype=np.float64)
+        if isinstance(self.thresholds, int):
+            even = np.arange(1, self.count + 1) / (self.count + 1)
+            volts = column["threshold"][:, np.newaxis] * even
+        weights = [column[f"{self.weight[0]}_{j}"] for j in range(1, self.count + 1)]
+        return PlaysStep(self.slope(column), np.stack(weights, axis=1), volts)
 
     def numbers(self, column: Values) -> FloatArray:
         """Return d, all weights and all thresholds."""
@@ -165,19 +225,16 @@ class Plays(InParallel):
     and Phase Transitions (Springer, 1996).
     """
 
-    thresholds: int | tuple[float, ...] = 10
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
+    weight = "weight", "w", "play"
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, the weights, the largest threshold if it is not given, and the start."""
-        return (SLOPE, *numbered(self.thresholds, "weight", "w", "of play"), INITIAL)
+        return (SLOPE, *self.elements(), INITIAL)
 
-    def step(self, column: Values) -> PlaysStep:
-        """Return the plays."""
-        return PlaysStep.of(self.thresholds, "weight", column["d"], column)
+    def slope(self, column: Values) -> FloatArray:
+        """Return d."""
+        return column["d"]
 
 
 @dataclass(frozen=True)
@@ -197,15 +254,6 @@ class PlaysStep(HysteresisStep):
     slope: FloatArray
     weights: FloatArray
     thresholds: FloatArray
-
-    @classmethod
-    def of(
-        cls, thresholds: int | tuple[float, ...], name: str, slope: FloatArray, column: Values
-    ) -> PlaysStep:
-        """Return plays with weights of a name, and the ``slope`` of the rest (models,), um/V."""
-        volts = threshold_volts(thresholds, column)
-        weights = np.stack([column[f"{name}_{j + 1}"] for j in range(volts.shape[1])], axis=1)
-        return cls(slope, weights, volts)
 
     @cached_property
     def parameters(self) -> FloatArray:
@@ -261,63 +309,3 @@ class PlaysStep(HysteresisStep):
             "weights": (self.weights[0].tolist(), "um/V"),
             "thresholds": (self.thresholds[0].tolist(), "V"),
         }
-
-
-def checked_thresholds(thresholds: int | Sequence[float]) -> int | tuple[float, ...]:
-    """Return thresholds, or their number; raise an InputError where they cannot be."""
-    if isinstance(thresholds, int):
-        if thresholds < 1:
-            raise InputError(f"thresholds: {thresholds} is too few; give 1 or more")
-        return int(thresholds)
-    volts = tuple(float(threshold) for threshold in thresholds)
-    rising = np.isfinite(volts).all() and (np.diff(volts, prepend=0.0) > 0).all()
-    if not volts or not rising:
-        raise InputError(
-            f"thresholds: {list(volts)}; give positive volts, each larger than the one before"
-        )
-    return volts
-
-
-def numbered(
-    thresholds: int | tuple[float, ...], name: str, symbol: str, of: str
-) -> tuple[Declaration, ...]:
-    """Declare a weight for each threshold, and the threshold that an evenly spaced row ends at.
-
-    The sum of the weights is about 0.7 Y/U by default, however many they are.
-    """
-    count = thresholds if isinstance(thresholds, int) else len(thresholds)
-    weights = tuple(
-        Declaration(
-            name=f"{name}_{j}",
-            unit="um/V",
-            label=rf"{symbol}_{{{j}}}",
-            description=f"weight {of} {j}",
-            default=of_gain(0.4 / count, 1.0),
-            floor=0.0,
-            reaches_floor=True,
-            loop=True,
-        )
-        for j in range(1, count + 1)
-    )
-    if not isinstance(thresholds, int):
-        return weights
-    last = Declaration(
-        name="threshold",
-        unit="V",
-        label="U",
-        description="voltage up to which the thresholds are spread",
-        default=lambda context: rounded(context.ranges.voltage),
-        floor=0.0,
-        loop=True,
-    )
-    return (*weights, last)
-
-
-def threshold_volts(thresholds: int | tuple[float, ...], column: Values) -> FloatArray:
-    """Return the thresholds r_j, V, (models, thresholds), or (1, thresholds) if all are alike."""
-    if not isinstance(thresholds, int):
-        return np.array([thresholds], dtype=np.float64)
-    last = column["threshold"]
-    if last.size and (last == last[0]).all():
-        last = last[:1]
-    return last[:, np.newaxis] * (np.arange(1, thresholds + 1) / (thresholds + 1))
