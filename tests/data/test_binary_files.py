@@ -169,6 +169,15 @@ def test_numbers_that_are_damaged_are_refused(tmp_path: Path) -> None:
     assert ": time_s: damaged or cut off (cannot reshape" in fault(path)
 
 
+def test_a_cell_array_of_more_elements_than_it_has_is_refused(tmp_path: Path) -> None:
+    """SciPy would make an array of so many, whatever the memory."""
+    path = store(tmp_path, "mat", GOOD | {"cells": np.array([1.0, "b"], dtype=object)})
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(struct.pack("<IIII", 5, 8, 1, 2)) + 12, 10**9)
+    path.write_bytes(data)
+    assert "elements of an array are missing" in fault(path)
+
+
 def test_version_4_is_refused_by_name(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "record.mat", GOOD, format="4")
     assert "save it with -v7" in fault(tmp_path / "record.mat")

@@ -141,9 +141,11 @@ def _check_matrix(body: bytes, order: str, *, nested: bool = False) -> None:
         return
     (flags,) = struct.unpack_from(f"{order}I", inner[0][1])
     if flags & 0xFF in _NESTED_CODES:
-        for kind, content in inner:
-            if kind == _MATRIX:
-                _check_matrix(content, order, nested=True)
+        contents = [content for kind, content in inner if kind == _MATRIX]
+        if math.prod(np.frombuffer(inner[1][1], f"{order}i4").tolist()) > max(len(contents), 1):
+            raise ValueError("elements of an array are missing")
+        for content in contents:
+            _check_matrix(content, order, nested=True)
     elif flags & 0xFF not in _PLAIN_CODES:
         if nested:  # it would be read with the struct that it is in
             raise ValueError("an object in a struct")
