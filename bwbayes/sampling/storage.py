@@ -110,7 +110,9 @@ class ChainFile(Chain):
             It is damaged further on; the blocks before that are read.
         """
         if not path.exists():
-            raise InputError(f"{path}: the chain does not exist; run again")
+            earlier = path.with_suffix(".h5").exists()
+            missing = "is of an earlier version (chain.h5)" if earlier else "does not exist"
+            raise InputError(f"{path}: the chain {missing}; run again")
         chain: ChainFile | None = None
         try:
             chain = cls._begun(path)

@@ -154,6 +154,9 @@ def test_another_file_in_place_of_the_start_is_refused(
     path = tmp_path / "chain"
     with pytest.raises(InputError, match=f"^{path}: the chain does not exist; run again$"):
         ChainFile.read(path)
+    path.with_suffix(".h5").touch()
+    with pytest.raises(InputError, match=r"the chain is of an earlier version \(chain.h5\); run"):
+        ChainFile.read(path)
     shutil.copytree(whole, path)
     (path / "start.npz").write_bytes(content)
     with pytest.raises(InputError, match=f"^{path}: the chain cannot be read .*; run again$"):
