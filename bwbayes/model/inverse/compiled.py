@@ -125,9 +125,9 @@ def _invert_one(
     curve, kappa, farthest = chains.curve[model], chains.growth[model], chains.farthest[model]
     # A drive that is held acts one sample later, and is found from the next sample.
     late = int(top[0, 0] == 0.0)
-    close = CLOSE * chains.largest[model]
-    u = chains.voltage[model]
-    w = chains.drive[model]
+    u, w = chains.voltage[model], chains.drive[model]
+    # Nearer than the rounding of where it starts there is nothing to find.
+    close = max(CLOSE * chains.largest[model], 1e-15 * abs(u * chains.slope[model]))
     here = u, w, chains.slope[model], 0.0, 1.0
     for t in range(samples.size):
         first = chains.begins and t == 0

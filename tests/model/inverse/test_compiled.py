@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -73,6 +73,7 @@ def plain(name: str, gain: PolynomialGain | None) -> tuple[Actuator, FloatArray]
 @pytest.mark.parametrize("name", KINDS)
 @settings(max_examples=8, deadline=None)
 @given(turns=paths, from_rest=st.booleans())
+@example(turns=[(1e-9, 12)], from_rest=False)  # no more than the rounding of where it starts
 def test_along_any_path_as_alone(
     name: str, gain: PolynomialGain | None, turns: list[tuple[float, int]], from_rest: bool
 ) -> None:

@@ -203,32 +203,3 @@ def test_without_beta_a_minor_loop_closes(parameters: Model, far: float, width: 
     h = hysteresis(path, *parameters)[0]
     tolerance = 1e-11 * growth(parameters, path.tolist()) * top_of(parameters)
     assert h[3] == pytest.approx(h[1], abs=tolerance)
-
-
-@few
-@given(
-    parameters=models(passive_ratio, (1.0,)),
-    shares=st.tuples(st.floats(0, 1), st.floats(0, 1)),
-    travel=st.floats(0, 100),
-)
-def test_the_trace_of_the_past_fades_with_the_travel(
-    parameters: Model, shares: tuple[float, float], travel: float
-) -> None:
-    """By exp(−(β + γ) v) after a voltage travel v, once h has the direction of the travel."""
-    starts = np.array(shares) * top_of(parameters)
-    h = hysteresis(np.array([3.0, 3.0 + travel]), *parameters, initial=starts)[:, -1]
-    expected = (starts[1] - starts[0]) * np.exp(-(parameters.beta + parameters.gamma) * travel)
-    assert expected == pytest.approx(h[1] - h[0], abs=1e-13 * top_of(parameters))
-
-
-@few
-@given(parameters=models(passive_ratio, (1.0,)), share=inside, width=st.floats(1, 20))
-def test_minor_loops_drift_until_they_are_symmetric_about_zero(
-    parameters: Model, share: float, width: float
-) -> None:
-    """Whatever the bias that they began with; a width counts in units of 1/(β + γ)."""
-    bottom, top = 10.0, 10.0 + width / (parameters.beta + parameters.gamma)
-    path = np.array([bottom, *[top, bottom] * 60])
-    h = hysteresis(path, *parameters, initial=share * top_of(parameters))[0]
-    assert h[-2] > 0
-    assert -h[-2] == pytest.approx(h[-1], rel=1e-9)
