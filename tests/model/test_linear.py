@@ -159,26 +159,6 @@ def test_a_ramp_is_followed_at_a_constant_distance(parameters: tuple[float, floa
         assert pytest.approx(INTERVAL / 2, rel=0.1) == later
 
 
-def test_an_undamped_oscillator_keeps_its_energy() -> None:
-    recursion = oscillator(from_poles(700j, -700j), "zero")
-    drive = np.zeros(50_000)
-    drive[1:] = 1.0
-    swing = from_rest(recursion, drive)
-    assert pytest.approx(2.0, abs=1e-3) == swing[-1000:].max()
-    assert pytest.approx(0.0, abs=1e-3) == swing[-1000:].min()
-
-
-@given(cut=st.integers(0, 400))
-@settings(deadline=None, max_examples=30)
-def test_two_pieces_equal_one(cut: int) -> None:
-    for poles in POLES.values():
-        recursion = oscillator(from_poles(poles[0] / INTERVAL, poles[1] / INTERVAL), "first")
-        expected = from_rest(recursion, walk())
-        state = recursion.at_rest()
-        pieces = [recursion.run(piece, state) for piece in np.split(walk()[np.newaxis], [cut], 1)]
-        np.testing.assert_array_equal(expected, np.concatenate(pieces, axis=1)[0])
-
-
 @pytest.mark.parametrize("hold", HOLDS)
 def test_a_model_does_not_depend_on_its_batch(hold: Hold) -> None:
     models = [from_poles(*(pole / INTERVAL for pole in pair)) for pair in POLES.values()]
