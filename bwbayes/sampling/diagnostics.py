@@ -15,6 +15,7 @@ passes. This module alone knows arviz's statistics.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -194,7 +195,7 @@ def _one_parameter(values: FloatArray) -> tuple[float, ...]:
     scores = _scores(values)
     half = steps // 2
     # The halves of all ensembles are superchains of their own: first halves, then second ones.
-    halves = np.concatenate([scores[..., :half], scores[..., steps - half :]], axis=1)
+    halves = [np.concatenate([s[:, :half], s[:, steps - half :]]) for s in scores]
     rhat = float(np.max([_rhat(scores, ensembles), _rhat(halves, 2 * ensembles)]))  # keeps a nan
     ranked = scores[0]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -278,24 +279,27 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     tail are worth another number.
     """
     statistics, means = _statistics(), np.mean(values, axis=2)
-    # A comparison would take what is not a number for a draw beyond the tail.
-    tails = [np.where(np.isnan(scores), np.nan, scores <= ndtri(p)) for p in TAIL]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         cap = statistics.ess(means.T, method="mean") * np.var(values) / np.var(means)
-        chains = (scores, *tails, as_chains(values))
-        bulk, lower, upper, mean = (statistics.ess(chain, method="mean") for chain in chains)
+        bulk = statistics.ess(scores, method="mean")
+        # A comparison would take what is not a number for a draw beyond the tail.
+        tails = [
+            statistics.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
+            for p in TAIL
+        ]
+        mean = statistics.ess(as_chains(values), method="mean")
     # np.minimum keeps a nan of either.
-    bulk, tail, mean = np.minimum([bulk, np.minimum(lower, upper), mean], cap).tolist()
+    bulk, tail, mean = np.minimum([bulk, np.min(tails), mean], cap).tolist()
     return bulk, tail, mean
 
 
-def _rhat(scores: FloatArray, ensembles: int) -> float:
-    """Nested R-hat of scores (2, chains, steps), an ensemble's chains in a row.
+def _rhat(scores: Sequence[FloatArray], ensembles: int) -> float:
+    """Nested R-hat of two scores (chains, steps), an ensemble's chains in a row.
 
     Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
     calls rank, which would rank the draws once more.
     """
-    superchain = np.repeat(np.arange(ensembles), scores.shape[1] // ensembles)
+    superchain = np.repeat(np.arange(ensembles), len(scores[0]) // ensembles)
     statistics = _statistics()
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return float(
@@ -317,18 +321,34 @@ def as_chains(values: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.moveaxis(values, 0, -1)).reshape(-1, len(values))
 
 
-def _scores(values: FloatArray) -> FloatArray:
-    """Rank draws (steps, ensembles, walkers) into normal scores (2, chains, steps).
+def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rank draws (steps, ensembles, walkers) into two normal scores (chains, steps).
 
     With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)); nan if any draw is.
     The second ones are those of the draws' distances from their median.
     """
     chains = as_chains(values)
     with np.errstate(invalid="ignore"):
-        folded = np.abs(chains - np.median(chains))
-    ranks = np.stack([scipy.stats.rankdata(draws) for draws in (chains, folded)])
-    scores: FloatArray = ndtri((ranks - 3 / 8) / (chains.size + 1 / 4))
-    return scores.reshape(2, *chains.shape)
+        scores, median = _normal_scores(chains.ravel())
+        folded, _ = _normal_scores(np.abs(chains.ravel() - median))
+    return scores.reshape(chains.shape), folded.reshape(chains.shape)
+
+
+def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
+    """Return the scores of draws (count,) and their median, by one sorting: half the time of both.
+
+    All nan if any of them is.
+    """
+    order = np.argsort(draws)
+    ordered = draws[order]
+    if np.isnan(ordered[-1]):  # nan sorts last
+        return np.full(draws.size, np.nan), np.nan
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    equal = np.diff(first, append=draws.size)
+    rank = first + 0.5 * (equal + 1)
+    scores = np.empty(draws.size)
+    scores[order] = np.repeat(ndtri((rank - 3 / 8) / (draws.size + 1 / 4)), equal)
+    return scores, float(np.mean(ordered[[(draws.size - 1) // 2, draws.size // 2]]))
 
 
 def times(draws: FloatArray, thin: int = 1) -> FloatArray:

@@ -78,8 +78,8 @@ def advance(
 
     Each step takes one of an ensemble's moves at random, with its weight, for all walkers. An
     ensemble moves as it does alone: bit for bit where a density does not depend on the others of
-    its batch, to rounding where it does (the compiled engine decides for groups of models when
-    their noise has settled). On a short record a call costs more than the models in it, so that
+    its batch, to rounding where it does (a record's are worked out for groups of models, whose
+    noise settles together). On a short record a call costs more than the models in it, so that
     four ensembles cost little more than one.
 
     Raises
