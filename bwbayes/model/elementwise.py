@@ -31,4 +31,7 @@ def gone(z: Any) -> Any:
 
 def look_up(rows: Any, index: Any) -> Any:
     """Return the number at a place, a whole float, in a row, or at one in each column of rows."""
-    return np.take_along_axis(rows, index[np.newaxis].astype(np.intp), 0)[0]
+    models = np.arange(rows.shape[1]).reshape(-1, *(1,) * (index.ndim - 1))
+    # The rows of a step are columns of its parameters: no copy is made here.
+    numbers = rows.reshape(rows.shape[:2]).T
+    return numbers.ravel().take(models * len(rows) + index.astype(np.intp))
