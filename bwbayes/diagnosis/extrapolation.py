@@ -69,10 +69,9 @@ def _fitted_range(posterior: Posterior) -> tuple[float, float]:
 
 def _turn_times(posterior: Posterior) -> list[float]:
     """Return the typical time between turning points in each record that was fitted, s."""
-    every = posterior.datasets
     return [
         time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
-        for dataset in every
+        for dataset in posterior.datasets
     ]
 
 
@@ -90,17 +89,13 @@ def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
 
 
 def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Finding | None:
-    before = now = math.inf
-    for dataset, a_turn in zip(posterior.datasets, _turn_times(posterior), strict=True):
-        own = dataset.actuator.interval
-        over = PART * min(a_turn, time_between_turns(voltage, interval))
-        its, this = (
-            fastest(dataset.voltage, own, over, dataset.training),
-            fastest(voltage, interval, over),
-        )
-        # Of several records the one that comes nearest to the drive.
-        if this * before <= now * its or before == math.inf:
-            before, now = its, this
+    turn_time, speeds = time_between_turns(voltage, interval), []
+    for dataset, fitted_turn_time in zip(posterior.datasets, _turn_times(posterior), strict=True):
+        over = PART * min(fitted_turn_time, turn_time)
+        fitted = fastest(dataset.voltage, dataset.actuator.interval, over, dataset.training)
+        speeds.append((fastest(voltage, interval, over), fitted))
+    # Of several records the one that comes nearest to the drive.
+    now, before = min(speeds, key=lambda pair: pair[0] / max(pair[1], 1e-300))
     # Noise and the sampling change a speed by a tenth or so.
     if now <= 1.5 * before:
         return None

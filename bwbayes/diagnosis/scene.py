@@ -119,10 +119,10 @@ class Scene:
         rows = posterior.only.readings.rows
         if rows.size > READINGS:
             # Every so many of them: the voltage stays whole.
-            kept = rows[:: -(-rows.size // READINGS)]
+            retained = rows[:: -(-rows.size // READINGS)]
             thinned = posterior.only.displacement.copy()
-            thinned[np.setdiff1d(rows, kept)] = np.nan
-            posterior, rows = posterior.altered(displacement=thinned), kept
+            thinned[np.setdiff1d(rows, retained)] = np.nan
+            posterior, rows = posterior.altered(displacement=thinned), retained
         first = int(rows[rows.size // 5])
         windows = posterior.only.training
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)

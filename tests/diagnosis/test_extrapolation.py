@@ -49,7 +49,7 @@ def test_speed_is_remarked_on_from_a_factor_of_one_and_a_half(
 
 
 def kinds(posterior: Posterior, voltage: FloatArray, interval: float) -> list[str]:
-    return [one.kind for one in beyond_training(posterior, voltage, interval)]
+    return [finding.kind for finding in beyond_training(posterior, voltage, interval)]
 
 
 def test_step_is_faster_than_a_sine_and_no_sine_than_a_step() -> None:
@@ -78,7 +78,9 @@ def test_a_slow_sine_and_a_hold_are_said() -> None:
     assert slow.text.startswith("voltage averages 50.2 V over 23.7 s, in training at most 0.")
     assert duration.text.startswith("duration of 100 s exceeds the 16 s of training; the bands")
     for held in (np.full(long.size, 75.0), np.where(long > 1, 75.0, 0.0)):
-        slow = next(one for one in beyond_training(FAST, held, 0.005) if one.kind == "slow")
+        slow = next(
+            finding for finding in beyond_training(FAST, held, 0.005) if finding.kind == "slow"
+        )
         assert f"voltage averages {np.mean(held):.3g} V over 100 s" in slow.text
 
 
@@ -107,7 +109,7 @@ def test_a_hold_counts_from_where_it_begins_and_the_slowest_record_counts() -> N
     """Predicted is the end of a hold; a fit that saw one as long knows it."""
     held = np.where(TIME < 1, 75 * np.sin(4 * np.pi * TIME), 75.0)
     end = slice(TIME.size * 3 // 4, None)
-    assert ["slow"] == [one.kind for one in beyond_training(FAST, held, 0.005, end)]
+    assert ["slow"] == [finding.kind for finding in beyond_training(FAST, held, 0.005, end)]
     assert [] == beyond_training(fitted(held, 0.005), held, 0.005, end)
 
 
@@ -123,7 +125,7 @@ def test_few_good_drives_are_called_slow_or_long() -> None:
         if sum(float(np.ptp(record.voltage[window])) for window in training) > 0:
             posterior = fitted(record.voltage, record.interval).altered(training=training)
             found = beyond_training(posterior, record.voltage, record.interval, held_out)
-            alarms += any(one.kind in ("slow", "duration") for one in found)
+            alarms += any(finding.kind in ("slow", "duration") for finding in found)
     assert alarms <= 4
 
 

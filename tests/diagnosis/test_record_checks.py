@@ -23,7 +23,9 @@ MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_l
 
 
 def findings(kind: str, voltage: FloatArray, displacement: FloatArray) -> list[Finding]:
-    return [one for one in inspect(Record(voltage, displacement, 1e-3)) if one.kind == kind]
+    return [
+        finding for finding in inspect(Record(voltage, displacement, 1e-3)) if finding.kind == kind
+    ]
 
 
 SINE = np.sin(np.linspace(0.0, 12 * np.pi, 3000))
@@ -74,7 +76,7 @@ def test_a_coarse_sensor_alone_is_not_taken_for_a_clipped_one(
 
 def false_alarms(numbers: range) -> dict[int, list[str]]:
     """Return what is said about good records of these numbers."""
-    said = {number: [str(one) for one in inspect(good(number))] for number in numbers}
+    said = {number: [str(finding) for finding in inspect(good(number))] for number in numbers}
     return {number: texts for number, texts in said.items() if texts}
 
 
@@ -84,7 +86,7 @@ def missed(kind: str, numbers: range) -> list[int]:
     left = []
     for number in numbers:
         record = SPOILT[kind](looping(number), np.random.default_rng(number))
-        if named not in [one.kind for one in inspect(record)]:
+        if named not in [finding.kind for finding in inspect(record)]:
             left.append(number)
     return left
 
@@ -167,16 +169,16 @@ def test_missing_readings_are_no_fault() -> None:
 
 def test_a_planned_voltage_is_looked_at_too() -> None:
     steady = 5e4 * np.sin(np.arange(3000) / 30)
-    kinds = [one.kind for one in inspect(Record(steady, None, 1e-3))]
+    kinds = [finding.kind for finding in inspect(Record(steady, None, 1e-3))]
     assert ["wrong units", "one amplitude"] == kinds
 
 
 def test_a_finding_is_one_line() -> None:
     for kind in SPOILT:
-        for one in inspect(SPOILT[kind](looping(0), np.random.default_rng(0))):
-            assert str(one).isprintable()
-            assert len(str(one)) < 300
-            assert one.start < one.stop
+        for finding in inspect(SPOILT[kind](looping(0), np.random.default_rng(0))):
+            assert str(finding).isprintable()
+            assert len(str(finding)) < 300
+            assert finding.start < finding.stop
 
 
 def test_spikes_are_neither_edges_nor_turns() -> None:
