@@ -38,7 +38,8 @@ def measured(seed: int, seconds: float = 16.0) -> Record:
     return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)
 
 
-@pytest.mark.parametrize("what", ["a second", pytest.param("a tenth", marks=pytest.mark.slow)])
+@pytest.mark.slow  # the quick twin is the dense density in inference/test_likelihood.py
+@pytest.mark.parametrize("what", ["a second", "a tenth"])
 def test_missing_readings_leave_the_posterior_of_the_dense_gaussian(
     tmp_path: Path, what: str
 ) -> None:
