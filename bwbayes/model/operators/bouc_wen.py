@@ -254,7 +254,9 @@ def hysteresis(
     column["d"] = np.zeros(size)
     operator = BoucWen(passive=False)
     operator.check(column)
-    return -operator.trace(column, path, column["initial"])[0]
+    # Not its negative, which has −0 for 0.
+    h: FloatArray = 0.0 - operator.trace(column, path, column["initial"])[0]
+    return h
 
 
 def _anywhere(column: Values) -> BoolArray:
