@@ -165,7 +165,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
 def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
     folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's":3', b's":2'))
-    assert 3 == resume(folder, small.quiet(), workers=1, count=3).replicates
+    assert 3 == resume(folder, small.quiet(), workers=1, replicates=3).replicates
     lines = [line for line in folder.replicates.read_bytes().splitlines() if b"number" in line]
     assert (whole / "replicates.jsonl").read_bytes().splitlines()[1:] == lines
     assert (whole / "replicates.jsonl").read_bytes().splitlines()[0] in (
@@ -261,10 +261,10 @@ def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "part"),
     [
-        ({0: b"nonsense"}, "does not say how many"),
-        ({0: b'{"replicates":0,"of":"x"}'}, "does not say how many"),
-        ({0: b'{"replicates":3}'}, "does not say how many"),
-        ({0: b'{"replicates":1e999,"of":"x"}'}, "does not say how many"),
+        ({0: b"nonsense"}, ":1: is not one of these replicates"),
+        ({0: b'{"replicates":0,"of":"x"}'}, ":1: is not one of these replicates"),
+        ({0: b'{"replicates":3}'}, ":1: is not one of these replicates"),
+        ({0: b'{"replicates":1e999,"of":"x"}'}, ":1: is not one of these replicates"),
         ({1: b"nonsense"}, ":2: is not one of these replicates; delete this line"),
         ({1: b'{"number": 0}'}, ":2: is not one of these replicates; delete this line"),
         ({2: b"[1]"}, ":3: is not one of these replicates; delete this line"),
@@ -330,7 +330,7 @@ def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
     shutil.copytree(whole, tmp_path / "a")
     monkeypatch.setattr(module, "_make", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        resume(CalibrationFolder.open(tmp_path / "a"), small.quiet(), count=4)
+        resume(CalibrationFolder.open(tmp_path / "a"), small.quiet(), replicates=4)
     assert {"config.toml", "records", "replicates.jsonl"} == {
         path.name for path in (tmp_path / "a").iterdir() if path.name != ".lock"
     }

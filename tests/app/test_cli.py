@@ -118,10 +118,8 @@ def test_help_lists_every_part_of_a_model(bwbayes: Type, command: str) -> None:
         (("resume", "none", "--steps", "0"), "--steps"),
         (("report", "none"), "none: no run here; start one with"),
         (("predict", "none", "--signal", "step10"), "none: no run here; start one with"),
-        (("predict", "none"), "give either --record or --signal"),
+        (("predict", "none"), "give either a record or a signal"),
         (("predict", "none", "--signal", "step10", "--record", "a.csv"), "either"),
-        (("predict", "none", "--signal", "step10", "--lead-in", "nan"), "lead-in"),
-        (("predict", "none", "--signal", "step10", "--lead-in", "-1"), "lead-in"),
         (("simulate", "a.xyz"), "unknown suffix '.xyz'"),
         (("simulate", "none/a.csv"), "none/a.csv: cannot be written"),
         (("simulate", "a.csv", "--signal", "verificaton"), "did you mean 'verification'?"),
@@ -327,6 +325,8 @@ def test_lead_in_longer_than_the_record_is_refused(
     predict = "predict", run, "--record", "new.csv", "--out", "bands.csv"
     said = bwbayes(*predict, "--lead-in", "1")
     assert_one_line(said, "lead-in of 1 s from 0 s on leaves nothing of the record from 0 to 0.6 s")
+    for length in ("nan", "-1"):
+        assert_one_line(bwbayes(*predict, "--lead-in", length), "not a positive length of time")
     assert not (tmp_path / "bands.csv").exists()
     # By itself it is a quarter of the record.
     assert 2 != bwbayes(*predict).status
@@ -369,7 +369,7 @@ def test_predict_after_continues_the_training_record_with_a_signal(
     assert rows[0, 0] == pytest.approx(fitted.start + fitted.duration)
     assert 550 == len(rows)
     said = bwbayes("predict", run, "--signal", "step50", "--after", "--window", "1", "2")
-    assert_one_line(said, "--window is for a --record")
+    assert_one_line(said, "a window is for a record")
     rows_of = [f"{i / 100},{50 * np.sin(i / 30)}" for i in range(300)]
     (tmp_path / "plan.csv").write_bytes(lines("time_s,voltage_V", *rows_of))
     said = bwbayes("predict", run, "--record", "plan.csv", "--after", "--out", "none.csv")

@@ -16,7 +16,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.compare import compare as compare_command
+from bwbayes.app.commands.studies import compare as compare_command
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.data import Record
 from bwbayes.errors import InputError, InputWarning
@@ -252,7 +252,7 @@ def test_a_config_alone_is_run_with_the_usual_models(
         asked.append(given[2])
         raise InputError("that is enough")
 
-    monkeypatch.setattr("bwbayes.app.jobs.models.compare_models", noted)
+    monkeypatch.setattr("bwbayes.app.jobs.compare.compare_models", noted)
     assert run([str(tmp_path / "c.toml")], monkeypatch) == 2
     (models,) = asked
     assert len(models) >= 6

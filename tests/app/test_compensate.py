@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.compensate import compensate as command
+from bwbayes.app.commands.products import compensate as command
 from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.predicted import FILES, Compensation

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.export import export as command
+from bwbayes.app.commands.products import export as command
 from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.export import FILES, export
 from bwbayes.errors import InputError

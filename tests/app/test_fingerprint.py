@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import resolve

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit

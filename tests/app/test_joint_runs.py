@@ -14,9 +14,8 @@ import bwbayes
 from bwbayes.app.config.config import Config, dump, parse
 from bwbayes.app.config.models import models_of
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.jobs.compare import compare
+from bwbayes.app.jobs.compare import compare, compare_models, open_runs
 from bwbayes.app.jobs.design import amplifier_of, candidates_of, liveliest
-from bwbayes.app.jobs.models import compare_models, open_runs
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.commands.products import predict
 from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
 from tests.app import small

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from bwbayes.app.commands import cli, run
+from bwbayes.app.commands import cli, fitting
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import Problem, resolve
@@ -219,7 +219,7 @@ def test_run_without_a_config_runs_the_proposed_one(
         ran.append(folder)
         return 0
 
-    monkeypatch.setattr(run, "finish", finish)
+    monkeypatch.setattr(fitting, "finish", finish)
     done = command("run", path, "--out", tmp_path / "out", "--quiet")
     assert 0 == done.return_value
     assert "" == done.output
@@ -252,7 +252,7 @@ def test_what_the_reader_remarks_is_shown_and_kept(
     header, *rows = path.read_text().splitlines()
     path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
     remark = "mine.csv:1: ignored columns: temperature_C"
-    monkeypatch.setattr(run, "finish", shown_alone)
+    monkeypatch.setattr(fitting, "finish", shown_alone)
     name, _, config = command_line.partition(" ")
     if config:
         path = path.with_suffix(".toml")

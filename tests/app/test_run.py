@@ -16,7 +16,7 @@ import pytest
 import xarray
 from rich.console import Console
 
-from bwbayes.app.commands.shared import finish
+from bwbayes.app.commands.ending import finish
 from bwbayes.app.fit.opening import finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
@@ -173,7 +173,7 @@ def test_interrupted_command_says_how_to_go_on(
 ) -> None:
     made = small.begun(tmp_path / "a")
     watch_until(monkeypatch, "pilot", 5)
-    assert 130 == finish(made.path, 1, quiet=True)
+    assert 130 == finish(made.path, workers=1, quiet=True)
     printed = capsys.readouterr()
     assert f"interrupted; resume with `bwbayes resume {made.path}`\n" == printed.err
     assert "" == printed.out

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.track import track as command
+from bwbayes.app.commands.products import track as command
 from bwbayes.control.tracked import CONTROLLERS
 from bwbayes.errors import InputError
 

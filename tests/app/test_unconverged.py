@@ -11,7 +11,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.shared import finish
+from bwbayes.app.commands.ending import finish
 from bwbayes.app.config.config import load
 from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
@@ -28,7 +28,7 @@ def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]
     """Return a run that used up its budget, and the exit status of its command."""
     path = tmp_path_factory.mktemp("short") / "small"
     made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
-    return made, finish(made.path, 1, quiet=True)
+    return made, finish(made.path, workers=1, quiet=True)
 
 
 def test_run_without_convergence_speaks_of_no_interval(
@@ -52,7 +52,7 @@ def test_line_on_the_screen_says_what_to_do(
     cut_short: tuple[RunFolder, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(cut_short[0].path, tmp_path / "a")
-    assert 4 == finish(tmp_path / "a", 1, quiet=True)
+    assert 4 == finish(tmp_path / "a", workers=1, quiet=True)
     printed = capsys.readouterr()
     assert "" == printed.out
     assert 1 == printed.err.count("\n")
@@ -118,7 +118,7 @@ def test_likelihood_that_is_nan_everywhere_is_said(
     folder = small.begun(tmp_path / "a")
     monkeypatch.setattr(Posterior, "log_likelihood", not_a_number)
     with pytest.raises(InputError, match="no draw has a finite posterior density"):
-        finish(folder.path, 1, quiet=True)
+        finish(folder.path, workers=1, quiet=True)
     assert not folder.summary.exists()
 
 

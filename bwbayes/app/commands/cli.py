@@ -1,4 +1,4 @@
-"""The command line: a thin layer over the package, a module for each command.
+"""The command line: a thin layer over the package.
 
 Exit status 0: success. 2: invalid input, said in one line. 3: converged, but validation failed: the
 bands do not hold on a record that was measured, fitted or not. 4: not converged, or calibration
@@ -18,21 +18,11 @@ from concurrent.futures.process import BrokenProcessPool
 
 import click
 
-from bwbayes.app.commands.calibrate import calibrate
-from bwbayes.app.commands.campaign import campaign
-from bwbayes.app.commands.check import check
-from bwbayes.app.commands.compare import compare
-from bwbayes.app.commands.compensate import compensate
-from bwbayes.app.commands.design import design
-from bwbayes.app.commands.export import export
-from bwbayes.app.commands.init import init
-from bwbayes.app.commands.predict import predict
+from bwbayes.app.commands.ending import BAD_INPUT, INTERRUPTED, NOT_CONVERGED
+from bwbayes.app.commands.fitting import check, init, report, resume, run
+from bwbayes.app.commands.products import compensate, design, export, predict, track
 from bwbayes.app.commands.reference import config, models
-from bwbayes.app.commands.report import report
-from bwbayes.app.commands.run import resume, run
-from bwbayes.app.commands.shared import BAD_INPUT, INTERRUPTED, NOT_CONVERGED
-from bwbayes.app.commands.simulate import simulate
-from bwbayes.app.commands.track import track
+from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
 from bwbayes.app.commands.wording import as_typed
 from bwbayes.errors import ColumnsError, InputError, NotConvergedError
 

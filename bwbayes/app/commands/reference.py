@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from bwbayes.app.commands.shared import WithParts
+from bwbayes.app.commands.options import WithParts
 
 __all__ = ["config", "models"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from bwbayes.app.config.limits import USUAL_MODELS
 from bwbayes.errors import InputError
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.comparison.compared import Comparison
     from bwbayes.data import Record
-    from bwbayes.inference.engine import Engine
 
 __all__ = ["compare", "fit", "open_run", "resume"]
 
@@ -47,13 +46,13 @@ def fit(
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume`. By default nothing is left but the fit.
     overwrite
-        Replace a run that is in the folder already.
+        Replace an existing run.
     improve
-        First add the parts of the model, one after the other, for which the record has evidence.
+        Add the parts of the model that the record supports, one after the other, first of all.
     workers
-        Ensembles side by side; by default one a core. The draws do not depend on it.
+        Ensembles side by side; default: all cores. The draws do not depend on it.
     executor
-        Where they run: "local", "threads", "processes", "dask" or "dask://HOST:PORT", a
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python also a
         ``distributed.Client``, or any executor with the methods of ``concurrent.futures``.
     progress
         Show how far it is.
@@ -132,14 +131,18 @@ def compare(
         Where page, table and numbers go, and the runs of the models: after an interruption those
         that are there go on. By default nothing is left but the comparison.
     overwrite
-        Replace what is in the folder already.
+        Replace existing files.
     screen
         Whether to leave out the sampling of models that are out of reach at their MAP estimates.
     future
         Whether to score the later half of the training readings too, given the earlier half, which
         takes a short fit.
-    workers, executor, progress
-        As in :func:`fit`.
+    workers
+        Models or ensembles side by side; default: all cores.
+    executor
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python as in :func:`fit`.
+    progress
+        Show how far it is.
     keys
         The keys of a config, as in :func:`fit`; the same for all models.
 
@@ -161,7 +164,6 @@ def compare(
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.fit.surroundings import Scratch, console_of
     from bwbayes.app.jobs import compare as job
-    from bwbayes.app.jobs import models as models_job
     from bwbayes.report.saving import refuse_existing
 
     scratch = Scratch() if folder is None else None
@@ -180,7 +182,7 @@ def compare(
         config, records = config_of(compared_runs, keys, "compare")
         named_models = USUAL_MODELS if models is None else models
         text = named_models if isinstance(named_models, str) else "; ".join(named_models)
-        comparison = models_job.compare_models(
+        comparison = job.compare_models(
             config,
             Path(),
             models_of(text, config.model),
@@ -236,7 +238,7 @@ def resume(
     *,
     ess: float | None = None,
     steps: int | None = None,
-    engine: Engine | None = None,
+    engine: Literal["numpy", "numba"] | None = None,
     workers: int | None = None,
     executor: Any = None,
     progress: bool = True,
@@ -247,12 +249,18 @@ def resume(
     ----------
     folder
         The run's folder.
-    ess, steps
-        A new target of effective draws, a new budget of steps; by default as before.
+    ess
+        New target of effective draws; default: as before.
+    steps
+        New maximum number of steps; default: as before.
     engine
         Continue with this engine, whatever the chain was begun with.
-    workers, executor, progress
-        As in :func:`fit`.
+    workers
+        Ensembles side by side; default: all cores.
+    executor
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python as in :func:`fit`.
+    progress
+        Show how far it is.
 
     Raises
     ------

@@ -203,7 +203,7 @@ def campaign(
         _write(records, Path(source))
     begun_folder = start(Path(source), text, where, path, pictures=pictures, overwrite=overwrite)
     finished = Campaign(
-        resume(begun_folder, console_of(progress), workers=workers, backend=executor),
+        resume(begun_folder, console_of(progress), workers=workers, executor=executor),
         begun_folder,
         scratch,
     )

@@ -18,15 +18,16 @@ from bwbayes.app.jobs.at_work import at_work
 from bwbayes.app.jobs.compensate import compensate as compensate_fit
 from bwbayes.app.jobs.design import design as design_fit
 from bwbayes.app.jobs.export import export as export_fit
+from bwbayes.app.jobs.predict import predict as predict_record
+from bwbayes.app.jobs.predict import prediction_notes
 from bwbayes.app.jobs.track import track as track_fit
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.assembling import assemble, load_result
 from bwbayes.app.running.fingerprint import version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import Prediction, predict_another, residuals_along
+from bwbayes.app.running.predictions import Prediction, residuals_along
 from bwbayes.app.running.workers import executor
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, read_record
 from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.report.page import fragment
@@ -35,7 +36,6 @@ from bwbayes.report.run import run_report
 from bwbayes.report.screen import as_text
 from bwbayes.results.loops import Loops
 from bwbayes.results.outputs import posterior_tree
-from bwbayes.results.prediction import Start
 from bwbayes.results.result import Result, summary
 from bwbayes.results.standing import Standing
 from bwbayes.results.verdict import Verdict
@@ -240,57 +240,7 @@ class Fit:
 
         return Plots(self.problem, self.result, self._converged)
 
-    def predict(
-        self,
-        record: Record | str | Path,
-        *,
-        name: str | None = None,
-        window: tuple[float, float] | None = None,
-        from_rest: bool = False,
-        own_offset: bool = True,
-        lead_in: float | None = None,
-        lead_in_from: float | None = None,
-        after: bool = False,
-        of: str | None = None,
-    ) -> Prediction:
-        """Predict another record, or a planned voltage without a displacement.
-
-        Parameters
-        ----------
-        record
-            The record or its file, at any sampling interval.
-        name
-            Name of the bands; by default the file's, or "prediction".
-        window
-            Start and stop in s of the part that is predicted and judged; by default all of it.
-        from_rest, own_offset, lead_in, lead_in_from, after, of
-            What is known of its start, as of a config's [validation.NAME]. With ``after`` what
-            comes after the lead-in is a forecast.
-
-        Raises
-        ------
-        NotConvergedError
-            The sampling has not converged.
-        InputError
-            A lead-in or window that does not fit into the record.
-
-        Warns
-        -----
-        InputWarning
-            A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
-        """
-        self.require_converged()
-        name = name or ("prediction" if isinstance(record, Record) else Path(record).stem)
-        if not isinstance(record, Record):
-            record = read_record(record, need_displacement=False)
-        hold = self.problem.config.model.hold
-        interpolation = None if hold == "auto" else hold
-        start = Start(from_rest, own_offset, lead_in, lead_in_from, interpolation, after)
-        prediction = predict_another(self.problem, self.flat_draws, record, start, name, window, of)
-        standing = Standing.of([prediction.verdict] if prediction.verdict else [])
-        warn([*(f"{name}: {remark}" for remark in prediction.remarks), *standing.said], 3)
-        return prediction
-
+    predict = at_work(predict_record, before=lambda _: (), after=prediction_notes)
     compensate = at_work(compensate_fit)
     design = at_work(design_fit)
     export = at_work(export_fit)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import signature
-from typing import TYPE_CHECKING, Concatenate
+from typing import TYPE_CHECKING, Any, Concatenate
 
 import numpy as np
 
@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 __all__ = ["at_work", "command_limits", "limits_of"]
 
 
-def at_work[**P, R](job: Callable[Concatenate[Fit, P], R]) -> Callable[Concatenate[Fit, P], R]:
+def at_work[**P, R](
+    job: Callable[Concatenate[Fit, P], R],
+    before: Callable[[Fit], Iterable[str]] = lambda fit: fit.standing.said,
+    after: Callable[[Any], Iterable[str]] = lambda product: getattr(product, "remarks", ()),
+) -> Callable[Concatenate[Fit, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints."""
     options = [*signature(job).parameters][1:]
 
@@ -30,9 +34,9 @@ def at_work[**P, R](job: Callable[Concatenate[Fit, P], R]) -> Callable[Concatena
             if name not in options:
                 raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")
         fit.require_converged()
-        warn(fit.standing.said, 3)
+        warn(before(fit), 3)
         product = job(fit, *args, **kwargs)
-        warn(getattr(product, "remarks", ()), 3)
+        warn(after(product), 3)
         return product
 
     return method

@@ -29,37 +29,36 @@ from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import CountProgress
-from bwbayes.app.running.workers import executor, one_thread, side_by_side
+from bwbayes.app.running.workers import executor as executor_of
+from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.saving import save
 from bwbayes.results.calibration import Calibration, judge
-from bwbayes.results.replicates import RANKED, Entry, Experiment, replicates
+from bwbayes.results.replicates import RANKED, Entry, Experiment
+from bwbayes.results.replicates import replicates as run_replicates
 from bwbayes.results.simulated import OtherRecord
 
 __all__ = ["experiment", "resume", "start"]
 
-# Draws of the prior that show whether there is one.
-TRIED = 64
-
 
 class _Request(BaseModel):
-    """The first line, and any that asks for more: how many replicates, of what."""
+    """A line that says how many replicates were requested, of what."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     replicates: PositiveInt
     of: str
 
-    @property
     def line(self) -> bytes:
+        """Return it as it is written."""
         return self.model_dump_json().encode() + b"\n"
 
 
 def start(
-    config: Config, where: Path, out: Path, count: int, *, overwrite: bool = False
+    config: Config, where: Path, out: Path, count: int | None = None, *, overwrite: bool = False
 ) -> CalibrationFolder:
-    """Make the folder of a new calibration with ``count`` replicates.
+    """Make the folder of a new calibration with ``count`` replicates, by default 500.
 
     The config's files are relative to the folder ``where``.
 
@@ -70,8 +69,8 @@ def start(
     """
     problem = resolve(config, where)
     experiment(problem)
-    request = _Request(replicates=count, of=_identity(problem))
-    return CalibrationFolder.create(out, problem, overwrite, request.line)
+    request = _Request(replicates=count or 500, of=_identity(problem))
+    return CalibrationFolder.create(out, problem, overwrite, request.line())
 
 
 def experiment(problem: Problem) -> Experiment:
@@ -85,7 +84,8 @@ def experiment(problem: Problem) -> Experiment:
     InputError
         Its voltage shows no loop, or its prior leaves hardly anything.
     """
-    problem.posterior.prior.draw(np.random.default_rng(0), TRIED)
+    # Refused is a prior of which no draw is possible.
+    problem.posterior.prior.draw(np.random.default_rng(0), 64)
     windows = {
         f"{name} {i}" if i else name: window
         for name, v in problem.validations.items()
@@ -104,9 +104,9 @@ def resume(
     folder: CalibrationFolder,
     console: Console,
     *,
+    replicates: int | None = None,
     workers: int | None = None,
-    count: int | None = None,
-    backend: str | Executor | None = None,
+    executor: str | Executor | None = None,
 ) -> Calibration:
     """Make the missing replicates, judge all, and write the calibration's files.
 
@@ -116,13 +116,13 @@ def resume(
         The calibration's folder.
     console
         Where progress goes.
+    replicates
+        How many; default: 500, or as begun. None is thrown away.
     workers
-        Replicates side by side, in processes if more than one; by default as many as cores. The
-        result does not depend on it.
-    count
-        A new number of replicates, if given; none is thrown away.
-    backend
-        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
+        Replicates side by side; default: all cores. The result does not depend on it.
+    executor
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python any executor, as
+        in :func:`~bwbayes.app.running.workers.executor`.
 
     Raises
     ------
@@ -131,16 +131,18 @@ def resume(
     """
     with folder.locked(), one_thread():
         problem = resolve(load(folder.config), folder.path)
-        common = experiment(problem)
-        request, entries = _read(folder, common, _identity(problem))
-        if count is not None and count != request.replicates:
-            request = request.model_copy(update={"replicates": count})
-            _append(folder, request.line)
-        missing = [number for number in range(request.replicates) if number not in entries]
-        # It is written last, as the sign that all is done; now there is more to do.
-        _clear(folder)
+        common, identity = experiment(problem), _identity(problem)
+        requested, entries = _read(folder, common, identity)
+        if replicates not in (None, requested):
+            requested = replicates or requested
+            _append(folder, _Request(replicates=requested, of=identity).line())
+        missing = [number for number in range(requested) if number not in entries]
+        # The summary is the sign that all is done; now there is more to do.
+        for path in (folder.summary, folder.path / "calibration.html"):
+            path.unlink(missing_ok=True)
+        shutil.rmtree(folder.path / "figures", ignore_errors=True)
         if missing:
-            _make(folder, common, problem.config.seed, missing, entries, workers, console, backend)
+            _make(folder, common, problem.config.seed, missing, entries, workers, console, executor)
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         provenance = {
@@ -180,13 +182,13 @@ def _make(
     unconverged = sum(not entry["converged"] for entry in entries.values())
     # Processes, also for the compiled engine: most of a replicate's time goes into Python.
     with (
-        executor(count, backend=backend) as pool,
+        executor_of(count, backend=backend) as pool,
         CountProgress(
             console, "replicate", len(entries), len(missing), {"not converged": unconverged}
         ) as progress,
     ):
         together = side_by_side(pool, workers, len(missing))
-        for replicate in replicates(common, seed, missing, pool, together):
+        for replicate in run_replicates(common, seed, missing, pool, together):
             entry = entries[replicate.number] = replicate.entry()
             _append(folder, json.dumps(entry).encode() + b"\n")
             progress("" if replicate.converged else "not converged")
@@ -202,72 +204,53 @@ def _append(folder: CalibrationFolder, line: bytes) -> None:
 
 def _read(
     folder: CalibrationFolder, common: Experiment, identity: str
-) -> tuple[_Request, dict[int, Entry]]:
+) -> tuple[int, dict[int, Entry]]:
     """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()
     end = content.rfind(b"\n") + 1
     if end < len(content):
         os.truncate(folder.replicates, end)
-    first, *others = content[:end].splitlines() or [b""]
-    request = _request(folder, first, identity)
-    entries: dict[int, Entry] = {}
-    for number, line in enumerate(others, start=2):
-        if line.startswith(b'{"replicates"'):
-            request = _request(folder, line, identity)
-            continue
+    line_of = TypeAdapter[_Request | Entry](_Request | Entry)
+    statistics = [*common.statistics], [*common.bands]
+    request, entries = None, dict[int, Entry]()
+    for number, line in enumerate(content[:end].splitlines(), start=1):
         try:
-            entry = _entry(line, common, entries)
+            entry = line_of.validate_json(line)
+            if isinstance(entry, _Request):
+                request = entry
+                continue
+            if ([*entry["ranks"]], [*entry["covered"]]) not in (statistics, ([], [])):
+                raise ValueError("has other statistics")
+            if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
+                raise ValueError("has a rank that there is not")
+            if entry["number"] in entries:
+                raise ValueError("is there already")
         except ValueError:
             raise InputError(
                 f"{folder.replicates}:{number}: is not one of these replicates; delete this line"
             ) from None
         entries[entry["number"]] = entry
-    return request, entries
-
-
-def _request(folder: CalibrationFolder, line: bytes, identity: str) -> _Request:
-    """Read the line that says how many replicates were requested, and check that they are these."""
-    try:
-        request = _Request.model_validate_json(line)
-    except ValueError:
+    if request is None:
         raise InputError(
             f"{folder.replicates}: does not say how many replicates were requested; "
             "start again with `overwrite=True`"
-        ) from None
+        )
     if request.of != identity:
         raise InputError(
             f"{folder.replicates}: these are replicates of another config or record than the "
             "folder's; restore that, or start again with `overwrite=True`"
         )
-    return request
-
-
-def _entry(line: bytes, common: Experiment, others: Mapping[int, Entry]) -> Entry:
-    """Read a line, and check that it is a replicate of this experiment, and a new one."""
-    entry = TypeAdapter(Entry).validate_json(line)
-    stored = [*entry["ranks"]], [*entry["covered"]]
-    if stored not in (([*common.statistics], [*common.bands]), ([], [])):
-        raise ValueError("has other statistics")
-    if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
-        raise ValueError("has a rank that there is not")
-    if entry["number"] in others:
-        raise ValueError("is there already")
-    return entry
-
-
-def _clear(folder: CalibrationFolder) -> None:
-    """Remove what an earlier run has written."""
-    for path in (folder.summary, folder.path / "calibration.html"):
-        path.unlink(missing_ok=True)
-    shutil.rmtree(folder.path / "figures", ignore_errors=True)
+    return request.replicates, entries
 
 
 def _facts(problem: Problem, provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return what was run, by subject."""
     model, plan = problem.config.model, problem.plan
-    held_out = [window for v in problem.validations.values() for window in v.windows]
-    judged = sum(window.stop - window.start for window in held_out)
-    windows = [window for dataset in problem.posterior.datasets for window in dataset.training]
-    fitted = sum(window.stop - window.start for window in windows)
+    windows = {
+        "fitted": [w for dataset in problem.posterior.datasets for w in dataset.training],
+        "held out": [w for validation in problem.validations.values() for w in validation.windows],
+    }
+    samples = [sum(w.stop - w.start for w in several) for several in windows.values()]
     return [
         *(
             (
@@ -276,7 +259,7 @@ def _facts(problem: Problem, provenance: Mapping[str, Any]) -> list[tuple[str, s
             )
             for name, record in problem.records.items()
         ),
-        ("fitted, held out", f"{fitted} samples, {judged} samples"),
+        (", ".join(windows), ", ".join(f"{count} samples" for count in samples)),
         ("model", in_words(model)),
         ("noise", model.noise),
         (

@@ -24,7 +24,8 @@ from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_
 from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.one_record import SPECIMEN, Ended, Task, fit_one
 from bwbayes.app.running.progress import CountProgress
-from bwbayes.app.running.workers import executor, one_thread, side_by_side
+from bwbayes.app.running.workers import executor as executor_of
+from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.population.population import FEWEST, population
 from bwbayes.population.specimen import Specimen
@@ -98,7 +99,7 @@ def resume(
     console: Console,
     *,
     workers: int | None = None,
-    backend: str | Executor | None = None,
+    executor: str | Executor | None = None,
 ) -> CampaignResult:
     """Fit the records that are missing, and write table and page over all.
 
@@ -109,11 +110,11 @@ def resume(
     console
         Where progress goes.
     workers
-        Records side by side, in processes if more than one; by default as many as cores. The result
-        does not depend on it.
-    backend
-        Which executor, as in :func:`~bwbayes.app.running.workers.executor`. The machines of a
-        cluster must all see the campaign's folder and that of the records by the same path.
+        Records side by side; default: all cores. The result does not depend on it.
+    executor
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python any executor, as
+        in :func:`~bwbayes.app.running.workers.executor`. The machines of a cluster must all see the
+        campaign's folder and that of the records by the same path.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def resume(
         folder.summary.unlink(missing_ok=True)
         if missing:
             done = len(fitted) - len(missing)
-            refused |= _fit(folder, origin, missing, done, workers, console, backend)
+            refused |= _fit(folder, origin, missing, done, workers, console, executor)
         console.print("combining the records ...", highlight=False)
         campaign = _together(folder, files, refused)
         # Nothing in its files depends on when or how it was computed.
@@ -173,7 +174,7 @@ def _fit(
     count = min(workers or os.cpu_count() or 1, len(tasks))
     refused: dict[str, str] = {}
     with (
-        executor(count, backend=backend) as pool,
+        executor_of(count, backend=backend) as pool,
         CountProgress(
             console, "record", done, len(missing), {"not converged": 0, "refused": 0}
         ) as progress,

@@ -6,7 +6,7 @@ shows to be wrong with it, each with the line of config that deals with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from markupsafe import Markup
@@ -16,7 +16,6 @@ from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.data import Record
 from bwbayes.diagnosis import conflict
-from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference import pointfit
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import (
@@ -33,18 +32,8 @@ from bwbayes.results import identifiability, innovations
 
 __all__ = ["check"]
 
-CAPTIONS = {
-    "time": (
-        "Along time",
-        "Voltage and displacement. Gray: readings that are not fitted; colored: the parts of the "
-        "record with which something is wrong.",
-    ),
-    "loop": ("Hysteresis loop", "Displacement against voltage, colored by time."),
-    "drive": ("Spectrum of the drive", "Amplitude of the voltage at each frequency."),
-}
 
-
-def check(config: Config, folder: Path, out: Path) -> tuple[Problem, Report]:
+def check(config: Config, folder: Path, out: Path) -> Report:
     """Check a config and its record, fit a point, write ``out/check.html``; return its report.
 
     Parameters
@@ -60,34 +49,23 @@ def check(config: Config, folder: Path, out: Path) -> tuple[Problem, Report]:
         The config or its record cannot be used.
     """
     problem = resolve(config, folder)
-    posterior = problem.posterior
-    findings = problem.findings
-    point = pointfit.fit(posterior, generator(problem.config.seed, "point fit"))
+    posterior, seed = problem.posterior, problem.config.seed
+    point = pointfit.fit(posterior, generator(seed, "point fit"))
     free, _ = posterior.prior.constrain(point.mode[None])
-    fitted = dict(zip(posterior.names, free[0], strict=True))
-    likely = conflict.around(posterior.prior, point, generator(problem.config.seed, "around"))
+    likely = conflict.around(posterior.prior, point, generator(seed, "around"))
     # The findings are remarks too, but here they come with what to do.
-    shown = {f"{name}: {finding}" for name, issues in findings.items() for finding in issues}
+    findings = [finding for issues in problem.findings.values() for finding in issues]
+    shown = {f"{name}: {issue}" for name, issues in problem.findings.items() for issue in issues}
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
-    untold = [*map(str, identifiability.undetermined(posterior, point))]
+    warnings = [*map(str, identifiability.undetermined(posterior, point))]
     explanations: list[str] = []
     for name, alone, theta in posterior.each(free):
         odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))
         explanations += lines(explained(problem, name, point.optima, thorough=odd))
-    report = _report(problem, remarks, untold, explanations, fitted)
-    save(report, out, "check", pictures="figures")
-    return problem, report
-
-
-def _report(
-    problem: Problem,
-    remarks: Sequence[str],
-    warnings: Sequence[str],
-    explanations: Sequence[str],
-    fitted: Mapping[str, float],
-) -> Report:
-    """Return what to know of a record and a config, with pictures of the record."""
+    item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
+    items = [item.format(finding.kind, finding.text, finding.fix) for finding in findings]
+    nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
     facts = [
         (f"{subject}, {name}" if several else subject, fact)
@@ -96,17 +74,18 @@ def _report(
     ]
     name = problem.config.name or problem.record.origin
     about = "; ".join(f"{subject} {fact}" if several else fact for subject, fact in facts)
-    warned = Banner("note", "Warnings", items=warnings, label="warning")
-    better = Banner("note", "Explanations", items=explanations, label="note")
-    return Report(
+    report = Report(
         title=f"{name}, check",
         heading=f"Check: {name}",
         about=about,
         banners=[
-            _findings([finding for issues in problem.findings.values() for finding in issues]),
+            Banner("note", "Problems of the record", items=items, label="problem", name="findings")
+            if items
+            else Banner("good", "Nothing wrong shows", [nothing]),
             *remarks_banner(remarks),
-            *[warned] * bool(warnings),
-            *[better] * bool(explanations),
+            *[Banner("note", "Warnings", items=warnings, label="warning")] * bool(warnings),
+            *[Banner("note", "Explanations", items=explanations, label="note")]
+            * bool(explanations),
         ],
         blocks=[
             Text(about, on="screen"),
@@ -114,7 +93,7 @@ def _report(
             Section(
                 "Priors and point fit",
                 [
-                    priors_table(problem.posterior.prior, fitted),
+                    priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True))),
                     Text(
                         Markup(
                             "The point fit is the most probable set of parameters; it says nothing "
@@ -128,29 +107,28 @@ def _report(
             Section("The record", [Facts(facts)], folded=False),
         ],
     )
-
-
-def _findings(findings: Sequence[Finding]) -> Banner:
-    """Return what is wrong with the records, and what to do about it."""
-    if not findings:
-        nothing = (
-            "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
-        )
-        return Banner("good", "Nothing wrong shows", [nothing])
-    item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
-    items = [item.format(finding.kind, finding.text, finding.fix) for finding in findings]
-    return Banner("note", "Problems of the record", items=items, label="problem", name="findings")
+    save(report, out, "check", pictures="figures")
+    return report
 
 
 def _pictures(problem: Problem) -> Iterator[Picture]:
     """Yield the pictures of each record."""
     from bwbayes.report.figures.record import record_drawings  # noqa: PLC0415  # slow to load
 
+    captions = {
+        "time": (
+            "Along time",
+            "Voltage and displacement. Gray: readings that are not fitted; colored: the parts of "
+            "the record with which something is wrong.",
+        ),
+        "loop": ("Hysteresis loop", "Displacement against voltage, colored by time."),
+        "drive": ("Spectrum of the drive", "Amplitude of the voltage at each frequency."),
+    }
+    several = len(problem.records) > 1
     for name, record in problem.records.items():
         training = problem.posterior.alone(name).only.training
         for kind, draw in record_drawings(record, training, problem.findings[name]).items():
-            title, text = CAPTIONS[kind]
-            several = len(problem.records) > 1
+            title, text = captions[kind]
             yield Picture(
                 f"{kind}_{name}" if several else kind,
                 f"{title}: {name}" if several else title,
@@ -160,6 +138,7 @@ def _pictures(problem: Problem) -> Iterator[Picture]:
 
 
 def _facts(record: Record) -> list[tuple[str, str]]:
+    """Return what a record is, by subject."""
     low, high = record.range_voltage
     missing = record.samples - record.readings
     return [

@@ -1,37 +1,75 @@
 """Which model? Fits of the same readings, each judged by what a comparison weighs.
 
-Fits of different readings are refused: their numbers would not be about the same thing.
-:mod:`bwbayes.app.jobs.models` runs models for a comparison.
+:func:`compare` takes fits that exist, :func:`open_runs` those in folders. :func:`compare_models`
+runs a config with several models side by side, each into a folder of its own, and goes on with
+those that are there already. All are screened by their MAP estimates first; only what is within
+reach is sampled.
 """
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 
-from bwbayes.app.problem.model import in_words
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.config.config import Config, ModelConfig, dump
+from bwbayes.app.config.models import slug
+from bwbayes.app.fit.opening import finished
+from bwbayes.app.problem.continued import joined
+from bwbayes.app.problem.model import actuator_of, in_words
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.records import training_records
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions, scoring
+from bwbayes.app.running.run import begin, draw, resume
 from bwbayes.app.running.workers import executor as executor_of
-from bwbayes.app.running.workers import one_thread
+from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.comparison.candidates import Candidate, judged
 from bwbayes.comparison.compared import Comparison
-from bwbayes.comparison.evidence import evidence
+from bwbayes.comparison.evidence import evidence, screening_evidence
 from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
 from bwbayes.comparison.recommendation import recommend
-from bwbayes.errors import InputError
+from bwbayes.data import Record
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.noise import noise_model
+from bwbayes.inference.table import ParameterTable
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
+from bwbayes.results.replicates import as_done
 from bwbayes.results.scores import score
+from bwbayes.results.standing import Standing
 from bwbayes.sampling.chain import draws, log_densities
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["by_name", "candidate", "compare", "comparison_of", "description", "require_same"]
+__all__ = ["by_name", "compare", "compare_models", "open_runs"]
+
+# Nats of evidence and of likelihood by which a model may be behind at its MAP estimate.
+REACH = 30.0
+
+
+def open_runs(folders: Sequence[Path]) -> dict[str, Fit]:
+    """Return the fits of the runs in folders, by the folders' names.
+
+    Raises
+    ------
+    InputError
+        No such run, or one that is there twice.
+    """
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("compare: the same run is there twice; leave one out")
+    names = [folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    fits = [finished(RunFolder.open(folder)) for folder in folders]
+    return dict(zip(names, fits, strict=True))
 
 
 def by_name(named: Iterable[tuple[str, Fit]]) -> dict[str, Fit]:
@@ -40,51 +78,6 @@ def by_name(named: Iterable[tuple[str, Fit]]) -> dict[str, Fit]:
     if len(dict(pairs)) == len(pairs):
         return dict(pairs)
     return {f"{name} {number}": fit for number, (name, fit) in enumerate(pairs, start=1)}
-
-
-def require_same(fits: Mapping[str, Fit]) -> None:
-    """Refuse a last fit that is not about the same readings as the first.
-
-    Raises
-    ------
-    InputError
-        Records, training windows or what is held out differ.
-    """
-    first, last = next(iter(fits)), [*fits][-1]
-    first_problem, last_problem = fits[first].problem, fits[last].problem
-    pair = f"compare: {first} and {last}"
-    if first_problem.sha256 != last_problem.sha256:
-        raise InputError(
-            f"{pair}: fitted to different records, or in different units; compare fits of one "
-            "record, with the same readings left out"
-        )
-    windows = [
-        [dataset.training for dataset in p.posterior.datasets]
-        for p in (first_problem, last_problem)
-    ]
-    if windows[0] != windows[1]:
-        raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
-    held = [_held_out(problem) for problem in (first_problem, last_problem)]
-    if held[0] != held[1]:
-        names = [key for key in {**held[0], **held[1]} if held[0].get(key) != held[1].get(key)]
-        raise InputError(
-            f"{pair}: differ in what is held out ({', '.join(names)}); give both the same "
-            "[validation]"
-        )
-
-
-def _held_out(problem: Problem) -> dict[str, object]:
-    """Return what is held out, by name, so that it can be compared."""
-    return {
-        name: (
-            validation.windows,
-            None if validation.record is None else validation.record.sha256,
-            replace(validation.start, hold=None),
-            validation.judged,
-            validation.of,
-        )
-        for name, validation in problem.validations.items()
-    }
 
 
 def compare(
@@ -114,44 +107,157 @@ def compare(
     Raises
     ------
     InputError
-        Fits of different readings.
+        Fits of different readings: their numbers would not be about the same thing.
     """
-    require_same(fits)
+    first, *others = fits
+    for name in others:
+        _require_same(f"compare: {first} and {name}", fits[first].problem, fits[name].problem)
     candidates = []
     for name, fit in fits.items():
         if console is not None and not console.quiet:
             console.print(f"judging {name} ...", highlight=False)
         with one_thread(), executor_of(workers, fit.problem.posterior.engine, executor) as pool:
-            judged_fit = candidate(name, fit, pool, future=future)
-        candidates.append(
-            replace(judged_fit, standing=fit.standing) if fit.converged else judged_fit
+            candidate = _candidate(name, fit, pool, future=future)
+        if fit.converged:
+            candidate = replace(candidate, standing=fit.standing)
+        candidates.append(candidate)
+    return _comparison(fits[first].problem, candidates)
+
+
+def compare_models(
+    config: Config,
+    where: Path,
+    models: Mapping[str, ModelConfig],
+    out: Path,
+    console: Console,
+    *,
+    in_memory: Mapping[str, Record] | None = None,
+    overwrite: bool = False,
+    screen: bool = True,
+    future: bool = True,
+    files: bool = True,
+    workers: int | None = None,
+    executor: Any = None,
+) -> Comparison:
+    """Run a config with each of the models, in folders below ``out``, and compare them.
+
+    The config's files are relative to the folder ``where``; ``in_memory`` are its records that are
+    not in files. Runs that are there already, of the same config, are resumed, and those that are
+    finished are taken as they are. Only the recommended model's run is validated and gets its
+    report; ``bwbayes resume FOLDER`` does the same for another one.
+
+    Parameters
+    ----------
+    config, where, models, out, console, in_memory, overwrite
+        See above.
+    screen
+        Whether to leave out what is out of reach by Laplace's evidence at the MAP estimate, and by
+        the likelihood there: by both, so that no prior's width decides.
+    future
+        As in :func:`compare`.
+    files
+        Whether to write the files of the recommended model's run.
+    workers
+        Models side by side, in processes if more than one; by default as many as cores.
+    executor
+        Where they run, as in :func:`bwbayes.fit`. The machines of a cluster must all see the folder
+        ``out`` by the same path.
+
+    Raises
+    ------
+    InputError
+        The config, its records or a folder cannot be used, or a folder has another run.
+    """
+    _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
+    folders: dict[str, RunFolder] = {}
+    for name, model in models.items():
+        problem = resolve(_with_model(config, model, name, [*wholes.values()]), where, in_memory)
+        folders[name] = _folder(out / slug(name), problem, overwrite)
+    count = min(workers or os.cpu_count() or 1, len(models))
+    with one_thread(), executor_of(count, backend=executor) as pool:
+        together = side_by_side(pool, workers, len(models))
+        if not console.quiet:
+            console.print(f"screening {len(models)} models ...", highlight=False)
+        screened = as_done(pool, together, _screened, folders.items())
+        candidates = {candidate.name: candidate for candidate in screened}
+        criteria = {
+            name: np.array([candidate.log_evidence, candidate.log_likelihood], dtype=np.float64)
+            for name, candidate in candidates.items()
+        }
+        within_reach = np.max([*criteria.values()], axis=0) - REACH
+        runs = (
+            (name, folders[name], future)
+            for name, values in criteria.items()
+            if not screen or folders[name].summary.is_file() or np.any(values >= within_reach)
         )
-    return comparison_of(next(iter(fits.values())).problem, candidates)
+        for candidate in as_done(pool, together, _sampled, runs):
+            candidates[candidate.name] = candidate
+            if not console.quiet:
+                console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
+        problem = next(iter(folders.values())).problem()
+        comparison = _comparison(problem, [candidates[name] for name in folders])
+        best = comparison.recommended
+        if best is None or comparison[best].standing is not None:
+            return comparison
+        standing = pool.submit(_standing, folders[best], files).result()
+    candidates[best] = replace(candidates[best], standing=standing)
+    return _comparison(problem, [candidates[name] for name in folders])
 
 
-def comparison_of(problem: Problem, candidates: Sequence[Candidate]) -> Comparison:
-    """Compare models of the same readings; ``problem`` is that of any of them."""
-    return replace(recommend(candidates), facts=_facts(problem, candidates))
-
-
-def _facts(problem: Problem, candidates: Sequence[Candidate]) -> tuple[tuple[str, str], ...]:
-    """Return the models, and the readings that they share."""
-    return (
-        *((model.name, model.model) for model in candidates),
-        *(
-            (name, f"{record.origin}: {record.samples} samples every {record.interval:g} s")
-            for name, record in problem.records.items()
-        ),
-        ("readings fitted", str(candidates[0].readings)),
-        ("held out", ", ".join(problem.validations) or "nothing"),
+def _require_same(pair: str, first: Problem, other: Problem) -> None:
+    """Refuse a fit that is not about the same readings as another."""
+    if first.sha256 != other.sha256:
+        raise InputError(
+            f"{pair}: fitted to different records, or in different units; compare fits of one "
+            "record, with the same readings left out"
+        )
+    windows, other_windows = (
+        [dataset.training for dataset in problem.posterior.datasets] for problem in (first, other)
     )
+    if windows != other_windows:
+        raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
+    held_out, other_held_out = (
+        {
+            name: (
+                validation.windows,
+                validation.record and validation.record.sha256,
+                replace(validation.start, hold=None),
+                validation.judged,
+                validation.of,
+            )
+            for name, validation in problem.validations.items()
+        }
+        for problem in (first, other)
+    )
+    names = [
+        key
+        for key in {**held_out, **other_held_out}
+        if held_out.get(key) != other_held_out.get(key)
+    ]
+    if names:
+        raise InputError(
+            f"{pair}: differ in what is held out ({', '.join(names)}); give both the same "
+            "[validation]"
+        )
 
 
-def candidate(name: str, fit: Fit, pool: Executor, *, future: bool = True) -> Candidate:
+def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison:
+    """Compare models of the same readings; ``problem`` is that of any of them."""
+    facts = [(model.name, model.model) for model in candidates]
+    facts += [
+        (name, f"{record.origin}: {record.samples} samples every {record.interval:g} s")
+        for name, record in problem.records.items()
+    ]
+    facts.append(("readings fitted", str(candidates[0].readings)))
+    facts.append(("held out", ", ".join(problem.validations) or "nothing"))
+    return replace(recommend(candidates), facts=tuple(facts))
+
+
+def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidate:
     """Work out all that a comparison knows of a fit, but for its validation."""
     problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
-    plain = description(name, problem, fit.outcome.stop_reason, converged=fit.outcome.converged)
-    if not fit.outcome.converged:
+    plain = _description(name, problem, fit.outcome.stop_reason, converged=fit.converged)
+    if not fit.converged:
         return plain
     sampled, density = draws(posterior, fit.chain), log_densities(fit.chain)
     flat = sampled.reshape(-1, sampled.shape[-1])
@@ -173,12 +279,12 @@ def candidate(name: str, fit: Fit, pool: Executor, *, future: bool = True) -> Ca
             prediction.name: score(prediction, scoring(seed, prediction), full)
             for prediction in bands
         },
-        parts=parts | {part: scores for part, scores in others.items() if scores is not None},
+        parts=parts | {name: scores for name, scores in others.items() if scores is not None},
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
     )
 
 
-def description(name: str, problem: Problem, stop_reason: str, *, converged: bool) -> Candidate:
+def _description(name: str, problem: Problem, stop_reason: str, *, converged: bool) -> Candidate:
     """Say what a model is, and how its sampling ended."""
     posterior = problem.posterior
     return Candidate(
@@ -190,3 +296,59 @@ def description(name: str, problem: Problem, stop_reason: str, *, converged: boo
         sum(dataset.readings.rows.size for dataset in posterior.datasets),
         not isinstance(posterior.datasets[0].actuator.hysteresis, NoHysteresis),
     )
+
+
+def _screened(name: str, folder: RunFolder) -> Candidate:
+    """Say what a model is worth by its MAP estimate."""
+    problem, point = begin(folder)
+    rng = generator(problem.config.seed, "evidence")
+    return replace(
+        _description(name, problem, "only screened", converged=False),
+        evidence=screening_evidence(problem.posterior, point, rng),
+        screened=True,
+    )
+
+
+def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
+    """Sample a model to its end, from wherever it stands, and say what it is worth."""
+    fit = finished(folder) if folder.summary.is_file() else draw(folder)
+    with executor_of(1, fit.problem.posterior.engine) as pool:
+        result = _candidate(name, fit, pool, future=future)
+    return replace(result, standing=folder.standing()) if folder.summary.is_file() else result
+
+
+def _standing(folder: RunFolder, files: bool) -> Standing:
+    """Finish a run, and say whether its bands hold."""
+    with warnings.catch_warnings():
+        # What is wrong with a model is among what speaks against it.
+        warnings.simplefilter("ignore", InputWarning)
+        return resume(folder, Console(quiet=True), workers=1, files=files).standing
+
+
+def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
+    """Return the config with another model, and of what it says of parameters what that has."""
+    noise = noise_model(model.noise_until_chosen, records[0].interval)
+    names = ParameterTable(actuator_of(model, records[0], records), noise).names
+    # A parameter of one record is called name[record].
+    applicable = {
+        key: {p: value for p, value in getattr(config, key).items() if p.partition("[")[0] in names}
+        for key in ("parameters", "truth")
+    }
+    scopes = {
+        key: [p for p in getattr(model, key) if p in names] for key in ("per_record", "shared")
+    }
+    changes = {"model": model.model_copy(update=scopes), "name": name, **applicable}
+    return config.model_copy(update=changes)
+
+
+def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
+    """Make a model's folder, or take the one that is there, if it is the same run's."""
+    if path.exists() and not overwrite:
+        folder = RunFolder.open(path)
+        if folder.config.read_text(encoding="utf-8") != dump(problem.config):
+            raise InputError(
+                f"{path}: holds another run; choose another folder, or give `overwrite=True`"
+            )
+        return folder
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return RunFolder.create(path, problem, overwrite)

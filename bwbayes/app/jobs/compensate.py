@@ -8,16 +8,17 @@ pictures, ``compensation.html``.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.app.problem.problem import generator
 from bwbayes.control.compensation import compensate as compensated
-from bwbayes.control.predicted import Choice, Compensation
+from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.data.io.formats import read_reference
 from bwbayes.diagnosis.extrapolation import beyond_training
@@ -29,29 +30,29 @@ from bwbayes.results.prediction import thinned
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["compensate", "reference_of"]
+__all__ = ["compensate"]
 
 
 def compensate(
     fit: Fit,
     reference: Any,
     *,
-    command: Choice = "mean",
+    amplitude: float | None = None,
+    frequency: float | None = None,
+    middle: float | None = None,
+    periods: float | None = None,
+    levels: int | None = None,
+    interval: float | None = None,
+    smoothed: float | None = None,
+    command: Literal["mean", "expected"] = "mean",
     hold: str = "zoh",
+    limit: float | None = None,
     from_rest: bool = False,
     voltage: tuple[float, float] | None = None,
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
     nearest: bool = False,
-    limit: float | None = None,
-    interval: float | None = None,
-    smoothed: float | None = None,
-    amplitude: float | None = None,
-    frequency: float | None = None,
-    middle: float | None = None,
-    periods: float | None = None,
-    levels: int | None = None,
 ) -> Compensation:
     """Return the voltage for a displacement, and its predicted error.
 
@@ -68,30 +69,40 @@ def compensate(
         (samples,), um; or the ``reference`` of an earlier command. 0 um is where the actuator
         stands at zero volts as the command begins: there a command begins too, and a reference
         that begins elsewhere gets a way from there before it.
+    amplitude
+        Amplitude of the shape, um.
+    frequency
+        Frequency of the shape, or of a raster's lines, Hz.
+    middle
+        Middle of the shape, um; default: 0.
+    periods
+        Periods, or lines; default: 3.
+    levels
+        Steps of a staircase from the middle to either end; default: 5.
+    interval
+        Sampling interval of a shape, s; default: the record's.
+    smoothed
+        Smooths the reference, s (SD); default: a shape's 0.01 periods.
     command
-        ``"mean"``, the inverse of the mean model; or ``"expected"``, the voltage whose squared
-        error, expected over the draws, is least.
+        Inverse of the mean model, or least expected squared error over the draws.
     hold
-        What the command does between samples: ``"zoh"``, it is held, as a DAC does (zero-order
-        hold); ``"foh"``, it goes in straight lines (first-order hold), as the output of a generator
-        that interpolates does. It need not be that of the record.
-    from_rest
-        The actuator starts demagnetized; otherwise it has waited at zero volts, in a state of its
-        hysteresis that nothing tells.
-    voltage, slew, current, capacitance
-        Limits of the amplifier: lowest and highest voltage, V, by default zero and those of all
-        records fitted; its fastest change, V/s, and the largest current, A, into the actuator's
-        capacitance, F, by default any.
-    nearest
-        Give the nearest command where the limits do not allow for the one that is asked for.
+        Voltage between samples: held, as a DAC does (zoh), or straight lines (foh). It need not be
+        that of the record.
     limit
-        Of the error, um: the probability that it is kept is given.
-    interval, smoothed
-        Sampling interval, s, by default that of the record, and SD of a smoothing, s; a file has an
-        interval of its own.
-    amplitude, frequency, middle, periods, levels
-        Of a shape: um and Hz, which it needs; um (default: 0); how many periods or lines (default:
-        3), and steps of a staircase from the middle to either end (default: 5).
+        Limit of the error, um; says how probably it is kept.
+    from_rest
+        The actuator starts demagnetized. Otherwise it has waited at zero volts, in a state of its
+        hysteresis that nothing tells.
+    voltage
+        Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
+    slew
+        Its fastest change of the voltage, V/s.
+    current
+        Its largest current, A; with the capacitance.
+    capacitance
+        The actuator's capacitance, F.
+    nearest
+        If limits are exceeded, return the nearest feasible command.
 
     Raises
     ------
@@ -105,23 +116,14 @@ def compensate(
     InputWarning
         A reference that was smoothed or led to, a command beyond what was fitted.
     """
-    problem, flat = fit.problem, fit.flat_draws
+    problem, seed = fit.problem, fit.problem.config.seed
     span = command_limits(problem, voltage)
-    fastest = math.inf if slew is None else slew
-    limits = Limits(span.low, span.high, fastest, current, capacitance)
-    alone = next(iter(problem.posterior.each(flat)))
-    desired = reference_of(
-        reference,
-        problem.record.interval,
-        interval=interval,
-        smoothed=smoothed,
-        amplitude=amplitude,
-        frequency=frequency,
-        middle=middle,
-        periods=periods,
-        levels=levels,
-    )
-    seed = problem.config.seed
+    limits = Limits(span.low, span.high, math.inf if slew is None else slew, current, capacitance)
+    shape = {"amplitude": amplitude, "frequency": frequency, "middle": middle, "periods": periods}
+    options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
+    options = {name: value for name, value in options.items() if value is not None}
+    desired = _reference(reference, problem.record.interval, options)
+    alone = next(iter(problem.posterior.each(fit.flat_draws)))
     compensation = compensated(
         alone.posterior,
         thinned(alone.draws, generator(seed, "draws")),
@@ -139,39 +141,25 @@ def compensate(
     return replace(compensation, remarks=remarks, standing=fit.standing)
 
 
-def reference_of(requested: Any, default: float, **options: Any) -> Reference:
+def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> Reference:
     """Return a reference: one that is made already, a shape, a file's, or displacements.
 
-    Parameters
-    ----------
-    requested
-        A reference; the name of a shape; a file; or displacements (samples,), um.
-    default
-        Sampling interval, s, where neither the file nor ``options`` say it.
-    options
-        ``interval``, ``smoothed`` and those of :func:`~bwbayes.control.references.shaped`; what is
-        None is not given.
-
-    Raises
-    ------
-    InputError
-        It is none of these or cannot be used, or options that it cannot have.
+    ``interval`` is that of samples where nothing says it, s. Refused are options that it cannot
+    have.
     """
-    options = {name: value for name, value in options.items() if value is not None}
     shapes = ", ".join(SHAPES)
     if isinstance(requested, str) and requested in SHAPES:
         for name, unit in (("amplitude", "um"), ("frequency", "Hz")):
             if name not in options:
                 raise InputError(f"{requested}: has no {name}; give it, in {unit}")
-        return shaped(requested, **{"interval": default, **options})
-    kind, allowed = "displacements take", {"smoothed", "interval"}
+        return shaped(requested, **{"interval": interval, **options})
+    kind, allowed = "displacements take", ["smoothed", "interval"]
     if isinstance(requested, Reference):
-        kind, allowed = "one that is made already takes", set()
+        kind, allowed = "one that is made already takes", []
     elif isinstance(requested, str | Path):
-        kind, allowed = "a file takes", {"smoothed"}
-    for name in options:
-        if name not in allowed:
-            raise InputError(f"reference: {kind} no {name}; leave it out, or give one of {shapes}")
+        kind, allowed = "a file takes", ["smoothed"]
+    for name in set(options) - set(allowed):
+        raise InputError(f"reference: {kind} no {name}; leave it out, or give one of {shapes}")
     if isinstance(requested, Reference):
         return requested
     smoothed = options.get("smoothed", 0.0)
@@ -193,4 +181,4 @@ def reference_of(requested: Any, default: float, **options: Any) -> Reference:
             f"reference: {type(requested).__name__} is none; give one of {shapes}, a file, or "
             "displacements in um"
         )
-    return Reference(values, options.get("interval", default), smoothed=smoothed)
+    return Reference(values, options.get("interval", interval), smoothed=smoothed)

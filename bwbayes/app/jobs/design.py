@@ -53,7 +53,7 @@ def design(
     fit: Fit,
     target: str | Path | ArrayLike,
     *,
-    candidates: Mapping[str, ArrayLike] | str | Path = PRESET,
+    candidates: Mapping[str, ArrayLike] | str | Path = "standard",
     voltage: tuple[float, float] | None = None,
     slew: float | None = None,
     current: float | None = None,
@@ -69,11 +69,17 @@ def design(
         A parameter's name; or a drive whose parameter band is to be narrow: voltages (samples,), V,
         or the ``Path`` of a record's file, or of a signal's name.
     candidates
-        Voltages (samples,) by name, V, at the fitted record's interval (of several that whose
-        voltage turns most), from rest; a TOML file with a table for each signal, of the keys of a
-        config's [record.signal]; or ``"standard"``.
-    voltage, slew, current, capacitance
-        What the amplifier can do: V, V/s, A, F; by default the voltages of the fitted record.
+        A TOML file with a table for each signal, or the preset. Its keys are those of a config's
+        [record.signal]. In Python also voltages (samples,) by name, V, from rest, at the fitted
+        record's interval (of several that whose voltage turns most).
+    voltage
+        Lowest and highest voltage of the amplifier, V; default: what was fitted.
+    slew
+        Its fastest change of the voltage, V/s.
+    current
+        Its largest current, A; with the capacitance.
+    capacitance
+        The actuator's capacitance, F.
 
     Raises
     ------

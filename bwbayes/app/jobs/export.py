@@ -51,16 +51,14 @@ def export(
     folder
         Where the files go.
     voltage
-        Lowest and highest that the inverse may give, V; by default zero and those of all records
-        fitted.
+        Lowest and highest voltage of the inverse, V; default: what was fitted, and 0 V.
     rate
-        The controller's samples a second; by default the record's.
+        The controller's samples a second; default: the record's.
     hold
-        What the voltage does between samples, whatever it did in the record: ``"zoh"``, it is held,
-        as a controller's DAC does (zero-order hold); ``"foh"``, it goes in straight lines, for a
-        model beside a measured voltage (first-order hold).
+        Voltage between samples: held, as a DAC does (zoh), or straight lines (foh). The latter is
+        for a model beside a measured voltage; neither need be that of the record.
     overwrite
-        Whether files may be replaced.
+        Replace existing files.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 from bwbayes.app.problem.problem import generator
 from bwbayes.data import write_record
@@ -13,18 +13,21 @@ from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.data.waveforms import Sine, Waveform
 from bwbayes.data.waveforms import signal as named
 from bwbayes.errors import InputError
+from bwbayes.report.saving import refuse_existing
 
 __all__ = ["simulate"]
 
 
 def simulate(
     out: Path,
-    signal: str,
-    sine: tuple[float, float, float],
-    discrepancy: str,
-    seed: int,
-    rate: float,
     *,
+    signal: str = "identification",
+    amplitude: float | None = None,
+    frequency: float | None = None,
+    duration: float | None = None,
+    discrepancy: Literal["none", "process", "structural"] = "process",
+    seed: int = 1,
+    rate: float = 1000.0,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write a record, and beside it its true parameters; return what was written.
@@ -35,9 +38,21 @@ def simulate(
         The record's file. The noise-free displacement goes into ``NAME.truth.csv`` for a CSV and
         into the file itself for HDF5 and MATLAB; the true parameters into ``NAME.truth.json``.
     signal
-        A signal's name, or ``"sine"``: constant amplitude (V), frequency (Hz), duration (s).
-    discrepancy, seed, rate
-        Of the stand; the rate in samples a second.
+        identification, verification, step10, step50, step100, or sine (see the next options).
+    amplitude
+        Amplitude of the sine, V; default: 100.
+    frequency
+        Frequency of the sine, Hz; default: 1.
+    duration
+        Duration of the sine, s; default: 16.
+    discrepancy
+        How the stand's actuator departs from the model.
+    seed
+        Seed of the noise.
+    rate
+        Samples a second.
+    overwrite
+        Replace existing files.
 
     Raises
     ------
@@ -46,13 +61,17 @@ def simulate(
     """
     parameters = out.with_name(f"{out.stem}.truth.json")
     truth_file = out.with_name(f"{out.stem}.truth{out.suffix}")
-    for path in (out, truth_file, parameters):
-        if path.exists() and not overwrite:
-            raise InputError(f"{path}: exists; choose another name, or give `overwrite=True`")
-    amplitude, frequency, duration = sine
-    waveform = Waveform(Sine(amplitude, frequency), duration) if signal == "sine" else named(signal)
-    kind = cast("Literal['none', 'process', 'structural']", discrepancy)
-    stand = VirtualTestStand(kind, rate)
+    refuse_existing([out, truth_file, parameters], overwrite=overwrite)
+    sine = {"amplitude": amplitude, "frequency": frequency, "duration": duration}
+    given = {name: value for name, value in sine.items() if value is not None}
+    if signal == "sine":
+        options = {"amplitude": 100.0, "frequency": 1.0, "duration": 16.0} | given
+        waveform = Waveform(Sine(options["amplitude"], options["frequency"]), options["duration"])
+    elif given:
+        raise InputError(f"simulate: {', '.join(given)} need --signal sine")
+    else:
+        waveform = named(signal)
+    stand = VirtualTestStand(discrepancy, rate)
     record = stand.run(waveform, generator(seed, "record"))
     record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
     write_record(record, out)

@@ -33,13 +33,13 @@ LONGEST_DELAY = 100
 def track(
     fit: Fit,
     *,
+    frequencies: tuple[float, ...] | None = None,
+    amplitude: float | None = None,
     voltage: tuple[float, float] | None = None,
     rate: float = 1000.0,
     delay: int = 1,
     gain_margin: float = 2.0,
     phase_margin: float = 60.0,
-    frequencies: tuple[float, ...] | None = None,
-    amplitude: float | None = None,
     draws: int = 200,
 ) -> Tracking:
     """Say how well a closed loop would follow the paper's signals, with and without the model.
@@ -48,20 +48,23 @@ def track(
     ----------
     fit
         What is built on; of several records the first.
+    frequencies
+        Frequency of the references, Hz; may be given again; default: 0.1 Hz to where dynamics
+        matter.
+    amplitude
+        Amplitude of the references, um; default: 80 % of the mean model's reach.
     voltage
-        Lowest and highest of the amplifier, V; by default zero and those of all records fitted.
+        Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
     rate
         Samples a second.
     delay
         Whole samples from a reading to the command that answers it.
-    gain_margin, phase_margin
-        What every draw must keep: a factor, and degrees.
-    frequencies
-        Hz; by default from 0.1 Hz to where the dynamics matter.
-    amplitude
-        Of the references, um; by default 80 % of the mean model's reach.
+    gain_margin
+        Gain margin that all draws keep, a factor.
+    phase_margin
+        Phase margin that all draws keep, degrees.
     draws
-        How many are simulated; the margins hold for a thousand.
+        Simulated actuators. The margins hold for a thousand draws.
 
     Raises
     ------
@@ -95,7 +98,7 @@ def track(
         Stand(command_limits(problem, voltage), delay),
         generator(seed, "track"),
         robustness=robustness,
-        frequencies=frequencies,
+        frequencies=frequencies or None,
         amplitude=amplitude,
         all_theta=dataset.table.actuator(theta),
     )

@@ -1,0 +1,101 @@
+"""How commands end: what they show, what they say was written, and their exit status."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.problem.problem import Problem
+    from bwbayes.report.report import Report
+    from bwbayes.results.standing import Standing
+
+__all__ = [
+    "BAD_INPUT",
+    "INTERRUPTED",
+    "NOT_CONVERGED",
+    "finish",
+    "present",
+    "resumable",
+    "show_report",
+]
+
+BAD_INPUT = 2
+NOT_CONVERGED = 4
+INTERRUPTED = 130
+
+
+def show_report(report: Report) -> None:
+    """Show a report on the screen."""
+    # Here, because it is slow to load.
+    from bwbayes.report.screen import show
+
+    show(report, Console())
+
+
+@contextmanager
+def resumable(command: str) -> Iterator[None]:
+    """End what is interrupted with the command that resumes it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; resume with {command}", err=True)
+        raise click.exceptions.Exit(INTERRUPTED) from None
+
+
+def present(
+    report: Report, files: Sequence[Path], standing: Standing, *, quiet: bool = False
+) -> int:
+    """Show what came of a run and the files of it; return the exit status of that run."""
+    if quiet:
+        for line in standing.said:
+            click.echo(line, err=True)
+    else:
+        show_report(report)
+        for path in files:
+            click.echo(f"wrote {path}")
+    return standing.exit_status
+
+
+def finish(
+    path: Path,
+    *,
+    quiet: bool,
+    show: Callable[[Problem], None] | None = None,
+    **options: Any,
+) -> int:
+    """Sample the run in a folder to its end, say how it went, and return the exit status.
+
+    ``show`` is called with the problem at first; ``options`` are those of
+    :func:`~bwbayes.app.running.run.resume`.
+    """
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.run import resume
+
+    def answer(fit: Fit) -> None:
+        if not quiet:
+            show_report(fit.report())
+
+    folder = RunFolder.open(path)
+    console = Console(stderr=True, quiet=quiet)
+    with resumable(f"`bwbayes resume {path}`"):
+        fit = resume(folder, console, background=True, show=show, answer=answer, **options)
+    if not quiet:
+        click.echo(f"report: {folder.path / 'report.html'}")
+    if not fit.converged:
+        click.echo(
+            f"NOT CONVERGED: {fit.outcome.stop_reason}; intervals are withheld. Resume with "
+            f"`{fit.resuming}`, and look at the traces in {path}/report.html",
+            err=True,
+        )
+        return NOT_CONVERGED
+    # The screen begins with how the bands do.
+    for line in fit.standing.said if quiet else ():
+        click.echo(line, err=True)
+    return fit.standing.exit_status

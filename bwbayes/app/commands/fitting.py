@@ -1,0 +1,209 @@
+"""From a record to a run: ``bwbayes init``, ``check``, ``run``, ``resume`` and ``report``."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+from rich.markup import escape
+
+from bwbayes.app.commands.ending import finish, show_report
+from bwbayes.app.commands.options import (
+    FILE,
+    folder_argument,
+    naming_options,
+    options_of,
+    quiet_option,
+    seed_option,
+)
+from bwbayes.errors import ColumnsError, InputError
+
+if TYPE_CHECKING:
+    from bwbayes.app.config.config import Config
+    from bwbayes.app.config.proposal import ConfigProposal
+    from bwbayes.app.problem.problem import Problem
+
+__all__ = ["check", "init", "report", "resume", "run"]
+
+
+@click.command()
+@click.argument("record", type=FILE)
+@naming_options
+@click.option("--out", type=FILE, help="The config; default: NAME-OF-RECORD.toml.")
+def init(record: Path, out: Path | None, **naming: Any) -> int:
+    """Write a commented config for RECORD.
+
+    Example: bwbayes init my_record.csv --unit displacement=nm
+    """
+    out = out or record.with_suffix(".toml")
+    if out.exists():
+        raise InputError(f"{out}: exists; edit it, or choose another name with --out")
+    proposal = _proposed(record, out.parent, naming, "init")
+    try:
+        out.write_text(proposal.text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{out}: {error.strerror}; choose another place with --out") from None
+    _show(proposal, f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`")
+    return 0
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@click.option("--record", type=FILE, help="Check this record instead of the config's.")
+@naming_options
+@click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
+def check(config: Path, record: Path | None, out: Path | None, **naming: Any) -> int:
+    """Check a CONFIG or record for issues and compute a MAP estimate; no sampling.
+
+    Example: bwbayes check runs/measured_stack.toml --record my_record.csv
+    """
+    from bwbayes.app.jobs.check import check as check_config
+
+    chosen, _ = _config_or_proposal(config, naming, "check", quiet=True)
+    if record is not None:
+        chosen = chosen.with_record(record)
+    out = out or Path("results") / f"{config.stem}-check"
+    show_report(check_config(chosen, config.parent, out))
+    click.echo(f"report: {out / 'check.html'}")
+    return 0
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@click.option("--record", type=FILE, help="Fit this record instead of the config's.")
+@naming_options
+@click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
+@seed_option
+@options_of("bwbayes.app.fit.calls:fit", "folder", "progress")
+@quiet_option
+def run(
+    config: Path,
+    record: Path | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
+    improve: bool,
+    workers: int | None,
+    executor: str | None,
+    quiet: bool,
+    **naming: Any,
+) -> int:
+    """Fit a model to a record: sample the posterior, predict, write the report.
+
+    CONFIG is a config in TOML, or a record without one.
+
+    Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
+    """
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.improving import improve_model
+    from bwbayes.app.running.run import start
+    from bwbayes.report.priors import priors_table
+    from bwbayes.report.report import Report, remarks_banner
+
+    chosen, is_proposal = _config_or_proposal(config, naming, "run", quiet=quiet)
+    if record is not None:
+        chosen = chosen.with_record(record)
+    changes = {"name": chosen.name or config.stem} | ({} if seed is None else {"seed": seed})
+    chosen = chosen.model_copy(update=changes)
+    path = out or Path("results") / config.stem
+    if improve:
+        RunFolder.require_free(path, overwrite)
+        chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
+    folder = start(chosen, config.parent, path, overwrite=overwrite)
+
+    def show(problem: Problem) -> None:
+        # Of a record alone the remarks are shown already.
+        banners = [] if is_proposal else remarks_banner(problem.remarks)
+        priors = priors_table(problem.posterior.prior)
+        if not quiet:
+            show_report(Report(title="priors", banners=banners, blocks=[priors]))
+
+    return finish(folder.path, quiet=quiet, workers=workers, backend=executor, show=show)
+
+
+@click.command()
+@folder_argument
+@options_of("bwbayes.app.fit.calls:resume", "progress")
+@quiet_option
+def resume(folder: Path, quiet: bool, executor: str | None, **options: Any) -> int:
+    """Go on with the run in FOLDER, interrupted or short of its target.
+
+    Example: bwbayes resume results/ring_bender --steps 40000
+    """
+    return finish(folder, quiet=quiet, backend=executor, **options)
+
+
+@click.command()
+@folder_argument
+def report(folder: Path) -> int:
+    """Draw the pictures and the page of the run in FOLDER again.
+
+    Example: bwbayes report results/ring_bender
+    """
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.run import redraw
+
+    redraw(RunFolder.open(folder))
+    click.echo(f"wrote {folder / 'report.html'}")
+    return 0
+
+
+def _config_or_proposal(
+    path: Path, naming: dict[str, Any], command: str, *, quiet: bool
+) -> tuple[Config, bool]:
+    """Read a config; or propose one where the file is a record, and show what is wrong with it.
+
+    Return the config, and whether it is a proposal. What only ``check`` can use is refused.
+    """
+    from bwbayes.app.config.config import is_config, load
+
+    if is_config(path):
+        config = load(path)
+        if any(value not in (None, {}) for value in naming.values()):
+            raise InputError(
+                f"{path}: --column, --unit and --fs are for a record; in a config say columns, "
+                "units and fs under [record]"
+            )
+        return config, False
+    proposal = _proposed(path, path.parent, naming, command)
+    if command != "check" and proposal.pointless is not None:
+        raise InputError(
+            f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "
+            f"with `bwbayes init {path}` and run that"
+        )
+    if not quiet:
+        train = ", ".join(
+            f"{a:g} to {b:g}" for a, b in proposal.config.records["record"].train or ()
+        )
+        held_out = "the rest" if "held_out" in proposal.config.validation else "nothing"
+        _show(
+            proposal,
+            f"training on {train} s, holding out {held_out}; "
+            f"save this config with `bwbayes init {path}`",
+        )
+    return proposal.config, True
+
+
+def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> ConfigProposal:
+    """Propose a config; of unknown columns say the command that settles them."""
+    from bwbayes.app.config.proposal import propose
+    from bwbayes.data.io.columns import Naming
+
+    try:
+        return propose(path, where, Naming(**naming))
+    except ColumnsError as error:
+        raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
+
+
+def _show(proposal: ConfigProposal, conclusion: str) -> None:
+    """Show what was said of the record, with what to do."""
+    from bwbayes.report.report import Report, remarks_banner
+
+    show_report(Report(title="remarks", banners=remarks_banner(proposal.remarks)))
+    console = Console(highlight=False, soft_wrap=True)
+    for finding in proposal.findings:
+        console.print(escape(f"{finding.kind}: {finding.text}\n    fix: {finding.fix}"))
+    console.print(escape(conclusion))

@@ -1,0 +1,165 @@
+"""The options of commands: those that follow from what a command calls, and shared ones.
+
+The keyword arguments of a function are options of the same names, with their types and defaults;
+their help is the first sentence of each description. They are read from the function's source:
+loading it takes a second, which neither ``--help`` nor completion should wait for.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bwbayes.app.config.limits import LARGEST_SEED
+from bwbayes.errors import InputError
+
+__all__ = [
+    "FILE",
+    "WithParts",
+    "folder_argument",
+    "naming_options",
+    "options_of",
+    "overwrite_option",
+    "quiet_option",
+    "seed_option",
+]
+
+type AnyCommand = Callable[..., Any]
+
+FILE = click.Path(path_type=Path)
+
+# Arguments that have a range.
+RANGES = {
+    "workers": click.IntRange(1),
+    "replicates": click.IntRange(1),
+    "steps": click.IntRange(1),
+    "ess": click.FloatRange(1),
+    "seed": click.IntRange(0, LARGEST_SEED),
+}
+
+folder_argument = click.argument("folder", type=FILE)
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
+quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+seed_option = click.option("--seed", type=RANGES["seed"], help="Seed, instead of the config's.")
+
+
+def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyCommand], AnyCommand]:
+    """Return a decorator that adds a function's keyword arguments to a command as options.
+
+    Parameters
+    ----------
+    function
+        Where it is defined: ``"package.module:name"``; a method goes by its name too.
+    omitted
+        Arguments that are no options.
+    flags
+        Options that are called otherwise than their arguments.
+    """
+    module, _, name = function.partition(":")
+    spec = find_spec(module)
+    source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
+    (defined,) = (
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.FunctionDef) and node.name == name
+    )
+    texts = _first_sentences(ast.get_docstring(defined) or "")
+    arguments = [
+        (argument.arg, ast.unparse(argument.annotation), ast.literal_eval(default))
+        for argument, default in zip(defined.args.kwonlyargs, defined.args.kw_defaults, strict=True)
+        if argument.annotation and default and argument.arg not in omitted
+    ]
+
+    def decorate(command: AnyCommand) -> AnyCommand:
+        # The first decorator of a command is applied last.
+        for key, hint, default in reversed(arguments):
+            flag = flags.get(key, key).replace("_", "-")
+            option = _option(flag, key, hint.removesuffix(" | None"), default, texts[key])
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def _first_sentences(docstring: str) -> dict[str, str]:
+    """Return how the description of each parameter begins, by name."""
+    section = re.split(r"\n\w+\n-+\n", docstring.partition("Parameters\n----------\n")[2])[0]
+    texts: dict[str, str] = {}
+    for names, text in re.findall(r"^(\S.*)\n((?: {4}.*(?:\n|$))+)", section, re.MULTILINE):
+        first = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.replace("``", "").split()))[0]
+        texts |= dict.fromkeys(names.split(", "), first)
+    return texts
+
+
+def _option(
+    flag: str, key: str, hint: str, default: Any, text: str
+) -> Callable[[AnyCommand], AnyCommand]:
+    """Return the option of an argument with a type hint."""
+    if hint == "bool":
+        flags = f"--{flag}/--no-{flag}" if default else f"--{flag}"
+        return click.option(flags, key, is_flag=True, default=default, help=text)
+    kinds: dict[str, dict[str, Any]] = {
+        "tuple[float, float]": {"type": (float, float), "metavar": "FROM TO"},
+        "tuple[float, ...]": {"type": float, "multiple": True},
+        "float": {"type": float},
+        "int": {"type": int},
+    }
+    options = kinds.get(hint, {})
+    if hint.startswith("Literal"):
+        options = {"type": click.Choice(ast.literal_eval(hint.removeprefix("Literal")))}
+    if key in RANGES:
+        options = {"type": RANGES[key]}
+    return click.option(
+        f"--{flag}", key, default=default, show_default=default is not None, help=text, **options
+    )
+
+
+class WithParts(click.Command):
+    """A command whose help lists the parts that a model may have, as the registries do."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the parts, by kind."""
+        # Here, because it is slow to load.
+        from bwbayes.app.config.reference import PARTS
+
+        del ctx
+        with formatter.section("Parts"):
+            formatter.write_dl([(kind, ", ".join(names)) for kind, names in PARTS.items()])
+
+
+def naming_options(command: AnyCommand) -> AnyCommand:
+    """Add the options that say which columns of a record are meant: columns, units and fs."""
+    fs = click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column.")
+    units = click.option(
+        "--unit",
+        "units",
+        multiple=True,
+        metavar="QUANTITY=UNIT",
+        callback=_pairs,
+        help="A column's unit, if the file does not state it; -nm turns the sign.",
+    )
+    columns = click.option(
+        "--column",
+        "columns",
+        multiple=True,
+        metavar="QUANTITY=NAME",
+        callback=_pairs,
+        help="The column of time, voltage or displacement: a name, or a number from 1 on.",
+    )
+    return columns(units(fs(command)))
+
+
+def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+    """Read what stands to the left and right of equals signs."""
+    for text in texts:
+        if "=" not in text:
+            flag = option.opts[0]
+            raise InputError(f"{flag} {text}: write {flag} displacement=..., with a value")
+    pairs = (text.partition("=") for text in texts)
+    return {quantity.strip(): value.strip() for quantity, _, value in pairs}

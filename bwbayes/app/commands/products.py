@@ -1,0 +1,223 @@
+"""What is made of a run: ``predict``, ``compensate``, ``design``, ``export`` and ``track``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import click
+
+from bwbayes.app.commands.ending import present, show_report
+from bwbayes.app.commands.options import (
+    FILE,
+    folder_argument,
+    naming_options,
+    options_of,
+    overwrite_option,
+    quiet_option,
+)
+from bwbayes.errors import ColumnsError, InputError
+
+__all__ = ["compensate", "design", "export", "predict", "track"]
+
+
+@click.command()
+@folder_argument
+@click.option("--record", type=FILE, help="Record to predict (measured, or voltage only).")
+@naming_options
+@options_of("bwbayes.app.jobs.predict:predict", "name", "own_offset")
+@click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
+@click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
+@overwrite_option
+def predict(
+    folder: Path,
+    record: Path | None,
+    same_offset: bool,
+    out: Path | None,
+    overwrite: bool,
+    columns: dict[str, str],
+    units: dict[str, str],
+    fs: float | None,
+    **options: Any,
+) -> int:
+    """Write displacement bands for another record or voltage, from the run in FOLDER.
+
+    Beside the bands, their scores (JSON) and a figure. Exit status 3: validation failed on the
+    record; 5: it is inconclusive.
+
+    Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
+    """
+    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.jobs.predict import predict as predict_record
+    from bwbayes.app.jobs.predict import write_prediction
+    from bwbayes.data import read_record
+    from bwbayes.report.report import Report, standing_banner
+    from bwbayes.report.saving import refuse_existing
+    from bwbayes.results.standing import Standing
+
+    if (record is None) == (options["signal"] is None):
+        raise InputError("predict: give either a record or a signal")
+    name = options["signal"] if record is None else record.stem
+    table = out or folder / "predictions" / f"{name}.csv"
+    files = [table, table.with_suffix(".json"), table.with_suffix(".png")]
+    if table in files[1:]:
+        raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
+    refuse_existing(files, overwrite=overwrite)
+    fit = converged(folder)
+    try:
+        other = record and read_record(
+            record, need_displacement=False, columns=columns, units=units, fs=fs
+        )
+    except ColumnsError as error:
+        line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
+        raise error.in_command(line) from None
+    bands = predict_record(fit, other, name=name, own_offset=not same_offset, **options)
+    write_prediction(bands, files, fit.standing)
+    show_report(Report(title=name, banners=standing_banner(fit.standing)))
+    validation = Standing.of([bands.verdict] if bands.verdict else [])
+    # The worse of the two.
+    worse = validation if validation.holds is False or fit.standing.holds else fit.standing
+    present(bands.report(), files, worse)
+    return worse.exit_status
+
+
+@click.command()
+@folder_argument
+@click.argument(
+    "shape", required=False, type=click.Choice(["sine", "triangle", "staircase", "raster"])
+)
+@click.option(
+    "--reference", type=FILE, help="A file with time and displacement, in place of SHAPE."
+)
+@options_of("bwbayes.app.jobs.compensate:compensate", smoothed="smooth")
+@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
+@overwrite_option
+@quiet_option
+def compensate(
+    folder: Path,
+    shape: str | None,
+    reference: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Compute the voltage command for a reference displacement, with the run in FOLDER.
+
+    The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
+    zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
+    voltage will do is predicted with its error; beside it stands what a linear command would do.
+
+    Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
+    """
+    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.jobs.compensate import compensate as invert
+
+    if (shape is None) == (reference is None):
+        raise InputError("compensate: give either a shape or --reference")
+    command = invert(converged(folder), shape or reference, **options)
+    where = out or folder / "compensation" / command.reference.name
+    files = command.save(where, overwrite=overwrite)
+    return present(command.report(), files, command.standing, quiet=quiet)
+
+
+@click.command()
+@folder_argument
+@click.option("--parameter", help="The parameter to know better.")
+@click.option(
+    "--drive", type=FILE, help="Or the drive whose band is to be narrow: a record or a signal."
+)
+@options_of("bwbayes.app.jobs.design:design")
+@click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
+@overwrite_option
+@quiet_option
+def design(
+    folder: Path,
+    parameter: str | None,
+    drive: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Rank input signals by the expected reduction in posterior SD, from the run in FOLDER.
+
+    What would be left of a parameter's standard deviation, or of a band's width along a drive,
+    after one more record; the best signal within the amplifier's limits goes into best.csv.
+
+    Example: bwbayes design results/ring_bender --parameter beta --slew 2000
+    """
+    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.jobs.design import design as rank
+    from bwbayes.data import Record, write_record
+    from bwbayes.report.saving import refuse_existing, save
+
+    if parameter is not None and drive is not None:
+        raise InputError("design: give either a parameter or a drive")
+    target = parameter or drive
+    if target is None:
+        raise InputError("design: give either a parameter or a drive")
+    out = out or folder / "design"
+    best = out / "best.csv"
+    refuse_existing([best, out / "design.html", out / "design.json"], overwrite=overwrite)
+    ranking = rank(converged(folder), target, **options)
+    files = save(ranking.report(), out, "design")
+    signal = ranking.signals[ranking.best.name]
+    write_record(Record(signal, None, ranking.interval, voltage_is="command"), best)
+    return present(ranking.report(), [best, *files], ranking.standing, quiet=quiet)
+
+
+@click.command()
+@folder_argument
+@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/export.")
+@options_of("bwbayes.app.jobs.export:export")
+def export(folder: Path, out: Path | None, **options: Any) -> int:
+    """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
+
+    It is the posterior's mean. The C file needs math.h alone and does a sample a call. 0 um is
+    where the demagnetized actuator stands at zero volts.
+
+    Example: bwbayes export results/ring_bender --rate 1000
+    """
+    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.jobs.export import FILES
+    from bwbayes.app.jobs.export import export as write
+
+    out = out or folder / "export"
+    model = write(converged(folder), out, **options)
+    for line in model.standing.said:
+        click.echo(line, err=True)
+    if model.without_inverse is not None:
+        click.echo(f"bwbayes: no inverse in it: {model.without_inverse}", err=True)
+    for name in FILES:
+        click.echo(f"wrote {out / name}")
+    return model.standing.exit_status
+
+
+@click.command()
+@folder_argument
+@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/track.")
+@options_of("bwbayes.app.jobs.track:track", frequencies="frequency")
+@overwrite_option
+@quiet_option
+def track(folder: Path, out: Path | None, overwrite: bool, quiet: bool, **options: Any) -> int:
+    """Simulate closed-loop tracking with the run in FOLDER: open loop, feedforward, PID, and both.
+
+    On the virtual test stand, with every draw of the posterior for actuator, and the paper's
+    signals: a linear command, the mean model's inverse (feedforward), a PID controller, and both
+    together. 0 um is where the demagnetized actuator stands at zero volts; the default voltages
+    are those fitted and 0 V.
+
+    Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
+    """
+    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.jobs.track import track as simulate
+    from bwbayes.report.saving import refuse_existing, save
+
+    out = out or folder / "track"
+    files = [out / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
+    refuse_existing(files, overwrite=overwrite)
+    tracking = simulate(converged(folder), **options)
+    written = save(tracking.report(), out, "track")
+    return present(tracking.report(), written, tracking.standing, quiet=quiet)

@@ -1,0 +1,196 @@
+"""Studies of many fits, ``calibrate``, ``campaign`` and ``compare``, and ``simulate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from bwbayes.app.commands.ending import NOT_CONVERGED, present, resumable, show_report
+from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_option, seed_option
+from bwbayes.app.config.limits import USUAL_MODELS
+from bwbayes.errors import InputError
+
+__all__ = ["calibrate", "campaign", "compare", "simulate"]
+
+
+@click.command()
+@click.argument("out", type=FILE)
+@options_of("bwbayes.app.jobs.simulate:simulate")
+def simulate(out: Path, **options: Any) -> int:
+    """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
+
+    Example: bwbayes simulate ring.csv --signal verification --seed 7
+    """
+    from bwbayes.app.jobs.simulate import simulate as write
+
+    for path in write(out, **options):
+        click.echo(f"wrote {path}")
+    return 0
+
+
+@click.command()
+@click.argument("config", type=FILE, required=False)
+@click.option("--resume", "resumed", type=FILE, help="Go on with the calibration in this folder.")
+@click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
+@seed_option
+@click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
+@options_of("bwbayes.app.jobs.calibrate:resume")
+@quiet_option
+def calibrate(
+    config: Path | None,
+    resumed: Path | None,
+    out: Path | None,
+    seed: int | None,
+    overwrite: bool,
+    quiet: bool,
+    replicates: int | None,
+    **options: Any,
+) -> int:
+    """Simulation-based calibration of a CONFIG: fit records simulated from its prior.
+
+    Each replicate draws parameters from the config's prior, simulates its record and fits it
+    as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
+    replicates did not converge.
+
+    Example: bwbayes calibrate runs/calibration.toml --replicates 500
+    """
+    from bwbayes.app.config.config import load
+    from bwbayes.app.jobs.calibrate import resume, start
+    from bwbayes.app.running.folder import CalibrationFolder
+    from bwbayes.report.calibration import calibration_report
+
+    if config is not None and resumed is None:
+        chosen = load(config)
+        changes = {"name": chosen.name or config.stem} | ({} if seed is None else {"seed": seed})
+        where = out or Path("results") / f"{config.stem}-calibration"
+        chosen = chosen.model_copy(update=changes)
+        folder = start(chosen, config.parent, where, replicates, overwrite=overwrite)
+    elif config is None and resumed is not None:
+        if out is not None or seed is not None or overwrite:
+            raise InputError("calibrate: --resume goes on as begun; leave the other options out")
+        folder = CalibrationFolder.open(resumed)
+    else:
+        raise InputError("calibrate: give either a CONFIG or --resume FOLDER")
+    with resumable(folder.resuming):
+        console = Console(stderr=True, quiet=quiet)
+        calibration = resume(folder, console, replicates=replicates, **options)
+    page = folder.path / "calibration.html"
+    if not quiet:
+        show_report(calibration_report(calibration))
+        click.echo(f"report: {page}")
+    if calibration.passed:
+        return 0
+    first, *others = calibration.shortcomings
+    more = f", and {len(others)} more" if others else ""
+    click.echo(f"NOT PASSED: {first}{more}; see {page}", err=True)
+    return NOT_CONVERGED
+
+
+@click.command()
+@click.argument("folder", type=FILE, required=False)
+@click.option("--config", type=FILE, help="Config of all records; default: each proposes its own.")
+@click.option("--out", type=FILE, help="The campaign's folder; default: results/NAME-OF-FOLDER.")
+@click.option("--resume", "resumed", type=FILE, help="Go on with the campaign in this folder.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
+@click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
+@options_of("bwbayes.app.jobs.campaign:resume")
+@quiet_option
+def campaign(
+    folder: Path | None,
+    config: Path | None,
+    out: Path | None,
+    resumed: Path | None,
+    overwrite: bool,
+    no_pictures: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Fit every record in FOLDER and compare the actuators.
+
+    The same command goes on after an interruption, and fits records that were added or changed.
+    Exit status: 2 if records were refused, else 4 if some did not converge, else 3 if validation
+    failed for some, else 5 if it is inconclusive; every record is in the table in any case.
+
+    Example: bwbayes campaign records/ --config my.toml --out results/batch
+    """
+    from bwbayes.app.jobs.campaign import config_text, resume, start
+    from bwbayes.app.running.campaign_folder import CampaignFolder
+
+    if folder is not None and resumed is None:
+        text, where = ("", folder) if config is None else (config_text(config), config.parent)
+        out = out or Path("results") / folder.absolute().name
+        batch = start(folder, text, where, out, pictures=not no_pictures, overwrite=overwrite)
+    elif folder is None and resumed is not None:
+        if out is not None or config is not None or overwrite or no_pictures:
+            raise InputError("campaign: --resume goes on as begun; leave the other options out")
+        batch = CampaignFolder.open(resumed)
+    else:
+        raise InputError("campaign: give either a FOLDER of records or --resume CAMPAIGN")
+    with resumable(f"`bwbayes campaign --resume {batch.path}`"):
+        result = resume(batch, Console(stderr=True, quiet=quiet), **options)
+    if not quiet:
+        show_report(result.report(batch.path.name))
+        click.echo(f"report: {batch.page}")
+    for row in result.rows:
+        if row.reason:
+            click.echo(f"{row.status.upper()}: {row.name}: {row.reason}", err=True)
+    return result.exit_status
+
+
+@click.command(cls=WithParts)
+@click.argument("paths", type=FILE, nargs=-1, required=True)
+@click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL_MODELS}.")
+@click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
+@options_of("bwbayes.app.fit.calls:compare", "models", "folder", "progress")
+@quiet_option
+def compare(
+    paths: tuple[Path, ...],
+    models: str | None,
+    out: Path | None,
+    screen: bool,
+    overwrite: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Compare the runs in folders PATHS, or models that one config is run with.
+
+    Reports joint log scores of later readings given earlier ones, with errors; log evidence; a
+    recommendation and its caveats. Of --models the first word is an operator; gain, creep,
+    dynamics and noise follow after plus signs. Models out of reach at their MAP estimates are only
+    screened.
+
+    Example: bwbayes compare results/bender results/bender_plays
+    """
+    from bwbayes.app.config.config import load
+    from bwbayes.app.config.models import models_of
+    from bwbayes.app.jobs import compare as job
+    from bwbayes.report.saving import refuse_existing
+
+    path, *others = paths
+    if models is None and not others and (path.is_file() or path.suffix == ".toml"):
+        models = USUAL_MODELS
+    if models is None and not others:
+        raise InputError("compare: give two runs or more, or a CONFIG")
+    if models is not None and others:
+        raise InputError("compare: --models goes with one CONFIG; leave the others out")
+    config = None if models is None else load(path)
+    out = out or Path("results") / ("comparison" if config is None else f"{path.stem}-comparison")
+    refuse_existing([out / "comparison.json"], overwrite=overwrite)
+    console = Console(stderr=True, quiet=quiet)
+    if config is None or models is None:
+        comparison = job.compare(job.open_runs(paths), console, **options)
+    else:
+        named_models = models_of(models, config.model)
+        options |= {"screen": screen, "overwrite": overwrite}
+        comparison = job.compare_models(config, path.parent, named_models, out, console, **options)
+    comparison.save(out)
+    # What does not hold is among what speaks against the recommendation.
+    page = out / "comparison.html"
+    status = present(comparison.report(), [page], comparison.standing, quiet=quiet)
+    if comparison.recommended is None:
+        click.echo("NOT CONVERGED: no model has converged, so none is recommended", err=True)
+        return NOT_CONVERGED
+    return status

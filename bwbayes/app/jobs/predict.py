@@ -1,0 +1,134 @@
+"""Bands for another record, a planned voltage or a signal: ``fit.predict()``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bwbayes.app.running.predictions import (
+    Prediction,
+    predict_after,
+    predict_another,
+    training_record,
+)
+from bwbayes.data import Record, read_record
+from bwbayes.data.waveforms import signal as named_signal
+from bwbayes.errors import InputError
+from bwbayes.report.figures import picture_of
+from bwbayes.results.outputs import write_bands, write_summary
+from bwbayes.results.prediction import Start
+from bwbayes.results.standing import Standing
+
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
+
+__all__ = ["predict", "prediction_notes", "write_prediction"]
+
+
+def predict(
+    fit: Fit,
+    record: Record | str | Path | None = None,
+    *,
+    signal: str | None = None,
+    name: str | None = None,
+    window: tuple[float, float] | None = None,
+    from_rest: bool = False,
+    own_offset: bool = True,
+    lead_in: float | None = None,
+    lead_in_from: float | None = None,
+    after: bool = False,
+    of: str | None = None,
+) -> Prediction:
+    """Predict another record, a planned voltage without a displacement, or a signal.
+
+    Parameters
+    ----------
+    fit
+        What is built on.
+    record
+        The record or its file, at any sampling interval.
+    signal
+        A signal to predict instead, by its name.
+    name
+        Name of the bands; by default the file's or the signal's, or "prediction".
+    window
+        Judge and write this part of the record alone: start and stop, s.
+    from_rest
+        The record starts from a demagnetized actuator.
+    own_offset
+        The sensor has an offset in the record that is estimated anew.
+    lead_in
+        Length of the lead-in, s, that estimates initial state and offset; default: a quarter of the
+        record, and ten correlation times of the discrepancy at most.
+    lead_in_from
+        Where the lead-in begins, s; default: the record's start.
+    after
+        A forecast: condition the discrepancy on the lead-in or, with a signal, on the training
+        record, behind which the signal follows.
+    of
+        Training record whose per-record parameters to use; default: the first.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        A lead-in or window that does not fit into the record.
+
+    Warns
+    -----
+    InputWarning
+        A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
+    """
+    if (record is None) == (signal is None):
+        raise InputError("predict: give either a record or a signal")
+    if lead_in is not None and not 0 < lead_in < math.inf:
+        raise InputError(
+            f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
+        )
+    problem, of = fit.problem, training_record(fit.problem, of)
+    if signal is not None:
+        interval = problem.records[of].interval
+        voltage = named_signal(signal).sample(1 / interval)[1]
+        if after and window is not None:
+            raise InputError(
+                "predict: a window is for a record; what comes after the training record is "
+                "predicted whole"
+            )
+        if after:
+            return predict_after(problem, fit.flat_draws, voltage, name or signal, of)
+        name, record = name or signal, Record(voltage, None, interval, origin=f"{signal} signal")
+    elif not isinstance(record, Record):
+        name = name or Path(str(record)).stem
+        record = read_record(str(record), need_displacement=False)
+    model_hold = problem.config.model.hold
+    hold = None if model_hold == "auto" else model_hold
+    start = Start(from_rest, own_offset, lead_in, lead_in_from, hold, after)
+    name = name or "prediction"
+    return predict_another(problem, fit.flat_draws, record, start, name, window, of)
+
+
+def prediction_notes(prediction: Prediction) -> list[str]:
+    """Return what is to be known of a prediction: where it extrapolates, and what does not hold."""
+    validation = Standing.of([prediction.verdict] if prediction.verdict else [])
+    return [*(f"{prediction.name}: {remark}" for remark in prediction.remarks), *validation.said]
+
+
+def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:
+    """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
+
+    Raises
+    ------
+    InputError
+        They cannot be written.
+    """
+    table, numbers, picture = files
+    try:
+        table.parent.mkdir(parents=True, exist_ok=True)
+        write_bands(table, [prediction])
+        write_summary(numbers, prediction.numbers() | {"run_validation": standing.numbers})
+        picture.write_bytes(picture_of(prediction.plot))
+    except OSError as error:
+        raise InputError(f"{table}: {error.strerror}; choose another place") from None
