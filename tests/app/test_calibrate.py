@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -133,10 +132,7 @@ def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     assert bands == list(result["bands"])
     for line in lines:
         assert bands == list(json.loads(line)["covered"])
-
-
-def test_prior_is_resolved_once(whole: Path) -> None:
-    """The folder's config has every prior in numbers, though the record is simulated."""
+    # The folder's config has every prior in numbers, though the record is simulated.
     text = (whole / "config.toml").read_text()
     assert "signal" not in text
     assert 'file = "records/record.h5"' in text
@@ -231,6 +227,7 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
         ((), "give either a CONFIG or --resume"),
         (("small.toml", "--resume", "a"), "give either a CONFIG or --resume"),
         (("--resume", "none"), "none: no calibration here; start one with"),
+        (("--resume", "b"), "b: no calibration here, but something else's folder"),
         (("--resume", "a", "--seed", "1"), "goes on as begun"),
         (("small.toml", "--replicates", "0"), "0 is not in the range x>=1"),
         (("none.toml",), "none.toml: No such file"),
@@ -247,68 +244,42 @@ def test_wrong_command_line_is_refused(
     small.begun(tmp_path / "b")
     with pytest.raises(Exception, match=re.escape(part)):
         cli.main(["calibrate", *arguments], standalone_mode=False)
-
-
-def test_calibration_is_no_run_and_a_run_no_calibration(tmp_path: Path) -> None:
-    begun(tmp_path / "a")
-    small.begun(tmp_path / "b")
     with pytest.raises(InputError, match="no run here"):
         RunFolder.open(tmp_path / "a")
-    with pytest.raises(InputError, match="no calibration here"):
-        CalibrationFolder.open(tmp_path / "b")
 
 
 @pytest.mark.parametrize(
-    ("damage", "part"),
+    ("number", "old", "new"),
     [
-        ({0: b"nonsense"}, ":1: is not one of these replicates"),
-        ({0: b'{"replicates":0,"of":"x"}'}, ":1: is not one of these replicates"),
-        ({0: b'{"replicates":3}'}, ":1: is not one of these replicates"),
-        ({0: b'{"replicates":1e999,"of":"x"}'}, ":1: is not one of these replicates"),
-        ({1: b"nonsense"}, ":2: is not one of these replicates; delete this line"),
-        ({1: b'{"number": 0}'}, ":2: is not one of these replicates; delete this line"),
-        ({2: b"[1]"}, ":3: is not one of these replicates; delete this line"),
-        ({2: b"[" * 100_000}, ":3: is not one of these replicates; delete this line"),
-        ({2: b"{}"}, ":3: is not one of these replicates; delete this line"),
-        ({2: b"\xff"}, ":3: is not one of these replicates; delete this line"),
+        (1, rb".*", b"nonsense"),
+        (1, rb'"replicates":3', b'"replicates":0'),
+        (2, rb".*", b"\xff"),
+        (3, rb".*", b"[" * 100_000),
+        (3, rb".*", b"{}"),
+        (3, rb'"ranks": .*}, "covered"', b'"ranks": "many", "covered"'),
+        (3, rb'"covered": .*', b'"covered": {}}'),
+        (3, rb'"d": \d+', b'"d": 200'),
+        (3, rb'"alpha"', b'"beta"'),
+        (3, rb'"number": 1', b'"number": 0'),
     ],
 )
-def test_damaged_lines_are_refused(
-    whole: Path, tmp_path: Path, damage: dict[int, bytes], part: str
-) -> None:
-    assert_refused(whole, tmp_path, part, damage.get)
-
-
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        (rb'"ranks": .*}, "covered"', b'"ranks": "many", "covered"'),
-        (rb'"covered": .*', b'"covered": null}'),
-        (rb'"covered": .*', b'"covered": {}}'),
-        (rb'"d": \d+', b'"d": 200'),
-        (rb'"d": \d+', b'"d": -1'),
-        (rb'"alpha"', b'"beta"'),
-        (rb'"number": 1', b'"number": 0'),
-    ],
-)
-def test_line_of_another_replicate_is_refused(
-    whole: Path, tmp_path: Path, one: bytes, other: bytes
-) -> None:
-    def change(number: int, line: bytes) -> bytes:
-        return re.sub(one, other, line) if number == 2 else line
-
-    assert_refused(whole, tmp_path, ":3: is not one of these replicates; delete this line", change)
-
-
-def assert_refused(
-    whole: Path, tmp_path: Path, part: str, change: Callable[[int, bytes], bytes]
+def test_lines_that_are_no_replicates_of_these_are_refused(
+    whole: Path, tmp_path: Path, number: int, old: bytes, new: bytes
 ) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
     lines = folder.replicates.read_bytes().splitlines()
-    changed = [change(number, line) for number, line in enumerate(lines)]
-    assert changed != lines
-    folder.replicates.write_bytes(b"".join(line + b"\n" for line in changed))
-    with pytest.raises(InputError, match=part):
+    changed = re.sub(old, lambda _: new, lines[number - 1], count=1)
+    assert changed != lines[number - 1]
+    lines[number - 1] = changed
+    folder.replicates.write_bytes(b"".join(line + b"\n" for line in lines))
+    line = f":{number}: is not one of these replicates; delete this line"
+    with pytest.raises(InputError, match=line):
+        resume(folder, small.quiet())
+
+
+def test_a_calibration_without_its_first_line_is_refused(whole: Path, tmp_path: Path) -> None:
+    folder = cut(whole, tmp_path / "a", 0)
+    with pytest.raises(InputError, match="does not say how many replicates were requested"):
         resume(folder, small.quiet())
 
 
@@ -336,18 +307,20 @@ def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
     }
 
 
-def test_prior_that_leaves_nothing_leaves_no_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01", "hardly any draw has"),
+        ("train = [[0.0, 1.5]]", "train = [[0.0, 0.2]]", "does not go back and forth"),
+    ],
+)
+def test_what_no_replicate_can_use_leaves_no_folder(
+    tmp_path: Path, old: str, new: str, line: str
+) -> None:
     """Said at once, not by the first replicate."""
-    impossible = TEXT.replace("mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01")
-    with pytest.raises(InputError, match="hardly any draw has"):
-        begun(tmp_path / "a", text=impossible)
-    assert [] == list(tmp_path.iterdir())
-
-
-def test_voltage_without_a_loop_leaves_nothing(tmp_path: Path) -> None:
-    ramp = TEXT.replace("train = [[0.0, 1.5]]", "train = [[0.0, 0.2]]")
-    with pytest.raises(InputError, match="does not go back and forth"):
-        begun(tmp_path / "a", text=ramp)
+    assert old in TEXT
+    with pytest.raises(InputError, match=line):
+        begun(tmp_path / "a", text=TEXT.replace(old, new))
     assert [] == list(tmp_path.iterdir())
 
 

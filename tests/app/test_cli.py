@@ -333,32 +333,6 @@ def test_lead_in_longer_than_the_record_is_refused(
     assert 60 == len(columns(tmp_path / "bands.csv")[1])
 
 
-def test_predict_after_goes_on_from_the_readings(bwbayes: Type, tmp_path: Path) -> None:
-    """The band of the displacement is narrower behind the lead-in, and as wide as ever later."""
-    text = small.TEXT.replace('discrepancy = "none"', "")
-    (tmp_path / "missed.toml").write_text(text)
-    # What the model misses is there to be carried on, and its held-out second tells too little.
-    assert bwbayes("run", "missed.toml", "--out", "missed").status in {0, 5}
-    run = tmp_path / "missed"
-    # Longer than the correlation times of all draws.
-    sine = "--signal", "sine", "--frequency", "0.5", "--duration", "30"
-    bwbayes("simulate", "new.csv", *sine, "--rate", "50", "--seed", "5")
-    record = "--record", "new.csv", "--from-rest", "--lead-in", "5"
-    assert 2 != bwbayes("predict", run, *record, "--out", "usual.csv").status
-    assert 2 != bwbayes("predict", run, *record, "--after", "--out", "after.csv").status
-    wide = {}
-    for name in ("usual", "after"):
-        header, rows = columns(tmp_path / f"{name}.csv")
-        low, high = (header.index(f"displacement_{edge}_95_um") for edge in ("lower", "upper"))
-        behind = rows[:, 0] > 5 - 1e-6
-        wide[name] = (rows[:, high] - rows[:, low])[behind]
-    part = wide["after"] / wide["usual"]
-    assert part[0] < 0.9
-    # At one time the quantiles of so many draws are 3 % off; over two periods they are not.
-    assert np.mean(part[-200:]) == pytest.approx(1, abs=0.02)
-    assert np.argmin(part) < 0.2 * part.size
-
-
 def test_predict_after_continues_the_training_record_with_a_signal(
     bwbayes: Type, run: Path, tmp_path: Path
 ) -> None:

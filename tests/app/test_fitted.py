@@ -189,12 +189,21 @@ def test_saved_and_opened_again_it_is_the_same(fit: Fit, tmp_path: Path) -> None
     assert repr(again) == repr(fit)
 
 
-def test_a_prediction_is_the_command_lines(folder: Path, opened: Fit, tmp_path: Path) -> None:
-    copy = tmp_path / "sine.h5"
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        ((), {}),
+        (("--after", "--lead-in", "1"), {"after": True, "lead_in": 1.0}),
+        (("--same-offset", "--window", "1", "2"), {"own_offset": False, "window": (1.0, 2.0)}),
+    ],
+)
+def test_a_prediction_is_the_command_lines(
+    folder: Path, opened: Fit, tmp_path: Path, words: tuple[str, ...], options: dict[str, Any]
+) -> None:
+    copy, out = tmp_path / "sine.h5", tmp_path / "theirs.csv"
     shutil.copyfile(folder / "records/sine.h5", copy)
-    out = tmp_path / "theirs.csv"
-    small.typed(predict, folder, "--record", copy, "--from-rest", "--out", out)
-    write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True)])
+    small.typed(predict, folder, "--record", copy, "--from-rest", "--out", out, *words)
+    write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True, **options)])
     assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
 
 

@@ -22,8 +22,17 @@ from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
 from bwbayes.comparison.designed import Design
-from bwbayes.data import read_record
-from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal, signal_names
+from bwbayes.data import Record, read_record
+from bwbayes.data.waveforms import (
+    Carrier,
+    Decay,
+    Sine,
+    Staircase,
+    Triangle,
+    Waveform,
+    signal,
+    signal_names,
+)
 from bwbayes.errors import InputError
 from bwbayes.model.drive import time_between_turns, turning_points
 from bwbayes.model.inverse.limits import Limits
@@ -31,22 +40,7 @@ from bwbayes.model.inverse.limits import Limits
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = [
-    "PRESET",
-    "amplifier_of",
-    "candidates_of",
-    "design",
-    "liveliest",
-    "preset",
-]
-
-PRESET = "standard"
-
-# A decaying drive loses all but this part of its amplitude by its end.
-LEFT = 0.1
-
-# Levels of a staircase, as parts of half the range, in their order.
-STAIRS = (1.0, -1.0, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0.0)
+__all__ = ["amplifier_of", "candidates_of", "design", "liveliest"]
 
 
 def design(
@@ -91,19 +85,15 @@ def design(
     """
     problem = fit.problem
     amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
-    if isinstance(candidates, str | Path):
-        signals = candidates_of(candidates, problem, amplifier)
-    else:
-        signals = {n: np.asarray(v, dtype=np.float64) for n, v in candidates.items()}
+    signals = candidates_of(candidates, problem, amplifier)
+    drive = None if isinstance(target, str) else "a voltage"
     quantity: str | FloatArray
-    parameter: str | None = None
-    drive: str | None = None
     if isinstance(target, str):
-        quantity = parameter = target
+        quantity = target
     elif isinstance(target, Path):
         quantity, drive = _drive(str(target), problem), str(target)
     else:
-        quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
+        quantity = np.asarray(target, dtype=np.float64)
     # Of several records, what all of them taught of the actuator, seen from one.
     name = liveliest(problem)
     promises = rank(
@@ -119,9 +109,15 @@ def design(
             f"design: the amplifier can make none of the candidates; {promises[0].name} "
             f"{promises[0].refused}"
         )
-    interval = problem.records[name].interval
     return Design(
-        fit.folder.path.name, parameter, drive, amplifier, signals, interval, fit.standing, promises
+        fit.folder.path.name,
+        target if isinstance(target, str) else None,
+        drive,
+        amplifier,
+        signals,
+        problem.records[name].interval,
+        fit.standing,
+        promises,
     )
 
 
@@ -138,14 +134,12 @@ def amplifier_of(
     capacitance: float | None,
 ) -> Limits:
     """Return the amplifier; by default with the voltages that were fitted alone."""
-    if voltage is None:
-        span = limits_of(problem, None)
-        voltage = span.low, span.high
-    return Limits(*voltage, np.inf if slew is None else slew, current, capacitance)
+    low, high = limits_of(problem, None) if voltage is None else voltage
+    return Limits(low, high, np.inf if slew is None else slew, current, capacitance)
 
 
 def candidates_of(
-    candidates: str | Path, problem: Problem, amplifier: Limits
+    candidates: Mapping[str, ArrayLike] | str | Path, problem: Problem, amplifier: Limits
 ) -> dict[str, FloatArray]:
     """Return the candidates' voltages (samples,) by name, V, at the liveliest record's interval.
 
@@ -154,49 +148,54 @@ def candidates_of(
     InputError
         A file that cannot be read, or has no signal.
     """
-    rate = 1 / problem.records[liveliest(problem)].interval
-    from_file = candidates != PRESET
-    waveforms = _from_file(Path(candidates)) if from_file else preset(problem, amplifier)
-    return {name: waveform.sample(rate)[1] for name, waveform in waveforms.items()}
+    if not isinstance(candidates, str | Path):
+        return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}
+    record = problem.records[liveliest(problem)]
+    standard = str(candidates) == "standard"
+    waveforms = _preset(record, amplifier) if standard else _from_file(Path(candidates))
+    return {name: waveform.sample(1 / record.interval)[1] for name, waveform in waveforms.items()}
 
 
-def preset(problem: Problem, amplifier: Limits) -> dict[str, Waveform]:
+def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
     """Return sines and triangles, steady and decaying, small and slow, and a staircase.
 
-    They are as long as the fitted record, of several the liveliest, about the middle of the
-    amplifier's range, and turn as often as its drive, or as often as the amplifier allows.
+    They are as long as a record, about the middle of the amplifier's range, and turn as often as
+    its drive, or as often as the amplifier allows. A decaying one ends at a tenth of its amplitude.
     """
-    record = problem.records[liveliest(problem)]
-    duration = record.duration
     half, center = (amplifier.high - amplifier.low) / 2, (amplifier.high + amplifier.low) / 2
-    typical = 0.5 / time_between_turns(record.voltage, record.interval)
     # A sine changes fastest, by 2π f times its amplitude.
-    fastest = min(typical, amplifier.rate / (2 * np.pi * half))
-    fading = Decay(0.0, (1 - LEFT) / duration)
-    waveforms = {
-        "steady sine": Waveform(Sine(half, fastest), duration, bias=center),
-        "decaying sine": Waveform(Sine(half, fastest), duration, decay=fading, bias=center),
-        "small steady sine": Waveform(Sine(half / 2, fastest), duration, bias=center),
-        "slow steady sine": Waveform(Sine(half, fastest / 4), duration, bias=center),
-        "slow decaying sine": Waveform(
-            Sine(half, fastest / 4), duration, decay=fading, bias=center
-        ),
-        "steady triangle": Waveform(Triangle(half, fastest), duration, bias=center),
-        "decaying triangle": Waveform(Triangle(half, fastest), duration, decay=fading, bias=center),
+    fastest = min(
+        0.5 / time_between_turns(record.voltage, record.interval),
+        amplifier.rate / (2 * np.pi * half),
+    )
+    carriers: dict[str, Carrier] = {
+        "steady sine": Sine(half, fastest),
+        "decaying sine": Sine(half, fastest),
+        "small steady sine": Sine(half / 2, fastest),
+        "slow steady sine": Sine(half, fastest / 4),
+        "slow decaying sine": Sine(half, fastest / 4),
+        "steady triangle": Triangle(half, fastest),
+        "decaying triangle": Triangle(half, fastest),
     }
     if not np.isfinite(amplifier.rate):
-        levels = tuple(half * fraction for fraction in STAIRS)
-        stairs = Staircase(levels, duration / len(levels))
-        waveforms["staircase"] = Waveform(stairs, duration, bias=center)
-    return waveforms
+        levels = [half * part for part in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
+        carriers["staircase"] = Staircase(tuple(levels), record.duration / len(levels))
+    fading, steady = Decay(0.0, 0.9 / record.duration), Decay()
+    return {
+        name: Waveform(
+            carrier, record.duration, decay=fading if "decaying" in name else steady, bias=center
+        )
+        for name, carrier in carriers.items()
+    }
 
 
 def _from_file(path: Path) -> dict[str, Waveform]:
+    """Read a table for each signal."""
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or "is not UTF-8 text"
-        raise InputError(f'{path}: {reason}; give a file of candidates, or "{PRESET}"') from None
+    except OSError as error:
+        reason = f'{error.strerror}; give a file of candidates, or "standard"'
+        raise InputError(f"{path}: {reason}") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: invalid TOML: {error}; correct the file") from None
     if not tables:
@@ -218,9 +217,10 @@ def _drive(name: str, problem: Problem) -> FloatArray:
     if name in signal_names():
         return signal(name).sample(1 / interval)[1]
     record = read_record(Path(name), need_displacement=False)
-    if not np.isclose(record.interval, interval, rtol=1e-6):
-        times = np.arange(0.0, record.duration, interval)
-        since = record.interval * np.arange(record.samples)
-        along: FloatArray = np.interp(times, since, record.voltage)
-        return along
-    return record.voltage
+    if np.isclose(record.interval, interval, rtol=1e-6):
+        return record.voltage
+    times = np.arange(0.0, record.duration, interval)
+    voltage: FloatArray = np.interp(
+        times, record.interval * np.arange(record.samples), record.voltage
+    )
+    return voltage
