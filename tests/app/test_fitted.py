@@ -343,7 +343,7 @@ def _no_run(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"train": (5, 90)}, "window 5 to 90 s: reaches outside the record"),
         ({"dynamics": "leg"}, "dynamics: 'leg' is unknown; did you mean lag?"),
         ({"validation": {"a": {"windw": (0, 1)}}}, "fit: validation.a.windw: unknown key; did you"),
-        ({"validation": {"a": {"record": 3}}}, "fit: validation.a.record: is not a record"),
+        ({"validation": {"a": {"record": 3}}}, "fit: a: int is not a record"),
         ({"validation": {"a": "none.csv"}}, "none.csv: does not exist; check the path"),
     ],
 )
