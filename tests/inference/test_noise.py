@@ -1,18 +1,29 @@
-"""Both likelihoods are those of a multivariate normal distribution, at extreme values too."""
+"""Every noise is the Gaussian that it says it is, at extreme values too.
+
+The oracles are a dense Gaussian, with the covariance of a driven oscillator from a matrix
+exponential of its equation of motion, and eighty digits.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from decimal import Decimal, localcontext
 from itertools import product
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise, WhiteNoise, noise_model
+from bwbayes.inference.outliers import surprise
+from bwbayes.inference.posterior import Posterior
+from bwbayes.results.carried import carried
+from bwbayes.results.innovations import Innovations
+from tests.inference.problems import INTERVAL, short_posterior
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
 
@@ -25,13 +36,232 @@ EXTREMES = [
     if max(sensor, process) >= 1e-9
 ]
 
+QUALITIES = st.one_of(st.floats(0.02, 5.0), st.sampled_from([0.5, 0.5 + 1e-9, 0.5 - 1e-9]))
 
-def covariance(theta: FloatArray, samples: int) -> FloatArray:
-    """C[i, j] = σ² exp(−|i − j| / τ) + s² [i = j], times in samples."""
-    sensor, process, time = theta
-    apart = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
-    dense: FloatArray = process**2 * np.exp(-apart / time) + sensor**2 * np.eye(samples)
-    return dense
+
+def covariance(theta: FloatArray, time: FloatArray) -> FloatArray:
+    """Covariance (times,) of the discrepancy over times, s; of a rough one without a quality."""
+    _, process, memory, *qualities = theta
+    if not qualities:
+        rough: FloatArray = process**2 * np.exp(-time / memory)
+        return rough
+    (quality,) = qualities
+    frequency = 1 / (memory * quality)
+    motion = np.array([[0.0, frequency], [-frequency, -frequency / quality]])
+    kept = [scipy.linalg.expm(motion * one)[0, 0] for one in time.ravel()]
+    values: FloatArray = process**2 * np.reshape(kept, time.shape)
+    return values
+
+
+def dense(theta: FloatArray, rows: IntArray, interval: float) -> FloatArray:
+    """Covariance of readings at those rows."""
+    lags = covariance(theta, interval * np.arange(rows[-1] - rows[0] + 1.0))
+    full: FloatArray = lags[np.abs(np.subtract.outer(rows, rows))]
+    full += theta[0] ** 2 * np.eye(rows.size)
+    return full
+
+
+def noise_of(theta: FloatArray) -> Noise:
+    return DiscrepancyNoise(INTERVAL) if theta.size == 3 else SmoothNoise(INTERVAL)
+
+
+def parameters(sensor: float, time: float, quality: float | None) -> FloatArray:
+    return np.array([sensor, 1.3, time, *([] if quality is None else [quality])])
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(1e-3, 3.0),
+    st.one_of(st.none(), QUALITIES),
+    st.lists(st.integers(0, 300), min_size=1, max_size=60, unique=True),
+)
+@settings(deadline=None, max_examples=120)
+def test_whitening_is_that_of_a_dense_covariance(
+    seed: int, time: float, quality: float | None, readings: list[int]
+) -> None:
+    """L⁻¹ of the Cholesky factor L, whatever readings there are, evenly spaced or not."""
+    generator = np.random.default_rng(seed)
+    theta = parameters(np.exp(generator.normal(-2, 1)), time, quality)
+    rows = np.sort(np.array(readings))
+    factor = np.linalg.cholesky(dense(theta, rows, INTERVAL))
+    expected = generator.standard_normal((2, rows.size))
+    skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
+    (white,), (log_determinant,) = noise_of(theta).whiten(
+        theta[np.newaxis], (expected @ factor.T)[np.newaxis], skipped
+    )
+    np.testing.assert_allclose(white, expected, atol=1e-8)
+    np.testing.assert_allclose(log_determinant, 2 * np.sum(np.log(np.diag(factor))), atol=1e-8)
+
+
+def test_twin_a_gap_that_is_taken_for_one_step_is_found() -> None:
+    theta, series = np.array([[0.3, 1.0, 5.0]]), np.ones((1, 1, 80))
+    skipped = np.where(np.arange(80) == 40, 3.0, 0.0)
+    right, wrong = (DiscrepancyNoise(1.0).whiten(theta, series, k)[0] for k in (skipped, None))
+    assert np.max(np.abs(right - wrong)) > 1e-2
+
+
+@pytest.mark.parametrize("quality", [None, 0.05, 0.5, 2.0])
+def test_a_filter_that_has_settled_goes_on_as_one_that_has_not(quality: float | None) -> None:
+    """Through thousands of readings with two gaps, against the dense Gaussian."""
+    theta = parameters(0.1, 0.2, quality)
+    rows = np.concatenate([np.arange(700), np.arange(730, 1300), np.arange(1310, 1600)])
+    factor = np.linalg.cholesky(dense(theta, rows, INTERVAL))
+    expected = np.random.default_rng(1).standard_normal(rows.size)
+    skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
+    one = theta[np.newaxis], (factor @ expected)[np.newaxis, np.newaxis], skipped
+    white, log_determinant = noise_of(theta).whiten(*one)
+    np.testing.assert_allclose(white[0, 0], expected, atol=1e-8)
+    assert abs(log_determinant[0] - 2 * np.sum(np.log(np.diag(factor)))) < 1e-8 * rows.size
+
+
+@pytest.mark.parametrize("quality", [None, 0.02, 0.5, 3.0])
+def test_draws_have_the_covariance(quality: float | None) -> None:
+    """800 draws of 40 samples: a variance is known to 5 %, so 20 % too much is seen (4 sds)."""
+    theta = parameters(0.3, 0.1, quality)
+    generator = np.random.default_rng(3)
+    draws = np.array([noise_of(theta).draw(theta[np.newaxis], 40, generator) for _ in range(800)])
+    assert abs(np.std(draws[:, 1]) / 0.3 - 1) < 0.02
+    factor = np.linalg.cholesky(dense(theta, np.arange(40), INTERVAL))
+    white = scipy.linalg.solve_triangular(factor, draws.sum(axis=1).T, lower=True)
+    # Of independent standard normals: each mean square by itself, and the first with the others.
+    squares = np.mean(white**2, axis=1) - 1
+    assert np.abs(squares).max() * np.sqrt(800 / 2) < 4.5
+    across = np.mean(white[0] * white[1:], axis=1)
+    assert np.abs(across).max() * np.sqrt(800) < 4.5
+
+
+def test_without_quality_it_is_an_ornstein_uhlenbeck_process() -> None:
+    """The difference falls with Q², and at Q = 1/2 the covariance is that of Matérn 3/2."""
+    residual = np.random.default_rng(2).standard_normal((1, 200))
+    theta = np.array([[0.5, 0.8, 0.2, 1.0]])
+    rough = DiscrepancyNoise(INTERVAL).log_density(theta[:, :3], residual)[0]
+    gaps = []
+    for quality in (1e-2, 1e-3):
+        theta[0, 3] = quality
+        gaps.append(abs(SmoothNoise(INTERVAL).log_density(theta, residual)[0] - rough))
+    assert gaps[1] < 0.02 * gaps[0] < 0.02
+    time = np.linspace(0, 2, 50)
+    theta[0, 3] = 0.5
+    kept = SmoothNoise(INTERVAL).transition(theta, time / INTERVAL)[0, :, 0, 0]
+    np.testing.assert_allclose(kept, (1 + 10 * time) * np.exp(-10 * time), atol=1e-12)
+
+
+@pytest.mark.parametrize("quality", [0.1, 0.5, 2.0])
+def test_the_time_is_the_integral_of_the_correlation(quality: float) -> None:
+    theta = np.array([[0.1, 1.3, 0.2, quality]])
+    time = np.linspace(0, 40, 400_001)
+    kept = SmoothNoise(1.0).transition(theta, time)[0, :, 0, 0]
+    assert scipy.integrate.simpson(kept, x=time) == pytest.approx(0.2, rel=1e-6)
+
+
+def altered(quality: float | None, **changes: object) -> tuple[Posterior, FloatArray]:
+    """Return a posterior and a place in it (free,) of that quality."""
+    kind = "discrepancy" if quality is None else "smooth"
+    posterior = short_posterior(kind, 120, **changes)  # type: ignore[arg-type]
+    free = posterior.prior.draw(np.random.default_rng(7), 1)
+    if quality is not None:
+        free[0, posterior.names.index("discrepancy_quality")] = quality
+    free[0, posterior.names.index("discrepancy_time")] = 0.2
+    return posterior, posterior.prior.unconstrain(free)[0]
+
+
+@pytest.mark.parametrize("quality", [None, 0.1, 0.45])
+def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: float | None) -> None:
+    posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
+    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
+    rows = posterior.only.readings.rows
+    full = dense(posterior.only.table.noise(theta)[0], rows, INTERVAL)
+    residual = posterior.only.readings.values - posterior.simulate(theta, rows)[0]
+    inverse = np.linalg.inv(full)
+    expected = inverse @ residual / np.sqrt(np.diag(inverse))
+    np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("quality", [None, 0.1, 0.45])
+def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None) -> None:
+    """Mean and variance of the discrepancy at any later sample, given all readings."""
+    posterior, place = altered(quality)
+    theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
+    rows = posterior.only.readings.rows
+    simulated = posterior.simulate(theta, rows)
+    left = carried(posterior.likelihood, theta, simulated)
+    noise = posterior.only.table.noise(theta)[0]
+    later = rows[-1] + np.array([0, 3, 50])
+    across = covariance(noise, INTERVAL * np.abs(np.subtract.outer(later, rows)))
+    gain = np.linalg.solve(dense(noise, rows, INTERVAL), across.T).T
+    expected = gain @ (posterior.only.readings.values - simulated[0])
+    known = np.sum(gain * across, axis=1) / noise[1] ** 2
+    first = int(later[0])
+    np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, atol=1e-7)
+    np.testing.assert_allclose(left.told(first, 51)[0][later - first], known, atol=1e-7)
+
+
+GAPS = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 400), slice(440, 700))
+
+
+@pytest.mark.parametrize("training", [None, GAPS])
+@pytest.mark.parametrize("dynamics", ["none", "lag"])
+def test_engines_agree(dynamics: str, training: tuple[slice, ...] | None) -> None:
+    pytest.importorskip("numba")
+    posterior = short_posterior("smooth", 700, dynamics, {}, training=training)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(4), 100))
+    slow, fast = (
+        replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
+    )
+    np.testing.assert_allclose(fast, slow, atol=1e-10 * 700, rtol=1e-10)
+
+
+@pytest.mark.parametrize("stride", [1, 3, 20])
+def test_engines_agree_on_an_offset_and_any_stride(stride: int) -> None:
+    pytest.importorskip("numba")
+    posterior = short_posterior("smooth", 700, "lag", {})
+    reading = posterior.only.displacement.copy()
+    reading[np.arange(700) % stride != 0] = np.nan
+    posterior = posterior.altered(displacement=reading, from_rest=False)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
+    likelihood = replace(posterior.likelihood, offset_sd=3.0)
+    slow, fast = (
+        replace(likelihood, engine=engine).log_density(theta) for engine in ("numpy", "numba")
+    )
+    np.testing.assert_allclose(fast, slow, atol=1e-9 * 700, rtol=1e-9)
+
+
+def test_density_of_the_noise_model_is_that_of_its_covariance() -> None:
+    """Against the sum over all lags, at frequencies that sampling does not fold."""
+    theta, interval = np.array([0.01, 1.4, 0.3, 0.7]), 0.005
+    lags = np.arange(1, 4000)
+    along = SmoothNoise(interval).transition(theta[np.newaxis], lags.astype(float))[0, :, 0, 0]
+    frequency = np.array([0.05, 0.3, 1.0])
+    sums = [1.4**2 * (1 + 2 * along @ np.cos(2 * np.pi * f * interval * lags)) for f in frequency]
+    empty = np.empty(0)
+    noise = SmoothNoise(interval)
+    series = Innovations(empty, empty, empty, empty, empty, interval, noise, theta)
+    density = series.noise_density(frequency)
+    assert density is not None
+    expected = np.sqrt(2 * interval * (np.array(sums) + 0.01**2))
+    np.testing.assert_allclose(density, expected, rtol=1e-3)
+
+
+def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:
+    """Whatever the kernel says of it; a rough discrepancy's size is the kernel's."""
+    sizes = {}
+    for noise in ("smooth", "discrepancy"):
+        posterior = short_posterior(noise, 400)
+        free = np.repeat(posterior.prior.draw(np.random.default_rng(7), 1), 2000, axis=0)
+        known = {"discrepancy_sd": 50.0, "discrepancy_time": 0.02, "sensor_sd": 1e-3}
+        for name, value in known.items():
+            free[:, posterior.names.index(name)] = value
+        theta = posterior.prior.theta(free)
+        sized = posterior.noise_of_new(theta, np.random.default_rng(8))
+        rows = posterior.only.readings.rows
+        residual = posterior.only.readings.values - posterior.simulate(theta[:1], rows)[0]
+        sizes[noise] = float(np.mean(sized[:, 1] ** 2) / np.mean(residual**2))
+        assert np.array_equal(sized[:, 0], posterior.only.table.noise(theta)[:, 0])
+        if noise == "discrepancy":
+            assert np.array_equal(sized, posterior.only.table.noise(theta))
+    # ν/(ν − 2) of 4 s over at most 1.25 times 0.02 s; the mean of 2,000 is known to 0.3 %.
+    assert 1.005 < sizes["smooth"] < 1.025
+    assert abs(sizes["discrepancy"] - 1) > 0.1
 
 
 def simulated(theta: FloatArray, samples: int, generator: np.random.Generator) -> FloatArray:
@@ -124,47 +354,6 @@ def test_rows_are_independent(kind: str) -> None:
     together = noise.log_density(theta, residual)
     alone = [noise.log_density(theta[[i]], residual[[i]])[0] for i in range(8)]
     np.testing.assert_allclose(alone, together, rtol=1e-13)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.sampled_from([0.0, 0.1, 0.5]))
-@settings(deadline=None, max_examples=60)
-def test_whitening_is_that_of_a_dense_covariance(seed: int, readings: int, missing: float) -> None:
-    """L⁻¹ of the Cholesky factor L, whatever readings are missing, for stretches of any length."""
-    generator = np.random.default_rng(seed)
-    theta = np.exp(generator.normal(0, 1, 3))
-    skipped = np.where(generator.uniform(size=readings) < missing, 1.5, 0.0)
-    skipped[0] = 0.0
-    series = generator.standard_normal((2, readings))
-    time = np.cumsum(1 + skipped)
-    apart = np.abs(np.subtract.outer(time, time))
-    dense = theta[1] ** 2 * np.exp(-apart / theta[2]) + theta[0] ** 2 * np.eye(readings)
-    factor = np.linalg.cholesky(dense)
-    (white,), (log_determinant,) = DiscrepancyNoise(1.0).whiten(
-        theta[np.newaxis], series[np.newaxis], skipped
-    )
-    np.testing.assert_allclose(white, np.linalg.solve(factor, series.T).T, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(log_determinant, 2 * np.sum(np.log(np.diag(factor))), atol=1e-8)
-
-
-def test_twin_a_gap_that_is_taken_for_one_step_is_found() -> None:
-    theta, series = np.array([[0.3, 1.0, 5.0]]), np.ones((1, 1, 80))
-    skipped = np.where(np.arange(80) == 40, 3.0, 0.0)
-    right = DiscrepancyNoise(1.0).whiten(theta, series, skipped)[0]
-    wrong = DiscrepancyNoise(1.0).whiten(theta, series, skipped / 3)[0]
-    assert np.max(np.abs(right - wrong)) > 1e-2
-
-
-def test_draws_are_of_the_noise_that_the_likelihood_has() -> None:
-    """Its covariance is σ² exp(−|t − t'|/τ); 4,000 draws know it to some 3 %."""
-    noise, theta = DiscrepancyNoise(0.01), np.array([[0.3, 1.5, 0.05]])
-    generator = np.random.default_rng(1)
-    drawn = np.array([noise.draw(theta, 12, generator) for _ in range(4_000)])
-    slow, sensor = drawn[:, 0], drawn[:, 1]
-    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) * 0.01
-    for part, expected in ((slow, 1.5**2 * np.exp(-lag / 0.05)), (sensor, 0.3**2 * np.eye(12))):
-        # sd of a covariance of n draws: sqrt((c_ii c_jj + c_ij²) / n)
-        error = np.sqrt((expected[0, 0] ** 2 + expected**2) / 4_000)
-        assert np.max(np.abs(part.T @ part / 4_000 - expected) / error) < 5
 
 
 def test_white_noise_has_no_discrepancy() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from bwbayes.inference.compiled.walk import walk
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
-from tests.inference.test_gain_and_creep import GAIN, PARTS, WAYS
+from tests.inference.test_gain_and_creep import PARTS, WAYS
 from tests.inference.test_likelihood import moving
 from tests.inference.test_stages import OPERATORS, models
 from tests.model.operators.differential import SPAN, paths
@@ -55,6 +54,8 @@ def as_theta(actuator: Actuator, column: dict[str, FloatArray]) -> FloatArray:
     """Return θ (models, parameters) of an operator's columns, with a lag and an offset."""
     known = {"lag": np.array(0.01), "offset": np.array(3.0)}
     known |= {"quadratic": np.array(0.4), "cubic": np.array(-0.3)} | column
+    known |= {f"creep_{k}": np.array(0.01 * k) for k in (1, 2, 3)}
+    known |= {"creep_growth": np.array(0.5)}
     return np.stack([np.resize(known[name], LANES) for name in actuator.parameters], axis=1)
 
 
@@ -68,10 +69,10 @@ def test_operators_of_one_state_walk_as_with_numpy(name: str, path: str) -> None
 
 @pytest.mark.parametrize("operator", [JilesAtherton(), DomainWall()])
 @pytest.mark.parametrize("path", paths())
-@pytest.mark.parametrize("gain", [None, GAIN])
-def test_pinned_walls_walk_as_with_numpy(operator: Pinned, path: str, gain: Any) -> None:
+@pytest.mark.parametrize("parts", ["none", "both"])
+def test_pinned_walls_walk_as_with_numpy(operator: Pinned, path: str, parts: str) -> None:
     """NumPy takes the same pieces: an integrator's steps end where a piece does."""
-    actuator = Actuator("lag", "first", 1e-3, operator, gain, span=SPAN)
+    actuator = Actuator("lag", "first", 1e-3, operator, **PARTS.get(parts, {}), span=SPAN)
     theta, voltage = as_theta(actuator, models(operator, 3)), paths()[path]
     begun, state = walk(actuator, theta, voltage), None
     assert begun is not None

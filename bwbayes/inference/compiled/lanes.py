@@ -17,14 +17,14 @@ PARAMETERS = (
     "level", "b0", "b1", "b2", "a1", "a2",
     "kept_11", "kept_12", "kept_22", "fresh_11", "fresh_12", "fresh_22", "process", "sensor",
     "free_11", "free_12", "free_21", "free_22",
-    "quadratic", "cubic", "equilibrium", "growth",
+    "quadratic", "cubic", "equilibrium", "crept", "growth",
     *(f"strength_{number}" for number in range(1, MOST_TIMES + 1)),
 )  # fmt: skip
 (
     LEVEL, B0, B1, B2, A1, A2,
     KEPT, KEPT_12, KEPT_22, FRESH, FRESH_12, FRESH_22, PROCESS, SENSOR,
     FREE, FREE_12, FREE_21, FREE_22,
-    QUADRATIC, CUBIC, EQUILIBRIUM, GROWTH,
+    QUADRATIC, CUBIC, EQUILIBRIUM, CREPT, GROWTH,
     STRENGTH,
 ) = (LANES * row for row in range(len(PARAMETERS) - MOST_TIMES + 1))  # fmt: skip
 

@@ -14,8 +14,8 @@ from bwbayes.arrays import FloatArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    A1, A2, B0, B1, B2, CUBIC, DRIVE, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC, STRENGTH,
-    X1, X2,
+    A1, A2, B0, B1, B2, CREPT, CUBIC, DRIVE, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC,
+    STRENGTH, X1, X2,
 )
 # fmt: on
 # isort: on
@@ -54,15 +54,16 @@ def physics(
     sections = actuator.sections(column)
     if actuator.gain is not None:
         equilibrium = equilibrium + actuator.gain.displacement(column, voltage[:1])[:, 0]
-    level = column["offset"] + equilibrium
+    level, rows = column["offset"] + equilibrium, {"equilibrium": equilibrium}
     if actuator.creep is not None:
         crept = actuator.creep.drive(column, equilibrium[:, np.newaxis], voltage[:1])[:, 0]
         level = level + crept * np.sum(sections.gains[1:], axis=0)
+        rows |= {"crept": crept}
     dynamics = sections.recursions[0]
-    rows = dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
+    rows |= dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
     rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
     rows |= {f"strength_{k}": gain for k, gain in enumerate(sections.gains[1:], 1)}
-    rows |= {"level": level, "equilibrium": equilibrium}
+    rows |= {"level": level}
     others = {"growth": "creep_growth", "quadratic": "quadratic", "cubic": "cubic"}
     return rows | {row: column[name] for row, name in others.items() if name in column}
 
@@ -127,11 +128,9 @@ def _creep(
     for t in range(first, last):
         row = (t - first) * LANES
         size = 1.0 if growth.size == 0 else growth[t]
-        size_0 = 1.0 if growth.size == 0 else growth[0]
         for i in range(LANES):
-            w_0, more = state[EQUILIBRIUM + i], state[GROWTH + i]
-            total = (drive[row + i] + w_0) * (1.0 + more * size)
-            state[DRIVE + i] = total - w_0 * (1.0 + more * size_0)
+            w = drive[row + i] + state[EQUILIBRIUM + i]
+            state[DRIVE + i] = w * (1.0 + state[GROWTH + i] * size) - state[CREPT + i]
         _follow(state, 1, drive[row : row + LANES])
         for k in range(lags.shape[0]):
             now, next_, keep = lags[k, 0], lags[k, 1], lags[k, 2]

@@ -6,7 +6,7 @@ for ``LANES`` models side by side.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -16,8 +16,6 @@ from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, 
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Values
-from bwbayes.model.operator import Operator
 
 __all__ = ["Walk", "walk"]
 
@@ -34,7 +32,7 @@ class Walk:
         known: tuple[FloatArray, FloatArray, FloatArray],
         state: FloatArray,
         voltage: FloatArray,
-        drive: _GivenDrive | None,
+        drive: Callable[[FloatArray], FloatArray] | None,
     ) -> None:
         self.stage, self.known, self.state, self.voltage = stage, known, state, voltage
         self.drive = drive
@@ -51,26 +49,13 @@ class Walk:
             piece = slice(begin, end)
             voltage, curve, begin, end = voltage[piece], curve[piece], 0, last - self.now
             growth = growth[piece]
-            plan = self.drive.along(voltage)
+            plan = self.drive(voltage)
         _walk(
             self.stage.kind, self.own, plan, curve, lags, growth, self.state, voltage, begin, end,
             displacement,
         )  # fmt: skip
         self.now = last
         return displacement
-
-
-class _GivenDrive:
-    """What an operator without a stage makes of a voltage, piece by piece."""
-
-    def __init__(self, operator: Operator, column: Values, memory: Any) -> None:
-        self.operator, self.column, self.memory = operator, column, memory
-        self.make = DRIVES[type(operator)]
-
-    def along(self, voltage: FloatArray) -> FloatArray:
-        """Return the drive (models, samples), um, along the next piece."""
-        drive, self.memory = self.make(self.operator, self.column, voltage, self.memory)
-        return drive
 
 
 def walk(
@@ -83,9 +68,9 @@ def walk(
 ) -> Walk | None:
     """Put models to a voltage's first sample; None if they are left to NumPy.
 
-    That is so for an operator that is not compiled. Parameters
-    and errors are those of :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the
-    ``voltage`` (samples,) is known up to the end.
+    That is so for an operator that is not compiled. Parameters and errors are those of
+    :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the ``voltage`` (samples,) is known
+    up to the end.
     """
     operator, drive = actuator.hysteresis, None
     column = actuator.columns(theta)
@@ -93,8 +78,14 @@ def walk(
     memory = actuator.begin(column, voltage, from_rest=from_rest)
     stage: Stage | None
     if type(operator) in DRIVES:
-        drive = _GivenDrive(operator, column, memory)
-        stage = given(drive.along(voltage[:1])[:, 0], np.empty((0, 0)))
+        make = DRIVES[type(operator)]
+
+        def along(piece: FloatArray) -> FloatArray:
+            nonlocal memory
+            moved, memory = make(operator, column, piece, memory)
+            return moved
+
+        drive, stage = along, given(along(voltage[:1])[:, 0], np.empty((0, 0)))
     else:
         stage = prepared(operator, column, voltage, memory)
     if stage is None:
