@@ -268,7 +268,7 @@ def test_lines_that_are_no_replicates_of_these_are_refused(
 ) -> None:
     folder = cut(whole, tmp_path / "a", line_ends(whole)[-1])
     lines = folder.replicates.read_bytes().splitlines()
-    changed = re.sub(old, lambda _: new, lines[number - 1], count=1)
+    changed = re.sub(old, lambda _: new, lines[number - 1])
     assert changed != lines[number - 1]
     lines[number - 1] = changed
     folder.replicates.write_bytes(b"".join(line + b"\n" for line in lines))
