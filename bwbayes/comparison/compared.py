@@ -24,7 +24,6 @@ from bwbayes.report.report import (
     standing_banner,
 )
 from bwbayes.report.words import mark
-from bwbayes.results.scores import as_summary
 from bwbayes.results.standing import Standing
 from bwbayes.shown import head
 
@@ -124,7 +123,7 @@ class Comparison:
             "readings": model.readings,
             "validation": None if model.standing is None else model.standing.status,
             "held_out": None if model.mean is None else vars(model.mean),
-            "windows": {name: as_summary(scores) for name, scores in model.scores.items()},
+            "windows": {name: scores.numbers for name, scores in model.scores.items()},
             "parts": {
                 name: {
                     "log_score": float(np.sum(section.log_scores)),

@@ -42,26 +42,13 @@ from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.results.innovations import innovations
 
-__all__ = ["Agreement", "agreements", "disagreements", "numbers"]
+__all__ = ["Agreement", "agreements", "disagreements"]
 
-# Below these weights together nothing can be compared: what a record tells by itself alone differs
-# by rounding. And the part of a parameter's variance that the others are taken to take away, at
-# least.
-TAKEN = 0.05
+# Probability of a false alarm for a record.
+ALARM = 1e-3
 
 # Step along m − m_r for the prior's slope there, as a part of it.
 STEP = 1e-3
-
-# Probability of a false alarm for a record, and the residual's growth below which a disagreement
-# does not matter, however sure it is.
-ALARM, GROWN = 1e-3, 1.02
-
-# Ratio of its noise to that of all from which on a record's noise is called another one. The
-# discrepancy of a short record may be this much smaller or larger by chance.
-NOISIER = 1.25
-
-# Readings along which residuals are kept, for pictures.
-KEPT = 2000
 
 
 @dataclass(frozen=True)
@@ -103,17 +90,31 @@ class Agreement:
     @property
     def disagrees(self) -> bool:
         """Whether the record does not go with the others, beyond chance and so that it matters."""
-        return self.p_value < ALARM and self.joint_um > GROWN * self.own_um
+        return self.p_value < ALARM and self.joint_um > 1.02 * self.own_um
 
     @property
     def noisier(self) -> bool:
-        """Whether its noise is another one than the records share, beyond chance and by much."""
-        squares = self.readings * self.size**2
-        tails = (
-            scipy.stats.chi2.cdf(squares, self.readings),
-            scipy.stats.chi2.sf(squares, self.readings),
-        )
-        return min(tails) < ALARM / 2 and not 1 / NOISIER < self.size < NOISIER
+        """Whether its noise is another one than the records share, beyond chance and by much.
+
+        The discrepancy of a short record may be a fifth smaller or larger by chance.
+        """
+        below = scipy.stats.chi2.cdf(self.readings * self.size**2, self.readings)
+        return min(below, 1 - below) < ALARM / 2 and not 0.8 < self.size < 1.25
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it."""
+        return {
+            "residual_joint_um": self.joint_um,
+            "residual_own_um": self.own_um,
+            "chi_square": self.distance,
+            "degrees_of_freedom": self.degrees,
+            "p_value": self.p_value,
+            "farthest": self.moved[0],
+            "farthest_sds": self.moved[1],
+            "agrees": not self.disagrees,
+            "innovations_rms": self.size,
+        }
 
 
 def agreements(
@@ -139,27 +140,23 @@ def agreements(
         return {}
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
-    for name, alone, its in posterior.each(free):
-        with_noise = _with_noise(alone, its)
+    for name, single, joint_free in posterior.each(free):
+        with_noise = _with_noise(single, joint_free)
         own = pointfit.fit(with_noise, generator)
-        best, _ = with_noise.prior.constrain(own.mode[np.newaxis])
-        rows = alone.only.readings.rows
-        missed, own_missed = _residuals(alone, its), _residuals(with_noise, best)
-        distance, degrees, moved = _apart(posterior, point, with_noise, own)
-        white = innovations(alone, its[0]).white
-        kept = slice(None, None, -(-rows.size // KEPT))
-        first = (begin or {}).get(name, 0.0)
+        own_free, _ = with_noise.prior.constrain(own.mode[np.newaxis])
+        series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
+        own_residual = innovations(with_noise, own_free[0]).residual
+        # Residuals are kept for pictures, some 2,000 of them.
+        step = slice(None, None, -(-series.time.size // 2000))
         compared[name] = Agreement(
-            float(np.sqrt(np.mean(missed**2))),
-            float(np.sqrt(np.mean(own_missed**2))),
-            distance,
-            degrees,
-            moved,
-            float(np.sqrt(np.mean(white**2))),
-            rows.size,
-            first + alone.only.actuator.interval * rows[kept].astype(np.float64),
-            missed[kept],
-            own_missed[kept],
+            float(np.sqrt(np.mean(series.residual**2))),
+            float(np.sqrt(np.mean(own_residual**2))),
+            *_distance(posterior, point, with_noise, own),
+            float(np.sqrt(np.mean(series.white**2))),
+            series.time.size,
+            series.time[step],
+            series.residual[step],
+            own_residual[step],
         )
     return compared
 
@@ -174,39 +171,35 @@ def _with_noise(alone: Posterior, free: FloatArray) -> Posterior:
     return replace(alone, prior=JointPrior(parameters, alone.prior.constraint))
 
 
-def _residuals(alone: Posterior, free: FloatArray) -> FloatArray:
-    """Residuals (readings,) of a record at free parameters (1, free), um."""
-    readings = alone.only.readings
-    missed: FloatArray = readings.values - alone.simulate(alone.prior.theta(free), readings.rows)[0]
-    return missed
-
-
-def _apart(
-    posterior: Posterior, point: PointFit, alone: Posterior, its_point: PointFit
+def _distance(
+    posterior: Posterior, point: PointFit, single: Posterior, own: PointFit
 ) -> tuple[float, float, tuple[str, float]]:
     """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off."""
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
     columns = [
-        posterior.names.index(posterior.table.name_of(name, alone.only.name))
-        for name in alone.names
+        posterior.names.index(posterior.table.name_of(name, single.only.name))
+        for name in single.names
     ]
-    here = [physical.index(column) for column in columns]
+    rows = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
     precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
-    taken = its_point.covariance - linalg.inv(precision)[np.ix_(here, here)]
-    added = linalg.inv(its_point.covariance) - linalg.inv(its_point.prior_covariance)
+    taken = own.covariance - linalg.inv(precision)[np.ix_(rows, rows)]
+    added = linalg.inv(own.covariance) - linalg.inv(own.prior_covariance)
     weights = np.maximum(linalg.eigvals(added @ taken).real, 0.0)
-    if not weights.sum() > TAKEN:
+    # What a record tells by itself alone differs by rounding: then nothing can be compared.
+    smallest = 0.05
+    if not weights.sum() > smallest:
         return 0.0, 0.0, ("", 0.0)
     unit = float(np.sum(weights**2) / np.sum(weights))
-    moved = its_point.mode - point.mode[columns]
-    spread = np.sqrt(np.maximum(np.diag(taken), TAKEN * np.diag(its_point.covariance)))
-    shared = [i for i, name in enumerate(alone.names) if name in posterior.names]
-    away = moved[shared] / spread[shared]
-    worst = int(np.argmax(np.abs(away)))
-    farthest = alone.names[shared[worst]], float(away[worst])
-    cost = max(_cost(alone, its_point.mode, point.mode[columns]), 0.0)
-    return cost / unit, float(np.sum(weights)) / unit, farthest
+    spread = np.sqrt(np.maximum(np.diag(taken), smallest * np.diag(own.covariance)))
+    shifts = {
+        name: float(shift)
+        for name, shift in zip(single.names, (own.mode - point.mode[columns]) / spread, strict=True)
+        if name in posterior.names
+    }
+    farthest = max(shifts, key=lambda name: abs(shifts[name]))
+    cost = max(_cost(single, own.mode, point.mode[columns]), 0.0)
+    return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
 
 
 def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
@@ -241,21 +234,3 @@ def disagreements(compared: Mapping[str, Agreement]) -> Iterator[Finding]:
                 "times as large as they should be",
                 'set model.per_record = ["sensor_sd", "discrepancy_sd"]',
             )
-
-
-def numbers(compared: Mapping[str, Agreement]) -> dict[str, object]:
-    """Return agreements as ``summary.json`` holds them."""
-    return {
-        name: {
-            "residual_joint_um": record.joint_um,
-            "residual_own_um": record.own_um,
-            "chi_square": record.distance,
-            "degrees_of_freedom": record.degrees,
-            "p_value": record.p_value,
-            "farthest": record.moved[0],
-            "farthest_sds": record.moved[1],
-            "agrees": not record.disagrees,
-            "innovations_rms": record.size,
-        }
-        for name, record in compared.items()
-    }

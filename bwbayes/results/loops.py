@@ -36,21 +36,11 @@ __all__ = [
     "initial_curve",
     "measure_loops",
     "measures",
-    "numbers",
     "steady_loop",
 ]
 
 # Voltages along a branch: an odd number, so that a symmetric drive passes zero at one of them.
 POINTS = 201
-
-# Cycles before the first look at whether the loop has closed, twice as many before each next one,
-# and those after which it is taken as it is; it has where a cycle changes less than this part of
-# its range.
-CYCLES, MOST_CYCLES = 2, 1024
-CLOSED = 1e-9
-
-# Voltages of the initial curve in a summary, out of those along the curve.
-EVERY = 5
 
 # What is measured of a loop: its name in a summary, title and unit for people.
 MEASURES: Mapping[str, tuple[str, str]] = {
@@ -79,14 +69,10 @@ class Estimate:
         sd = np.std(values, ddof=1) if values.size > 1 else 0.0
         return cls(float(np.mean(values)), float(sd), float(lower), float(upper))
 
-    def summary(self) -> dict[str, float]:
-        """Return the numbers as a summary holds them."""
-        return {
-            "mean": self.mean,
-            "sd": self.sd,
-            "lower_95": self.lower,
-            "upper_95": self.upper,
-        }
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The numbers as a summary holds them."""
+        return {"mean": self.mean, "sd": self.sd, "lower_95": self.lower, "upper_95": self.upper}
 
 
 @dataclass(frozen=True)
@@ -137,10 +123,27 @@ class Loop:
     estimates: Mapping[str, Estimate | None]
     closed: bool
 
+    @classmethod
+    def of(cls, traced: Traced) -> Loop:
+        """Measure the loops of all draws."""
+        estimates = {n: None if v is None else Estimate.of(v) for n, v in measures(traced).items()}
+        branches = Curve.of(traced.rising), Curve.of(traced.falling)
+        return cls(traced.voltage, *branches, estimates, traced.closed)
+
     @property
     def amplitude(self) -> float:
         """Half of the voltage's range, V."""
         return float(self.voltage[-1] - self.voltage[0]) / 2
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """The numbers as a summary holds them."""
+        return {
+            "from_V": float(self.voltage[0]),
+            "to_V": float(self.voltage[-1]),
+            "amplitude_V": self.amplitude,
+            "closed": self.closed,
+        } | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,21 @@ class Loops:
     minor: Loop
     initial_voltage: FloatArray
     initial: Curve
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """The loops as ``summary.json`` has them, the initial curve at every fifth voltage."""
+        curve = {
+            "voltage_V": self.initial_voltage,
+            "mean_um": self.initial.mean,
+            "lower_95_um": self.initial.lower,
+            "upper_95_um": self.initial.upper,
+        }
+        return {
+            "major": self.major.numbers,
+            "minor": self.minor.numbers,
+            "initial_curve": {name: values[::5].tolist() for name, values in curve.items()},
+        }
 
 
 def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS) -> Loops:
@@ -186,8 +204,8 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     center, half = span.middle, span.half
     voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
     return Loops(
-        _loop(steady_loop(actuator, column, span.low, span.high, points)),
-        _loop(steady_loop(actuator, column, center - half / 2, center + half / 2, points)),
+        Loop.of(steady_loop(actuator, column, span.low, span.high, points)),
+        Loop.of(steady_loop(actuator, column, center - half / 2, center + half / 2, points)),
         voltage,
         Curve.of(curve),
     )
@@ -218,12 +236,13 @@ def steady_loop(
     column = _demagnetized(column)
     memory = actuator.begin(column, np.zeros(1), from_rest=True)
     operator = actuator.hysteresis
-    cycles, closed = CYCLES, False
-    while not closed and cycles <= MOST_CYCLES:
+    # After two cycles, then after twice as many each time, a thousand at most.
+    cycles, closed = 2, False
+    while not closed and cycles <= 1024:
         # Between two turns nothing needs to be sampled: what is exact is so for any step.
         moved, memory = operator.advance(column, np.tile([high, low], cycles), memory)
         changed = np.abs(moved[:, -2:] - moved[:, -4:-2])
-        closed = bool(np.all(changed <= CLOSED * np.abs(moved[:, -2:-1] - moved[:, -1:])))
+        closed = bool(np.all(changed <= 1e-9 * np.abs(moved[:, -2:-1] - moved[:, -1:])))
         cycles *= 2
     rising, memory = operator.advance(column, voltage, memory)
     falling, _ = operator.advance(column, voltage[::-1], memory)
@@ -300,43 +319,6 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         "coercive_V": (passed[0] - passed[1]) / 2,
         "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),
     }
-
-
-def numbers(loops: Loops) -> dict[str, object]:
-    """Return the loops as ``summary.json`` holds them, the initial curve at some voltages."""
-    thinned, curve = slice(None, None, EVERY), loops.initial
-    return {
-        "major": _numbers(loops.major),
-        "minor": _numbers(loops.minor),
-        "initial_curve": {
-            "voltage_V": loops.initial_voltage[thinned].tolist(),
-            "mean_um": curve.mean[thinned].tolist(),
-            "lower_95_um": curve.lower[thinned].tolist(),
-            "upper_95_um": curve.upper[thinned].tolist(),
-        },
-    }
-
-
-def _numbers(loop: Loop) -> dict[str, object]:
-    numbers: dict[str, object] = {
-        "from_V": float(loop.voltage[0]),
-        "to_V": float(loop.voltage[-1]),
-        "amplitude_V": loop.amplitude,
-        "closed": loop.closed,
-    }
-    estimates = {n: None if e is None else e.summary() for n, e in loop.estimates.items()}
-    return numbers | estimates
-
-
-def _loop(traced: Traced) -> Loop:
-    measured = measures(traced)
-    return Loop(
-        traced.voltage,
-        Curve.of(traced.rising),
-        Curve.of(traced.falling),
-        {name: None if v is None else Estimate.of(v) for name, v in measured.items()},
-        traced.closed,
-    )
 
 
 def _voltages(low: float, high: float, points: int) -> FloatArray:

@@ -15,18 +15,17 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.parameters import Parameter
-from bwbayes.results import agreement, loops, steps
 from bwbayes.results.agreement import Agreement
 from bwbayes.results.bands import Bands
 from bwbayes.results.innovations import Innovations
 from bwbayes.results.learned import Learned
 from bwbayes.results.loops import Loops
 from bwbayes.results.replicated import Replicated
-from bwbayes.results.scores import Scores, as_summary
+from bwbayes.results.scores import Scores
 from bwbayes.results.standing import Standing
 from bwbayes.results.steps import StepResponse
 from bwbayes.results.verdict import Verdict
-from bwbayes.sampling.diagnostics import Check, Outcome
+from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.shown import brief
 
 __all__ = ["Result", "summary"]
@@ -125,77 +124,68 @@ def summary(result: Result) -> dict[str, object]:
     ``identifiability``, ``replicated`` and ``explanations`` are None unless the sampling has
     converged; ``agreement`` is there for several records alone.
     """
-    outcome = result.outcome
+    outcome, check = result.outcome, result.outcome.check
     numbers: dict[str, object] = {
         "converged": outcome.converged,
         "stop_reason": outcome.stop_reason,
-        "steps": outcome.check.steps,
-        "acceptance": outcome.check.acceptance,
+        "steps": check.steps,
+        "acceptance": check.acceptance,
         "sampling": {
             "proposals": {move: proposed for move, (proposed, _) in result.moves.items()},
             "acceptance": {
-                move: kept / proposed for move, (proposed, kept) in result.moves.items()
+                move: accepted / proposed for move, (proposed, accepted) in result.moves.items()
             },
-            "pareto_k": outcome.check.pareto_k,
+            "pareto_k": check.pareto_k,
         },
         "remarks": list(result.remarks),
-        "parameters": None,
-        "validation": None,
-        "innovations": None,
-        "loops": None,
-        "step_responses": None,
-        "identifiability": None,
-        "replicated": None,
-        "explanations": None,
     }
-    if outcome.converged:
-        numbers["parameters"] = _parameters(result)
-        numbers["validation"] = {
-            name: as_summary(s) | (result.verdicts[name].summary if name in result.verdicts else {})
-            for name, s in result.scores.items()
-        }
-        whitened = {name: series.numbers for name, series in result.innovations.items()}
-        if whitened:
-            # Those of one record stand alone, those of several by their names.
-            numbers["innovations"] = (
-                whitened if len(whitened) > 1 else next(iter(whitened.values()))
-            )
-        if result.agreement:
-            numbers["agreement"] = agreement.numbers(result.agreement)
-        if result.loops is not None:
-            numbers["loops"] = loops.numbers(result.loops)
-        if result.learned is not None:
-            numbers["identifiability"] = result.learned.numbers
-        numbers["replicated"] = {
-            name: checks.numbers for name, checks in result.replicated.items()
-        } or None
-        numbers["explanations"] = {
-            name: [explanation.numbers for explanation in explained]
-            for name, explained in result.explanations.items()
-        }
-        numbers["step_responses"] = steps.numbers(result.steps)
-    return numbers
+    if not outcome.converged:
+        sections = ("parameters", "validation", "innovations", "loops", "step_responses")
+        return numbers | dict.fromkeys((*sections, "identifiability", "replicated", "explanations"))
+    validation = {
+        name: scores.numbers | (result.verdicts[name].summary if name in result.verdicts else {})
+        for name, scores in result.scores.items()
+    }
+    innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
+    if len(innovations) == 1:
+        # Those of one record stand alone, those of several by their names.
+        innovations = next(iter(result.innovations.values())).numbers
+    if result.agreement:
+        numbers["agreement"] = {n: record.numbers for n, record in result.agreement.items()}
+    return numbers | {
+        "parameters": _parameters(result),
+        "validation": validation,
+        "innovations": innovations or None,
+        "loops": None if result.loops is None else result.loops.numbers,
+        "step_responses": {name: step.numbers for name, step in result.steps.items()},
+        "identifiability": None if result.learned is None else result.learned.numbers,
+        "replicated": {n: checks.numbers for n, checks in result.replicated.items()} or None,
+        "explanations": {
+            name: [explanation.numbers for explanation in explanations]
+            for name, explanations in result.explanations.items()
+        },
+    }
 
 
 def _parameters(result: Result) -> dict[str, dict[str, object]]:
-    flat = result.flat_draws
+    flat, check = result.flat_draws, result.outcome.check
     lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
     sd = np.std(flat, axis=0, ddof=1)
-    check: Check = result.outcome.check
+    columns = {
+        "mean": np.mean(flat, axis=0),
+        "sd": sd,
+        "median": median,
+        "lower_95": lower,
+        "upper_95": upper,
+        "ess_bulk": check.ess_bulk,
+        "ess_tail": check.ess_tail,
+        "rhat": check.rhat,
+        "mcse_mean": sd / np.sqrt(check.ess_mean),
+    }
     table: dict[str, dict[str, object]] = {}
     for i, parameter in enumerate(result.free):
-        table[parameter.name] = {
-            "mean": float(np.mean(flat[:, i])),
-            "sd": float(sd[i]),
-            "median": float(median[i]),
-            "lower_95": float(lower[i]),
-            "upper_95": float(upper[i]),
-            "ess_bulk": float(check.ess_bulk[i]),
-            "ess_tail": float(check.ess_tail[i]),
-            "rhat": float(check.rhat[i]),
-            "mcse_mean": float(sd[i] / np.sqrt(check.ess_mean[i])),
-            "unit": parameter.unit,
-        }
+        row: dict[str, object] = {key: float(values[i]) for key, values in columns.items()}
+        table[parameter.name] = row | {"unit": parameter.unit}
         if parameter.name in result.truth:
             table[parameter.name]["truth"] = result.truth[parameter.name]
     return table

@@ -7,6 +7,7 @@ chances to miss. A block bootstrap says how far the coverage may lie from nomina
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,21 +18,7 @@ from bwbayes.results.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.shown import brief
 
-__all__ = ["Scores", "as_summary", "block_bootstrap_error", "block_length", "score"]
-
-# Kinds of bands that something exists to check against: a reading, and a simulated truth.
-CHECKED: tuple[Kind, ...] = ("sensor", "displacement")
-
-# Length of a block in integrated autocorrelation times of the residuals.
-BLOCK_TIMES = 3
-
-# A bootstrap from fewer blocks than this says little.
-FEWEST_BLOCKS = 4
-
-# More blocks than this only cost time: the error is then known to some 3 %.
-MOST_BLOCKS = 500
-
-REPLICATES = 2000
+__all__ = ["Scores", "block_bootstrap_error", "block_length", "score"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +69,30 @@ class Scores:
     log_score: float | None = None
     nrmse_full: float | None = None
 
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``validation.NAME`` in summary.json has of them; null for what is no number."""
+
+        def by_level(values: dict[int, float]) -> dict[str, float]:
+            return {str(level): value for level, value in values.items()}
+
+        def by_kind(values: Mapping[str, dict[int, float] | None]) -> dict[str, object]:
+            return {k: None if levels is None else by_level(levels) for k, levels in values.items()}
+
+        known = self.log_score is not None and np.isfinite(self.log_score)
+        return {
+            "nrmse": self.nrmse if np.isfinite(self.nrmse) else None,
+            "nrmse_full": self.nrmse_full,
+            "max_error_um": self.max_error_um,
+            "log_score": self.log_score if known else None,
+            "crps_um": self.crps_um,
+            **{f"width_{level}_um": width for level, width in self.width_um.items()},
+            **{f"interval_score_{level}_um": s for level, s in self.interval_score_um.items()},
+            "coverage": by_kind(self.coverage),
+            "coverage_error": by_kind(self.coverage_error),
+            "worst_second": by_level(self.worst_second),
+        }
+
 
 def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Scores:
     """Judge bands against what was measured, and against the truth where it is known.
@@ -110,13 +121,14 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
     measured = bands.measured[judged]
     residual = measured - bands.mean[judged]
     extent, rmse = float(np.ptp(measured)), float(np.sqrt(np.mean(residual**2)))
-    against = {"sensor": bands.measured, "displacement": bands.truth}
-    coverage: dict[str, dict[int, float] | None] = {}
-    error: dict[str, dict[int, float] | None] = {}
-    for kind in CHECKED:
-        values = against[kind]
+    targets: dict[Kind, FloatArray | None] = {
+        "sensor": bands.measured,
+        "displacement": bands.truth,
+    }
+    coverage: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
+    error: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
+    for kind, values in targets.items():
         if values is None:
-            coverage[kind] = error[kind] = None
             continue
         finite = np.isfinite(values)
         finite[: bands.scored_from] = False
@@ -124,62 +136,34 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
         coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
         block = block_length((values - bands.mean)[finite])
         error[kind] = _coverage_errors(hits, block, generator)
-    seconds = {
-        level: _worst(
-            bands.covers("sensor", level, bands.measured)[bands.scored_from :],
-            judged[bands.scored_from :],
-            bands.interval,
-        )
-        for level in LEVELS
-    }
+    width, interval_score, worst = {}, {}, {}
+    for level in LEVELS:
+        lower, upper = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
+        distance = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
+        width[level] = float(np.mean(upper - lower))
+        interval_score[level] = float(np.mean(upper - lower + 2 / (1 - level / 100) * distance))
+        inside = bands.covers("sensor", level, bands.measured)
+        scored = slice(bands.scored_from, None)
+        worst[level] = _worst_second(inside[scored], judged[scored], bands.interval)
     return Scores(
         nrmse=rmse / extent if extent > 0 else np.nan,
         nrmse_full=rmse / full if full else None,
         max_error_um=float(np.abs(residual).max()),
         crps_um=float(bands.crps[judged].mean()),
-        width_um={level: _width(bands, level, judged) for level in LEVELS},
-        interval_score_um={level: _interval_score(bands, level, judged) for level in LEVELS},
+        width_um=width,
+        interval_score_um=interval_score,
         coverage=coverage,
         coverage_error=error,
-        worst_second=seconds,
+        worst_second=worst,
         log_score=None if bands.log_score is None else float(bands.log_score[judged].mean()),
     )
-
-
-def as_summary(scores: Scores) -> dict[str, object]:
-    """Scores in the shape of ``validation.NAME`` in summary.json; null for what is not a number."""
-
-    def by_level(values: dict[int, float]) -> dict[str, float]:
-        return {str(level): value for level, value in values.items()}
-
-    def by_kind(values: dict[str, dict[int, float] | None]) -> dict[str, dict[str, float] | None]:
-        return {
-            kind: None if levels is None else by_level(levels) for kind, levels in values.items()
-        }
-
-    return {
-        "nrmse": scores.nrmse if np.isfinite(scores.nrmse) else None,
-        "nrmse_full": scores.nrmse_full,
-        "max_error_um": scores.max_error_um,
-        "log_score": (
-            scores.log_score
-            if scores.log_score is not None and np.isfinite(scores.log_score)
-            else None
-        ),
-        "crps_um": scores.crps_um,
-        **{f"width_{level}_um": width for level, width in scores.width_um.items()},
-        **{f"interval_score_{level}_um": s for level, s in scores.interval_score_um.items()},
-        "coverage": by_kind(scores.coverage),
-        "coverage_error": by_kind(scores.coverage_error),
-        "worst_second": by_level(scores.worst_second),
-    }
 
 
 def block_bootstrap_error(
     hits: BoolArray | FloatArray,
     block: int,
     generator: np.random.Generator,
-    replicates: int = REPLICATES,
+    replicates: int = 2000,
 ) -> float:
     """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
 
@@ -212,7 +196,8 @@ def block_bootstrap_error(
     samples = hits.size
     if (hits == hits[0]).all():
         return 0.0
-    block = max(1, samples // MOST_BLOCKS, min(block, samples // FEWEST_BLOCKS))
+    # More than 500 blocks only cost time, and fewer than four say little.
+    block = max(1, samples // 500, min(block, samples // 4))
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([hits, hits[: block - 1]]))])
     means = (total[block:] - total[:-block]) / block
     blocks = samples / block
@@ -235,7 +220,7 @@ def block_length(residual: FloatArray) -> int:
         (samples,) value minus the mean of its band.
     """
     time = autocorrelation_time(residual[np.newaxis])
-    return max(1, round(BLOCK_TIMES * time)) if np.isfinite(time) else 1
+    return max(1, round(3 * time)) if np.isfinite(time) else 1
 
 
 def _coverage_errors(
@@ -261,22 +246,7 @@ def _coverage_errors(
     return errors
 
 
-def _width(bands: Bands, level: int, judged: BoolArray) -> float:
-    width = bands.upper["sensor", level] - bands.lower["sensor", level]
-    return float(width[judged].mean())
-
-
-def _interval_score(bands: Bands, level: int, judged: BoolArray) -> float:
-    """Mean of width + 2/a (distance to the band) of the judged readings, a = 1 - level."""
-    assert bands.measured is not None
-    measured = bands.measured[judged]
-    lower = bands.lower["sensor", level][judged]
-    upper = bands.upper["sensor", level][judged]
-    outside = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
-    return float((upper - lower + 2 / (1 - level / 100) * outside).mean())
-
-
-def _worst(hits: BoolArray, judged: BoolArray, interval: float) -> float:
+def _worst_second(hits: BoolArray, judged: BoolArray, interval: float) -> float:
     """Lowest coverage of the readings in a second, in all of them if they last less.
 
     A second that holds fewer than half as many readings as the fullest one says little, and is
@@ -287,5 +257,5 @@ def _worst(hits: BoolArray, judged: BoolArray, interval: float) -> float:
         np.concatenate([[0], np.cumsum(flags)]) for flags in (hits & judged, judged)
     )
     counts = readings[block:] - readings[:-block]
-    telling = 2 * counts >= counts.max()
-    return float(((covered[block:] - covered[:-block])[telling] / counts[telling]).min())
+    full = 2 * counts >= counts.max()
+    return float(((covered[block:] - covered[:-block])[full] / counts[full]).min())

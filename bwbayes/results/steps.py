@@ -28,18 +28,14 @@ __all__ = [
     "StepResponse",
     "measure_step",
     "measure_steps",
-    "numbers",
     "step_of",
 ]
 
-# The first time that is looked at, s, and times per decade.
-FIRST, PER_DECADE = 1e-6, 60
+# The first time that is looked at, s.
+FIRST = 1e-6
 
 # Time after a step from which creep is counted, s, as data sheets do.
 CREEP_FROM = 0.1
-
-# Part of a step's height by which a voltage may differ from its two levels.
-SLACK = 0.02
 
 # What is measured of a step response: its name in a summary, title and unit for people.
 STEP_MEASURES: Mapping[str, tuple[str, str]] = {
@@ -77,12 +73,18 @@ class StepResponse:
     crept: Curve | None
     estimates: Mapping[str, Estimate | None]
 
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it."""
+        levels: dict[str, object] = {"height_V": self.step.height, "held_s": self.step.held}
+        return levels | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
+
 
 def step_of(record: Record) -> Step | None:
     """Return the step from zero that a record's voltage is, or None if it is something else."""
     voltage = record.voltage
     height = float(np.median(voltage[voltage.size // 2 :]))
-    slack = SLACK * abs(height)
+    slack = 0.02 * abs(height)
     up = np.abs(voltage - height) <= slack
     first = int(np.argmax(up))
     # One sample may lie on the way.
@@ -125,42 +127,30 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     step
         The step.
     """
-    _, alone, its = next(posterior.each(draws))
-    dataset = alone.only
-    column = dataset.table.columns(alone.prior.theta(its))
-    nothing = np.zeros(len(draws))
-    column |= {"initial": nothing, "offset": nothing}
+    _, single, record_draws = next(posterior.each(draws))
+    dataset = single.only
+    column = dataset.table.columns(single.prior.theta(record_draws))
+    column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
     actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")
     held = max(step.held, 10 * FIRST)
-    time = np.geomspace(FIRST, held, round(PER_DECADE * np.log10(held / FIRST)) + 1)
+    time = np.geomspace(FIRST, held, round(60 * np.log10(held / FIRST)) + 1)
     settled, without, creep = _responses(actuator, column, step.height, time)
-    response = without + creep
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
     estimates["level_um"] = Estimate.of(settled)
     if actuator.filter.parameters:
-        fractionent = without / settled[:, np.newaxis]
-        rise = _passes(time, fractionent, 0.9) - _passes(time, fractionent, 0.1)
-        estimates["rise_s"] = Estimate.of(rise)
-        estimates["overshoot_percent"] = Estimate.of(
-            100 * np.maximum(np.max(fractionent, axis=1) - 1, 0.0)
-        )
+        share = without / settled[:, np.newaxis]
+        estimates["rise_s"] = Estimate.of(_passes(time, share, 0.9) - _passes(time, share, 0.1))
+        overshoot = 100 * np.maximum(np.max(share, axis=1) - 1, 0.0)
+        estimates["overshoot_percent"] = Estimate.of(overshoot)
     crept = None
     if actuator.creep is not None and held >= 10 * CREEP_FROM:
-        first_creep = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
-        grown = creep - first_creep[:, np.newaxis]
-        fractionent = 100 * grown[:, -1] / (settled + first_creep)
-        estimates["creep_percent"] = Estimate.of(fractionent / np.log10(held / CREEP_FROM))
+        before = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
+        grown = creep - before[:, np.newaxis]
+        decades = np.log10(held / CREEP_FROM)
+        percent = 100 * grown[:, -1] / (settled + before) / decades
+        estimates["creep_percent"] = Estimate.of(percent)
         crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
-    return StepResponse(step, time, Curve.of(response), crept, estimates)
-
-
-def numbers(responses: Mapping[str, StepResponse]) -> dict[str, object]:
-    """Return step responses as ``summary.json`` holds them."""
-    return {
-        name: {"height_V": response.step.height, "held_s": response.step.held}
-        | {n: None if e is None else e.summary() for n, e in response.estimates.items()}
-        for name, response in responses.items()
-    }
+    return StepResponse(step, time, Curve.of(without + creep), crept, estimates)
 
 
 def _responses(

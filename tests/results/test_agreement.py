@@ -12,7 +12,7 @@ from bwbayes.inference import pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.agreement import Agreement, _cost, agreements, disagreements, numbers
+from bwbayes.results.agreement import Agreement, _cost, agreements, disagreements
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
 from tests.inference.test_solvable import linear_posterior
@@ -45,7 +45,7 @@ def test_records_of_one_actuator_agree() -> None:
     assert [] == [*disagreements(every)]
     assert all(one.degrees > 0 for one in every.values())
     assert all(one.p_value > 1e-3 for one in every.values())
-    assert all(set(one) >= {"agrees", "p_value"} for one in numbers(every).values())  # type: ignore[call-overload]
+    assert all(set(one.numbers) >= {"agrees", "p_value"} for one in every.values())
 
 
 def test_a_record_with_another_gain_is_named() -> None:

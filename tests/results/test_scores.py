@@ -13,7 +13,7 @@ from scipy.stats import norm
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.results.bands import KINDS, LEVELS, Bands
-from bwbayes.results.scores import as_summary, block_bootstrap_error, block_length, score
+from bwbayes.results.scores import block_bootstrap_error, block_length, score
 
 # The window of the measured record: 14 s at 200 Hz, correlation time 0.65 s.
 SAMPLES, CORRELATION = 2800, 130
@@ -136,7 +136,7 @@ def test_bands_with_nothing_after_the_lead_in_are_refused() -> None:
 
 def test_a_window_at_rest_has_no_nrmse_and_the_summary_says_null() -> None:
     scores = score(bands_around(np.zeros(50), np.zeros(50)), np.random.default_rng(0))
-    assert as_summary(scores)["nrmse"] is None
+    assert scores.numbers["nrmse"] is None
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -17,7 +17,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
 from bwbayes.results.prediction import forecast, predict_windows
-from bwbayes.results.steps import Step, measure_step, measure_steps, numbers, step_of
+from bwbayes.results.steps import Step, measure_step, measure_steps, step_of
 from tests.inference.problems import decaying_sine, posterior_of
 
 INTERVAL = 0.01
@@ -141,9 +141,9 @@ def test_what_is_no_step_from_zero_is_left_alone(voltage: FloatArray) -> None:
 def test_summary_names_the_steps() -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
     record = Record(np.repeat([0.0, 50.0], 100), None, INTERVAL)
-    kept: Any = numbers(measure_steps(of, draws, {"up": record}))
-    assert [50.0, 1.0] == pytest.approx([kept["up"]["height_V"], kept["up"]["held_s"]])
-    assert {"mean", "sd", "lower_95", "upper_95"} == set(kept["up"]["rise_s"])
+    numbers: Any = measure_steps(of, draws, {"up": record})["up"].numbers
+    assert [50.0, 1.0] == pytest.approx([numbers["height_V"], numbers["held_s"]])
+    assert {"mean", "sd", "lower_95", "upper_95"} == set(numbers["rise_s"])
 
 
 def test_a_forecast_is_the_end_of_a_record_that_goes_on() -> None:

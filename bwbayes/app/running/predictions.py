@@ -39,7 +39,7 @@ from bwbayes.results.prediction import (
     predict_windows,
     thinned,
 )
-from bwbayes.results.scores import Scores, as_summary, score
+from bwbayes.results.scores import Scores, score
 from bwbayes.results.verdict import Background, Verdict, assess
 from bwbayes.shown import head
 
@@ -108,7 +108,7 @@ class Prediction(Bands):
             "samples": self.time.size,
             "remarks": list(self.remarks),
             "lead_in": None if self.lead_in is None else asdict(self.lead_in),
-            "scores": None if self.scores is None else as_summary(self.scores),
+            "scores": None if self.scores is None else self.scores.numbers,
             **held,
         }
 
