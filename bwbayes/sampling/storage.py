@@ -30,6 +30,7 @@ from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.inference.pointfit import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.curvature import QuadraticMap
+from bwbayes.sampling.earlier import read_earlier
 from bwbayes.sampling.proposals import StudentMixture
 
 __all__ = ["ChainFile"]
@@ -109,14 +110,18 @@ class ChainFile(Chain):
         InputWarning
             It is damaged further on; the blocks before that are read.
         """
-        if not path.exists():
-            earlier = path.with_suffix(".h5").exists()
-            missing = "is of an earlier version (chain.h5)" if earlier else "does not exist"
-            raise InputError(f"{path}: the chain {missing}; run again")
+        earlier = path.with_suffix(".h5")
+        if not path.exists() and not earlier.exists():
+            raise InputError(f"{path}: the chain does not exist; run again")
         chain: ChainFile | None = None
         try:
-            chain = cls._begun(path)
-            chain._read_blocks()
+            if path.exists():
+                chain = cls._begun(path)
+                chain._read_blocks()
+            else:
+                read, point, block, attributes = read_earlier(earlier)
+                chain = cls(path, point, read.starts, block, attributes)
+                vars(chain).update(vars(read))
         except Exception as error:  # a damaged file fails in whatever way its reader stumbles
             damage = one_line(str(error)) or type(error).__name__
             if chain is None:
@@ -154,6 +159,8 @@ class ChainFile(Chain):
         chain = cls.read(path)
         if check is not None:
             check(chain.attributes())
+        if not path.exists():
+            return chain._written_anew()
         for phase in PHASES:
             n_blocks = len(chain.history(phase))
             for file in path.glob(f"{phase}-[0-9]*"):
@@ -162,6 +169,22 @@ class ChainFile(Chain):
         if not chain.set_aside:
             (path / "set-aside.npz").unlink(missing_ok=True)
         return chain
+
+    def _written_anew(self) -> ChainFile:
+        """Write what was read of an earlier version's file as a folder."""
+        draft = self.path.with_suffix(".earlier")
+        shutil.rmtree(draft, ignore_errors=True)
+        written = self.create(draft, self, self.point, self.block, self._attributes)
+        for phase in PHASES[1:]:
+            written.freeze(phase, self.proposals[phase])
+        for phase in PHASES:
+            for blocks in self.history(phase):
+                written.append(phase, blocks)
+        if self.set_aside:
+            written.fall_back(self.set_aside, self.refit)
+        draft.rename(self.path)
+        written.path = self.path
+        return written
 
     def attributes(self) -> dict[str, str | int]:
         """Return what was run: config, versions, platform, seed, hash of the data."""

@@ -64,7 +64,10 @@ def load(path: Path, state: str) -> dict[str, Any] | None:
         text = json.loads(str(arrays["text"]))
         if text["state"] != state:
             return None
-        values: dict[str, Any] = _object_of(text["values"], arrays)
+        try:
+            values: dict[str, Any] = _object_of(text["values"], arrays)
+        except (ImportError, AttributeError, TypeError):
+            return None  # of a version whose dataclasses were others
         return values
 
 

@@ -181,7 +181,7 @@ def _chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     problem = folder.problem()
-    if not folder.chain.exists():
+    if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
         return _begun(folder, problem, console)
     chain = ChainFile.resume(folder.chain, partial(require_its_own, folder.chain, problem))
     first_engine, now = chain.attributes()["engine"], problem.posterior.engine
