@@ -14,7 +14,7 @@ of parameters::
 
 The names here are what a Python user needs; each is loaded when it is first used, so that
 ``import bwbayes`` costs nothing. ``notebooks/quickstart.ipynb`` shows them at work. All else is
-imported from its room: ``from bwbayes.results.replicates import replicates``.
+imported from its room: ``from bwbayes.calibration.replicates import replicates``.
 """
 
 from __future__ import annotations
@@ -51,28 +51,28 @@ if TYPE_CHECKING:
     from bwbayes.app.fit.campaigns import Campaign, campaign
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.running.predictions import Prediction
-    from bwbayes.data.io.formats import read_record, write_record
-    from bwbayes.data.record import Record
-    from bwbayes.data.teststand import VirtualTestStand
-    from bwbayes.data.waveforms import signal
     from bwbayes.diagnosis.record_checks import inspect
     from bwbayes.errors import InputError, InputWarning, NotConvergedError
     from bwbayes.model.operators.bouc_wen import hysteresis
-    from bwbayes.results.bands import Bands
+    from bwbayes.prediction.bands import Bands
+    from bwbayes.record.io.formats import read_record, write_record
+    from bwbayes.record.record import Record
+    from bwbayes.record.teststand import VirtualTestStand
+    from bwbayes.record.waveforms import signal
 else:
     HOMES = {
         "app.fit.calls": ("compare", "fit", "open_run", "resume"),
         "app.fit.campaigns": ("Campaign", "campaign"),
         "app.fit.fitted": ("Fit",),
         "app.running.predictions": ("Prediction",),
-        "data.io.formats": ("read_record", "write_record"),
-        "data.record": ("Record",),
-        "data.teststand": ("VirtualTestStand",),
-        "data.waveforms": ("signal",),
+        "record.io.formats": ("read_record", "write_record"),
+        "record.record": ("Record",),
+        "record.teststand": ("VirtualTestStand",),
+        "record.waveforms": ("signal",),
         "diagnosis.record_checks": ("inspect",),
         "errors": ("InputError", "InputWarning", "NotConvergedError"),
         "model.operators.bouc_wen": ("hysteresis",),
-        "results.bands": ("Bands",),
+        "prediction.bands": ("Bands",),
     }
 
     def __getattr__(name: str) -> object:

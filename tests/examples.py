@@ -22,9 +22,9 @@ from click.testing import CliRunner
 from matplotlib.figure import Figure
 
 from bwbayes.app.commands import cli
-from bwbayes.data import Record, write_record
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Staircase, Waveform
+from bwbayes.record import Record, write_record
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
 from bwbayes.report.figures import picture_of
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor, one_thread
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.sampler import first_chain, sample

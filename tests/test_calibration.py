@@ -31,11 +31,11 @@ from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.calibration.evaluation import LIMIT, Calibration, judge
+from bwbayes.calibration.replicates import Experiment, Replicate, replicates
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.calibration import LIMIT, Calibration, judge
-from bwbayes.results.replicates import Experiment, Replicate, replicates
 from tests.measured import keep
 from tests.together import (
     LEVEL,

@@ -40,14 +40,14 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.workers import one_thread
-from bwbayes.data.io.formats import write_record
-from bwbayes.data.record import Record
-from bwbayes.data.teststand import RingBender
+from bwbayes.calibration.evaluation import Calibration, judge
+from bwbayes.calibration.replicates import Experiment, Replicate, replicates
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS
-from bwbayes.results.calibration import Calibration, judge
-from bwbayes.results.replicates import Experiment, Replicate, replicates
+from bwbayes.record.io.formats import write_record
+from bwbayes.record.record import Record
+from bwbayes.record.teststand import RingBender
 from tests.measured import keep
 from tests.together import LEVEL, Plant, errors_off, narrowed, shifted, together_test
 

@@ -21,7 +21,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
-from bwbayes.results.bands import LEVELS, Bands, Kind
+from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled

@@ -20,11 +20,11 @@ from bwbayes.app.fit.opening import finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, read_record
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.chain import inverse
-from bwbayes.results.bands import Bands
-from bwbayes.results.prediction import Start, predict_record, thinned
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.prediction import Start, predict_record, thinned
+from bwbayes.record import Record, read_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
 

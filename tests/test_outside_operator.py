@@ -31,8 +31,8 @@ from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.elementwise import select
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
-from bwbayes.model.operators.one_state import OneState, beta, initial_anywhere
+from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
+from bwbayes.model.operators.scalar_memory import OneState, beta, initial_anywhere
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.model.step import OneStateStep
 from tests.control.compiled import Compiled

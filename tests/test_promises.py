@@ -95,7 +95,7 @@ FIGURES: dict[str, list[str]] = {
         "extent steady sine/covered 95/*",
         "steady sine/records",
     ],
-    "-m slow tests/results/test_verdicts_end_to_end.py": [
+    "-m slow tests/diagnosis/test_validation_end_to_end.py": [
         "#good runs hold/said no",
         "good runs hold/runs",
         "sum spoilt runs do not hold/*/missed",
@@ -107,21 +107,21 @@ FIGURES: dict[str, list[str]] = {
         "ordinary records/records",
         "#ordinary records/refused",
     ],
-    "-m slow tests/results/test_ordinary_answers.py": [
+    "-m slow tests/prediction/test_ordinary_answers.py": [
         "ordinary answers/seeds",
         "sum ordinary answers/correct/True",
         "sum ordinary answers/correct/False",
         "sum ordinary answers/other/True",
         "sum ordinary answers/other/False",
     ],
-    "-m slow tests/results/test_moving.py": [
+    "-m slow tests/prediction/test_moving.py": [
         "sum moving, */cases",
         "max moving, */records of each case",
         "extent 100 moving, */coverage and t/*/95/0",
         "count moving, */coverage and t/*/*/0",
         "max moving, */largest t",
     ],
-    "-m slow tests/results/test_moving_operators.py": [
+    "-m slow tests/prediction/test_moving_operators.py": [
         "min moving operators, */records",
         "extent 100 moving operators, */coverage and t/95/0",
         "count moving operators, */coverage and t/*/0",
@@ -148,7 +148,7 @@ FIGURES: dict[str, list[str]] = {
         "closed loop/draws",
         "closed loop/seeds",
     ],
-    "-m slow tests/results/test_forecasts_calibrated.py": [
+    "-m slow tests/prediction/test_forecasts_calibrated.py": [
         "forecasts from posteriors/records",
         "extent 100 forecasts from posteriors/95 % bands cover/*",
     ],
@@ -158,7 +158,7 @@ FIGURES: dict[str, list[str]] = {
         f"100 {WIDTH}/damping",
         f"extent 100 {WIDTH}/[!d]*|{WIDTH}/d",
     ],
-    "-m slow tests/results/test_agreement.py": [
+    "-m slow tests/diagnosis/test_consistency.py": [
         "joint fits: records that agree/named",
         "100 joint fits: records that agree/named with 10 % more gain",
     ],

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Waveform
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Decay, Sine, Waveform
 from tests.examples import README, ROOT, blocks
 from tests.measured import measured
 

@@ -24,8 +24,8 @@ import pytest
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, write_record
 from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import Outcome
 from tests.reference.make import digest, from_cube

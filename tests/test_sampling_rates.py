@@ -18,14 +18,14 @@ import pytest
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, write_record
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import predict_record
-from bwbayes.results.start import Start
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record
+from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import play
 from tests.measured import keep
-from tests.results.runs import KEPT, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
 
 RATE, SECONDS = 5000.0, 4.0
 EVERY = (1, 5, 25, 100)

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.data import Record, write_record
-from bwbayes.results.bands import Bands
+from bwbayes.prediction.bands import Bands
+from bwbayes.record import Record, write_record
 from tests.inference.test_likelihood import dense
 from tests.measured import keep
-from tests.results.runs import Judged, Stand, judge, problem_of, run
+from tests.prediction.runs import Judged, Stand, judge, problem_of, run
 
 RATE = 100.0
 STAND = Stand(lag=0.02, discrepancy=0.5, sensor=0.2)

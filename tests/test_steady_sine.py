@@ -16,8 +16,8 @@ import pytest
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, write_record
 from bwbayes.model.actuator import Actuator
+from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled

@@ -32,12 +32,12 @@ import pytest
 from scipy import linalg, stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, write_record
 from bwbayes.inference import defaults
 from bwbayes.model.actuator import Actuator
-from bwbayes.results.prediction import predict_windows
+from bwbayes.prediction.prediction import predict_windows
+from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.results.runs import KEPT, Stand, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, Stand, covered, problem_of, weighted_draws
 
 SEEDS = 20
 RATE = 5000.0

@@ -12,8 +12,8 @@ import numpy as np
 from scipy import linalg, stats
 
 from bwbayes.arrays import FloatArray
+from bwbayes.calibration.replicates import Replicate
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.results.replicates import Replicate
 
 # Level at which the test is used.
 LEVEL = 0.01

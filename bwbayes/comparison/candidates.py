@@ -15,9 +15,9 @@ import numpy as np
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import Part
-from bwbayes.results.bands import Bands
-from bwbayes.results.scores import Scores
-from bwbayes.results.standing import Standing
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
 
 __all__ = ["Candidate", "Mean", "judged"]

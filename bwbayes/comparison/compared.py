@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.comparison.candidates import Candidate
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -24,7 +25,6 @@ from bwbayes.report.report import (
     standing_banner,
 )
 from bwbayes.report.words import mark
-from bwbayes.results.standing import Standing
 from bwbayes.shown import head
 
 __all__ = ["Comparison", "Difference"]

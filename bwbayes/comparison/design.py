@@ -21,10 +21,10 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.designed import Promise
+from bwbayes.diagnosis.identifiability import stretches_once
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.results.identifiability import stretches_once
 
 __all__ = ["promises"]
 

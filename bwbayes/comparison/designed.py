@@ -13,6 +13,7 @@ from typing import overload
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.report.report import (
     Banner,
@@ -26,7 +27,6 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
-from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Design", "Promise"]

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
 from bwbayes.sampling.proposals import StudentMixture

@@ -18,10 +18,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.bands import Bands
-from bwbayes.results.prediction import thinned
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.prediction import thinned
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan

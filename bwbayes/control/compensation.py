@@ -30,15 +30,15 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.predicted import Choice, Compensation, Errors, Played, planned
 from bwbayes.control.references import Reference
-from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.linear import Hold
-from bwbayes.results.prediction import predict_record
-from bwbayes.results.start import Start, Started, started
+from bwbayes.prediction.initial_state import Start, Started, started
+from bwbayes.prediction.prediction import predict_record
+from bwbayes.record.record import Record
 
 __all__ = ["compensate"]
 

@@ -26,11 +26,11 @@ from bwbayes.control.sampled import (
     require_inverse,
     resolution,
 )
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
-from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Exported", "exported"]

@@ -17,8 +17,8 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains
 from bwbayes.control.sampled import SampledModel
-from bwbayes.data.teststand import Amplifier, LaserSensor
 from bwbayes.model.operator import Span
+from bwbayes.record.teststand import Amplifier, LaserSensor
 
 __all__ = ["LoopNoise", "LoopPlan", "Stand", "TrackingErrors", "follow"]
 

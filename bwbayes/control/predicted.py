@@ -16,9 +16,11 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
-from bwbayes.data.io.formats import write_record
-from bwbayes.data.record import Record
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.linear import HOLD_NAMES, Hold
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.record.io.formats import write_record
+from bwbayes.record.record import Record
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -31,8 +33,6 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
-from bwbayes.results.bands import KINDS, LEVELS, Bands
-from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["Choice", "Compensation", "Errors", "Played", "planned"]

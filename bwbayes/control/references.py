@@ -17,8 +17,8 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.data.waveforms import Triangle
 from bwbayes.errors import InputError, suggestion
+from bwbayes.record.waveforms import Triangle
 from bwbayes.shown import brief
 
 __all__ = ["SHAPES", "TRACKED", "Reference", "shaped", "tracking_signals"]

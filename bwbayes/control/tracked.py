@@ -14,6 +14,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains, Margins, Robustness
 from bwbayes.control.loop import Stand
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -24,7 +25,6 @@ from bwbayes.report.report import (
     kind_of,
     standing_banner,
 )
-from bwbayes.results.standing import Standing
 from bwbayes.shown import brief
 
 __all__ = ["CONTROLLERS", "Tracking"]

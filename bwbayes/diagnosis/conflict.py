@@ -17,8 +17,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.pointfit import PointFit
 from bwbayes.model.declaration import Values
 from bwbayes.model.distributions import Distribution
 

@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.laplace import Effect, Simulate, climb
 from bwbayes.diagnosis.record_checks import settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 
 __all__ = [
     "add_shapes",

@@ -15,7 +15,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.drive import fastest, time_between_turns
+from bwbayes.model.reversals import fastest, time_between_turns
 
 __all__ = ["beyond_training"]
 

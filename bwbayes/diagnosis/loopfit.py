@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.data.record import Record
 from bwbayes.diagnosis.series_patterns import turning_points
+from bwbayes.record.record import Record
 
 __all__ = ["LoopFit", "fit_loop"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.diagnosis.scene import Explanation, Scene
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import DiscrepancyNoise
 
 __all__ = ["creep", "dynamics", "hold", "nonlinearity", "operator", "smooth"]

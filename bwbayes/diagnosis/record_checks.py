@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.data.record import Record
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.frozen import Stuck, clipped, held, repeated
 from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
@@ -22,6 +21,7 @@ from bwbayes.diagnosis.series_patterns import (
     spikes,
     turning_points,
 )
+from bwbayes.record.record import Record
 
 __all__ = ["inspect", "isolated_outliers", "settle_fix"]
 

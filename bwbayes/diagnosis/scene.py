@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.io.grid import clock
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.laplace import Effect, LocalFit, climb
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.drive import rate, time_between_turns
+from bwbayes.model.reversals import rate, time_between_turns
+from bwbayes.record.io.grid import clock
 
 __all__ = ["Explanation", "Reconfigure", "Scene"]
 

@@ -20,7 +20,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.drive import time_between_turns
+from bwbayes.model.reversals import time_between_turns
 
 __all__ = ["default_priors", "joined", "ranges_of"]
 

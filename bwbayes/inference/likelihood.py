@@ -19,9 +19,9 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import Noise
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI
-from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.shown import brief
 

@@ -21,9 +21,9 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
+from bwbayes.inference.parameter_table import JointTable, ParameterTable
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.table import JointTable, ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief

@@ -28,8 +28,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.creep import Creep, creep_times
-from bwbayes.model.drive import time_between_turns
 from bwbayes.model.operator import Span
+from bwbayes.model.reversals import time_between_turns
 
 __all__ = ["with_creep"]
 

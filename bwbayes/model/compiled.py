@@ -30,7 +30,7 @@ from numba.extending import (
 
 from bwbayes.model import elementwise
 from bwbayes.model.elementwise import anywhere, gone, look_up, select
-from bwbayes.model.operators.memory import RemembersExtrema
+from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.step import HysteresisStep
 
 __all__ = ["INNER", "FormulaType", "compiled", "everett", "move"]

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.drive import PIECE, monotone_stretches
+from bwbayes.model.reversals import PIECE, monotone_stretches
 
 if TYPE_CHECKING:
     from bwbayes.model.operator import Span

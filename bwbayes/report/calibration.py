@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from itertools import product
 
+from bwbayes.calibration.evaluation import FAMILY_LEVEL, JUDGED_FROM, Calibration
+from bwbayes.calibration.replicates import RANKED
+from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
 from bwbayes.report.words import symbol, unit_text
-from bwbayes.results.bands import KINDS, LEVELS
-from bwbayes.results.calibration import FAMILY_LEVEL, JUDGED_FROM, Calibration
-from bwbayes.results.replicates import RANKED
 
 __all__ = ["calibration_report"]
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from bwbayes.results.standing import Standing
+from bwbayes.diagnosis.standing import Standing
 
 if TYPE_CHECKING:
     from matplotlib import figure

@@ -11,7 +11,11 @@ from typing import Any
 
 from markupsafe import Markup
 
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.scores import Scores
 from bwbayes.report import tables
 from bwbayes.report.captions import caption
 from bwbayes.report.figures import Drawings, drawings
@@ -30,12 +34,8 @@ from bwbayes.report.report import (
     Text,
     remarks_banner,
 )
+from bwbayes.report.result import Result
 from bwbayes.report.words import covered, error_text, mark
-from bwbayes.results.bands import Bands
-from bwbayes.results.result import Result
-from bwbayes.results.scores import Scores
-from bwbayes.results.standing import Standing
-from bwbayes.results.verdict import Verdict
 
 __all__ = ["prediction_report", "run_report"]
 
@@ -53,7 +53,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     result
         The run.
     numbers
-        As :func:`bwbayes.results.result.summary` returns them; ``seed``, ``wall_s``, ``versions``
+        As :func:`bwbayes.report.result.summary` returns them; ``seed``, ``wall_s``, ``versions``
         and ``data_sha256`` are shown too if they are there, and without convergence ``go_on``, the
         command that goes on.
     """

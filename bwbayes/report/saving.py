@@ -7,9 +7,9 @@ from pathlib import Path
 
 from bwbayes.errors import InputError
 from bwbayes.report.figures import picture_of, save_pictures
+from bwbayes.report.outputs import write_summary
 from bwbayes.report.page import render
 from bwbayes.report.report import Picture, Report
-from bwbayes.results.outputs import write_summary
 
 __all__ = ["draw_pictures", "refuse_existing", "save"]
 

@@ -7,16 +7,16 @@ from typing import Any
 
 from markupsafe import Markup
 
+from bwbayes.diagnosis.predictive_checks import STATISTICS
+from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import Parameter
+from bwbayes.prediction.bands import LEVELS
+from bwbayes.prediction.loops import MEASURES, Estimate
+from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.steps import STEP_MEASURES
 from bwbayes.report.report import Table, TableColumn
+from bwbayes.report.result import Result
 from bwbayes.report.words import covered, digits, error_text, mark, symbol, unit_text
-from bwbayes.results.bands import LEVELS
-from bwbayes.results.loops import MEASURES, Estimate
-from bwbayes.results.replicated import STATISTICS
-from bwbayes.results.result import Result
-from bwbayes.results.scores import Scores
-from bwbayes.results.steps import STEP_MEASURES
-from bwbayes.results.verdict import Verdict
 
 __all__ = [
     "flat_records",

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from markupsafe import Markup
 
 from bwbayes.inference.parameters import Parameter
+from bwbayes.prediction.scores import Scores
 from bwbayes.report.report import Kind
-from bwbayes.results.scores import Scores
 
 __all__ = [
     "STATUS_KINDS",

@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState
 from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.proposals import StudentMixture

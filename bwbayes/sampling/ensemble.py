@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.moves import AmongPlaces, Weighted

@@ -34,7 +34,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit, peaks
+from bwbayes.inference.map_estimate import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning

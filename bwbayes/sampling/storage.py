@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, one_line
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.earlier import read_earlier

@@ -13,12 +13,12 @@ from scipy.stats import norm
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures import drawings, drawn, interactive
 from bwbayes.report.page import render
+from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
-from bwbayes.results.bands import KINDS, LEVELS, Bands
-from bwbayes.results.result import Result, summary
-from bwbayes.results.scores import Scores
 from bwbayes.sampling.diagnostics import Check, Outcome
 from tests.declared import declared
 

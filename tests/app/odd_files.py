@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import scipy.io
 
-from bwbayes.data import read_record, write_record
+from bwbayes.record import read_record, write_record
 from tests.app.oddities import GOOD, ROWS
 
 __all__ = ["chosen", "few", "good_arrays", "made", "odd_arrays"]

@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.campaign_result import STATUSES, CampaignResult, Row
 from bwbayes.comparison.designed import Design, Promise
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.report.page import render
-from bwbayes.results.result import summary
-from bwbayes.results.standing import Standing
+from bwbayes.report.result import summary
 from tests.app import example, small
 from tests.programs import needs
 

@@ -21,7 +21,7 @@ from bwbayes.app.jobs.calibrate import resume, start
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.app.running.progress import CountProgress
 from bwbayes.errors import InputError
-from bwbayes.results.bands import KINDS, LEVELS
+from bwbayes.prediction.bands import KINDS, LEVELS
 from tests.app import small
 
 # Three free parameters: a replicate takes a fraction of a second.

@@ -24,9 +24,9 @@ from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.run import start as begin
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.report.outputs import write_summary
 from bwbayes.report.page import render
-from bwbayes.results.outputs import write_summary
-from bwbayes.results.result import summary
+from bwbayes.report.result import summary
 from tests.app import small
 from tests.app.specimens import CONFIG, POPULATION, record, specimens
 

@@ -14,8 +14,8 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.choosing import chosen_noise
 from bwbayes.app.running.run import resume, start
-from bwbayes.data import Record, write_record
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.record import Record, write_record
 from tests.test_sampling_rates import records
 
 CONFIG = '[record]\nfile = "record.h5"\ntrain = [[0.0, 4.0]]\nfrom_rest = true\n'

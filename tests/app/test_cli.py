@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
-from bwbayes.data import read_record, write_record
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.record import read_record, write_record
 from tests.app import small
-from tests.data.spoilt import looping
+from tests.record.spoilt import looping
 
 COMMANDS = (
     "init",
@@ -140,7 +140,7 @@ def test_wrong_command_line_is_one_line(
     assert [] == list(tmp_path.iterdir())
 
 
-# Bad input: of each kind one; tests/data and test_config.py have them all
+# Bad input: of each kind one; tests/record and test_config.py have them all
 
 ROWS = [f"{i / 100},{5 * (i % 7)},{2 * (i % 7)}" for i in range(60)]
 HEADER = "time_s,voltage_V,displacement_um"

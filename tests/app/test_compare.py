@@ -18,9 +18,9 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.studies import compare as compare_command
 from bwbayes.app.fit.fitted import Fit
-from bwbayes.data import Record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
+from bwbayes.record import Record
 from bwbayes.sampling.storage import ChainFile
 
 CONFIG = """\

@@ -11,8 +11,8 @@ import pytest
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.config.keywords import config_of
-from bwbayes.data.record import Record
 from bwbayes.errors import InputError
+from bwbayes.record.record import Record
 from tests.app import small
 
 RECORD = '[record]\nfile = "record.csv"\n'

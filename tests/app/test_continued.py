@@ -18,9 +18,9 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.engine import Engine
+from bwbayes.record import Record, write_record
 
 ENGINES = get_args(Engine)
 SAMPLES, INTERVAL = 300, 0.02

@@ -13,10 +13,10 @@ from bwbayes.app.commands import cli
 from bwbayes.app.fit.opening import converged
 from bwbayes.app.jobs.design import design
 from bwbayes.comparison.designed import Design, Promise
-from bwbayes.data import read_record
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.inverse.limits import Limits
+from bwbayes.record import read_record
 from bwbayes.report.page import render
-from bwbayes.results.standing import Standing
 
 CANDIDATES = """\
 [steady]

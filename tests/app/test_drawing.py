@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bwbayes.app.running.drawing import Beside, beside
+from bwbayes.app.running.figure_worker import Beside, beside
 from bwbayes.report.figures import drawings, interactive, picture_of, save_pictures
 from tests.app import example
 

@@ -25,7 +25,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.running.workers import executor, side_by_side
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample

@@ -18,9 +18,9 @@ from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.running import run
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.data import Record, read_record
+from bwbayes.record import Record, read_record
+from bwbayes.report.outputs import write_bands
 from bwbayes.report.words import digits
-from bwbayes.results.outputs import write_bands
 from tests.app import small
 
 

@@ -19,10 +19,10 @@ from scipy import stats
 from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
-from bwbayes.data.io.columns import Naming
-from bwbayes.data.io.grid import decimals_of
 from bwbayes.errors import InputWarning
+from bwbayes.record import Record
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.grid import decimals_of
 
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},

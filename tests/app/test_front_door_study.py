@@ -20,8 +20,8 @@ from bwbayes.app.running.run import resume, start
 from bwbayes.errors import InputError, InputWarning
 from tests.app import small
 from tests.app.test_front_door import SEPARATORS, UNITS, drive, play, written
-from tests.data.instruments import INSTRUMENTS, Written, signals
 from tests.measured import keep
+from tests.record.instruments import INSTRUMENTS, Written, signals
 
 RECORDS = 200
 

@@ -33,7 +33,7 @@ from bwbayes.app.jobs import check as app_check
 from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from tests.app.mutations import KINDS, Case, case
 from tests.measured import keep

@@ -12,8 +12,8 @@ from rich.console import Console
 import bwbayes as bw
 from bwbayes.app.config.config import Config, RecordConfig
 from bwbayes.app.running.improving import improve_model
-from bwbayes.data import write_record
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.record import write_record
 from tests.diagnosis.plants import plant
 
 QUIET = Console(quiet=True)

@@ -20,10 +20,10 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume, start
-from bwbayes.data import Record, write_record
+from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.record import Record, write_record
 from bwbayes.report.figures import drawings
-from bwbayes.results.replicates import replicate
 from tests.app import small
 
 # A loop and a step at another rate than its readings', on one stand.

@@ -11,9 +11,9 @@ import pytest
 
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.results.loops import MEASURES, Loops, measure_loops
-from bwbayes.results.result import Result, summary
-from bwbayes.results.steps import STEP_MEASURES, Step, StepResponse, measure_step
+from bwbayes.prediction.loops import MEASURES, Loops, measure_loops
+from bwbayes.prediction.steps import STEP_MEASURES, Step, StepResponse, measure_step
+from bwbayes.report.result import Result, summary
 from tests.app import example
 from tests.app.test_report import rows
 from tests.inference.problems import decaying_sine, posterior_of

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from bwbayes.app.commands.products import predict
-from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
+from bwbayes.record import Record, read_record, write_record
 from tests.app import small
 
 

@@ -11,11 +11,11 @@ import pytest
 from bwbayes.app.config.config import dump, parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.data import Record, write_record
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
+from bwbayes.record import Record, write_record
 from tests.app import small
-from tests.data.spoilt import SPOILT, looping
+from tests.record.spoilt import SPOILT, looping
 
 
 def of(text: str, folder: Path) -> Problem:

@@ -16,11 +16,11 @@ from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
-from bwbayes.data.io.columns import Naming
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Waveform
 from bwbayes.errors import InputError
+from bwbayes.record import Record
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Decay, Sine, Waveform
 
 OWN = "time_s,voltage_V,displacement_um"
 FOREIGN = "t [ms],U_mV,pos"

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given, settings
 
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.figures import interactive
+from bwbayes.report.result import Result, summary
 from bwbayes.report.words import digits, symbol
-from bwbayes.results.result import Result, summary
-from bwbayes.results.verdict import Verdict
 from tests.app import example
 
 PICTURES = {

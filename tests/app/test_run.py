@@ -21,8 +21,8 @@ from bwbayes.app.fit.opening import finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.run import redraw, resume
-from bwbayes.data import read_record
 from bwbayes.errors import InputError
+from bwbayes.record import read_record
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.storage import ChainFile

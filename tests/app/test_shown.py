@@ -19,22 +19,22 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult, Row
+from bwbayes.calibration.evaluation import judge
+from bwbayes.calibration.replicates import Experiment, replicates
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracked import Tracking
 from bwbayes.control.tracking import track
-from bwbayes.inference import pointfit
+from bwbayes.diagnosis.validation import Background, assess
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.population.population import population
-from bwbayes.results.calibration import judge
-from bwbayes.results.loops import measure_loops
-from bwbayes.results.prediction import predict_record
-from bwbayes.results.replicates import Experiment, replicates
-from bwbayes.results.scores import score
-from bwbayes.results.start import Start
-from bwbayes.results.steps import Step, measure_step
-from bwbayes.results.verdict import Background, assess
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.loops import measure_loops
+from bwbayes.prediction.prediction import predict_record
+from bwbayes.prediction.scores import score
+from bwbayes.prediction.steps import Step, measure_step
 from bwbayes.sampling.sampler import first_chain
 from bwbayes.shown import LONGEST, MOST_LINES, brief, head
 from tests.app import small

@@ -20,10 +20,10 @@ import pytest
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.data import Record
-from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import InputWarning
+from bwbayes.record import Record
+from bwbayes.record.teststand import VirtualTestStand
 
 # Sensor noise of 0.5 um and a discrepancy of 1.5 um.
 NOISE = 1.6

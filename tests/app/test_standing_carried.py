@@ -18,8 +18,8 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.results.standing import Standing
-from bwbayes.results.verdict import Verdict
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Verdict
 
 OFF = "95 % bands cover 55 % of 50 readings"
 STATUS = {False: 3, None: 5}

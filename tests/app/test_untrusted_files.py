@@ -24,13 +24,13 @@ import scipy.io
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.record import Record, read_record, write_record
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import Report
+from bwbayes.report.result import Result
 from bwbayes.report.screen import as_text
-from bwbayes.results.result import Result
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
 from tests.app.odd_files import good_arrays

@@ -14,7 +14,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.workers import one_thread
-from bwbayes.results.replicates import replicate
+from bwbayes.calibration.replicates import replicate
 from tests.benchmarks import effective, likelihood
 from tests.benchmarks.cases import CREEPING, FULL, QUICK, ROOT, Effort, problem
 from tests.benchmarks.control import inversion

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from bwbayes.data.waveforms import signal
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
@@ -15,6 +14,7 @@ from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
+from bwbayes.record.waveforms import signal
 from tests.benchmarks.cases import Effort
 from tests.benchmarks.measuring import Cell, Table, interleaved
 from tests.control import cases

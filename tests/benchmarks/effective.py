@@ -28,7 +28,7 @@ from emcee.moves import StretchMove
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.diagnostics import TAIL, Check, Outcome, as_chains

@@ -21,7 +21,7 @@ COMPILED = """
 import numpy as np
 from bwbayes.inference.compiled import moments
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.table import ParameterTable
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)
 record = np.sin(np.arange(9.0))

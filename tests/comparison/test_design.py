@@ -21,7 +21,7 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.sampling.diagnostics import smoothed_weights
 from tests.inference.problems import decaying_sine, short_posterior
 from tests.inference.test_solvable import closed_form, covariance, linear_posterior, prior_moments
-from tests.results.runs import weighted_draws
+from tests.prediction.runs import weighted_draws
 
 WIDE = Limits(-100.0, 100.0)
 SAMPLES = 400

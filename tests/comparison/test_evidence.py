@@ -22,11 +22,11 @@ from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
-from bwbayes.data import Record, write_record
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
+from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample

@@ -20,8 +20,8 @@ from bwbayes.comparison.leave_future_out import (
     leave_future_out,
     log_ratios,
 )
+from bwbayes.inference.parameter_table import JointTable
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.table import JointTable
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.test_solvable import (
     WINDOWS,
@@ -30,7 +30,7 @@ from tests.inference.test_solvable import (
     linear_posterior,
     prior_moments,
 )
-from tests.results.records import bands_of, made
+from tests.prediction.records import bands_of, made
 
 PLAN = SamplingPlan(ess=400, walkers=24, block=25)
 

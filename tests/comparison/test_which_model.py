@@ -29,7 +29,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import begin
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.compared import Comparison
-from bwbayes.data import Record
+from bwbayes.record import Record
 from tests.measured import keep
 
 NINE = (

@@ -21,15 +21,15 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import Reference
-from bwbayes.data.record import Record
-from bwbayes.data.teststand import LaserSensor, VirtualTestStand
-from bwbayes.data.waveforms import signal
-from bwbayes.inference import pointfit
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.results.bands import LEVELS
-from bwbayes.results.prediction import thinned
-from bwbayes.results.standing import Standing
+from bwbayes.prediction.bands import LEVELS
+from bwbayes.prediction.prediction import thinned
+from bwbayes.record.record import Record
+from bwbayes.record.teststand import LaserSensor, VirtualTestStand
+from bwbayes.record.waveforms import signal
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.sampler import first_chain, sample
 

@@ -18,9 +18,9 @@ from bwbayes.app.jobs.export import export
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference, shaped
-from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.errors import InputError
 from bwbayes.model.linear import Hold, parse_hold
+from bwbayes.record.teststand import VirtualTestStand
 from tests.control.commands import (
     about,
     compensated,

@@ -21,11 +21,11 @@ from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
-from bwbayes.results.bands import LEVELS
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.prediction.bands import LEVELS
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import signal
 from tests.control.commands import about, compensated, drawn, inside, off, problem, promised, rms
 from tests.measured import keep
 

@@ -9,9 +9,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains, Robustness, design
 from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, follow
 from bwbayes.control.sampled import SampledModel
-from bwbayes.data.teststand import Amplifier
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.record.teststand import Amplifier
 from tests.control import cases
 
 QUIET = LoopNoise(np.zeros(2), np.zeros(2), np.ones(2))

@@ -17,13 +17,13 @@ from bwbayes.control.compensation import compensate
 from bwbayes.control.exported import exported
 from bwbayes.control.references import Reference, shaped
 from bwbayes.control.sampled import SampledModel
-from bwbayes.data.record import Record
-from bwbayes.data.teststand import VirtualTestStand
 from bwbayes.errors import InputError
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.record.record import Record
+from bwbayes.record.teststand import VirtualTestStand
 from tests.control import cases
 from tests.control.commands import compensated, fit_of
 from tests.control.compiled import Compiled

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
+from bwbayes.record import Record
 
 __all__ = ["CAUSES", "Plant", "plant"]
 

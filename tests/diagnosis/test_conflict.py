@@ -14,8 +14,8 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import around, conflicts, effective
 from bwbayes.inference.defaults import default_priors, ranges_of
+from bwbayes.inference.map_estimate import fit
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.inference.pointfit import fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution

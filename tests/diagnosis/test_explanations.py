@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from bwbayes.data import write_record
 from bwbayes.diagnosis import effects, model, noise
 from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.scene import Explanation, Scene
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.record import write_record
 from tests.diagnosis.plants import CAUSES, plant
 from tests.measured import keep
-from tests.results.runs import problem_of
+from tests.prediction.runs import problem_of
 
 SEEDS, GOOD = 5, 100
 

@@ -13,8 +13,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from tests.data.spoilt import good
 from tests.inference.problems import short_posterior
+from tests.record.spoilt import good
 
 
 def sine(

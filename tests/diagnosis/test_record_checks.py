@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record, read_record
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.frozen import clipped
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.diagnosis.series_patterns import spikes
-from tests.data.spoilt import SPOILT, good, looping
+from bwbayes.record import Record, read_record
+from tests.record.spoilt import SPOILT, good, looping
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
 

@@ -19,18 +19,18 @@ import numpy as np
 from emcee.moves import Move
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.record import Record
-from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import ranges_of
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import noise_model
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.pointfit import PointFit
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold
+from bwbayes.record.record import Record
+from bwbayes.record.teststand import RingBender
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.proposals import StudentMixture
 from tests.declared import NAMES, context, declared, joint, parameter

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.teststand import RingBender
 from bwbayes.inference.defaults import ranges_of
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
+from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES as EVERY
 from tests.declared import default_prior, joint, parameter
 

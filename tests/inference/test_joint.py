@@ -14,13 +14,13 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
+from bwbayes.inference.parameter_table import JointTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.table import JointTable
 from bwbayes.model.actuator import Actuator
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
 

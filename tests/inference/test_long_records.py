@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import pilot_moves
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from tests.inference.problems import short_posterior
 
 posterior = replace(short_posterior(samples={samples}, dynamics="lag"), engine="{engine}")

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise, WhiteNoise, noise_model
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.results.carried import carried
-from bwbayes.results.innovations import Innovations
+from bwbayes.prediction.discrepancy_state import carried
 from tests.inference.problems import INTERVAL, short_posterior
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.outliers import outliers, surprise
 from bwbayes.inference.posterior import Posterior
 from tests.inference.problems import short_posterior

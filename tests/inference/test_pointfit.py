@@ -11,15 +11,15 @@ from scipy.stats import chi2
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.map_estimate import PointFit, fit, peaks
 from bwbayes.inference.noise import WhiteNoise
-from bwbayes.inference.pointfit import PointFit, fit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.distributions import Distribution
+from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.problems import posterior_of, short_posterior, target, truth
-from tests.results.runs import Stand
-from tests.results.test_verdicts_end_to_end import made
+from tests.prediction.runs import Stand
 
 CASES = ("white", "discrepancy", "lag")
 

@@ -12,7 +12,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import around
-from bwbayes.inference.pointfit import fit
+from bwbayes.inference.map_estimate import fit
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from tests.inference.problems import decaying_sine, posterior_of, ring_bender

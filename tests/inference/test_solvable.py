@@ -28,11 +28,11 @@ from scipy import linalg, stats
 
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.data.teststand import RingBender
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
+from bwbayes.record.teststand import RingBender
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample

@@ -15,14 +15,14 @@ from scipy import optimize
 from scipy.signal import fftconvolve, lfilter
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.record import Record
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.untried import ALIKE, with_creep
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.results.bands import Bands
-from bwbayes.results.prediction import Start, predict_record
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.prediction import Start, predict_record
+from bwbayes.record.record import Record
 from tests import measured
 from tests.inference.problems import posterior_of
 

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.drive import (
+from bwbayes.model.reversals import (
     RETURN,
     fastest,
     monotone_stretches,

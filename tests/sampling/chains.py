@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.proposals import StudentMixture

@@ -12,7 +12,7 @@ import pytest
 from emcee.moves import DEMove, MHMove, StretchMove
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.ensemble import advance, start

@@ -21,7 +21,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain

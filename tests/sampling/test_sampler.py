@@ -12,7 +12,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.diagnostics import Outcome

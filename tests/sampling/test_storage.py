@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.storage import ChainFile
 from tests.sampling.chains import (

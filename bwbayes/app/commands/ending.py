@@ -13,8 +13,8 @@ from rich.console import Console
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem
+    from bwbayes.diagnosis.standing import Standing
     from bwbayes.report.report import Report
-    from bwbayes.results.standing import Standing
 
 __all__ = [
     "BAD_INPUT",

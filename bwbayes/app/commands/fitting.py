@@ -190,7 +190,7 @@ def _config_or_proposal(
 def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
     from bwbayes.app.config.proposal import propose
-    from bwbayes.data.io.columns import Naming
+    from bwbayes.record.io.columns import Naming
 
     try:
         return propose(path, where, Naming(**naming))

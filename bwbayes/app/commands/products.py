@@ -51,10 +51,10 @@ def predict(
     from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.predict import predict as predict_record
     from bwbayes.app.jobs.predict import write_prediction
-    from bwbayes.data import read_record
+    from bwbayes.diagnosis.standing import Standing
+    from bwbayes.record import read_record
     from bwbayes.report.report import Report, standing_banner
     from bwbayes.report.saving import refuse_existing
-    from bwbayes.results.standing import Standing
 
     if (record is None) == (options["signal"] is None):
         raise InputError("predict: give either a record or a signal")
@@ -150,7 +150,7 @@ def design(
     """
     from bwbayes.app.fit.opening import converged
     from bwbayes.app.jobs.design import design as rank
-    from bwbayes.data import Record, write_record
+    from bwbayes.record import Record, write_record
     from bwbayes.report.saving import refuse_existing, save
 
     if parameter is not None and drive is not None:

@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from bwbayes.app.config.config import ALONE, Config, checked
 from bwbayes.app.config.keys import synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
-from bwbayes.data.record import Record
 from bwbayes.errors import InputError, suggestion
+from bwbayes.record.record import Record
 
 __all__ = ["config_of"]
 

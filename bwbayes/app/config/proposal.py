@@ -20,17 +20,17 @@ import numpy as np
 import scipy
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.data import Record
-from bwbayes.data.io.checks import checked
-from bwbayes.data.io.columns import Naming
-from bwbayes.data.io.formats import read_table
-from bwbayes.data.io.grid import decimals_of
-from bwbayes.data.io.table import FileTable
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning
-from bwbayes.model.drive import rate
 from bwbayes.model.registry import DYNAMICS
+from bwbayes.model.reversals import rate
+from bwbayes.record import Record
+from bwbayes.record.io.checks import checked
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.formats import read_table
+from bwbayes.record.io.grid import decimals_of
+from bwbayes.record.io.table import FileTable
 
 __all__ = ["ConfigProposal", "propose"]
 

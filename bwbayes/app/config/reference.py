@@ -17,7 +17,6 @@ from typing import Any
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.keys import ANY, Key, keys, synonyms
-from bwbayes.data.waveforms import signal_names
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.creep import Creep
@@ -25,6 +24,7 @@ from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import FAMILIAR
 from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
+from bwbayes.record.waveforms import signal_names
 
 __all__ = ["config_reference", "parts_reference"]
 

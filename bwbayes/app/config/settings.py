@@ -106,7 +106,7 @@ class _Source(ConfigTable):
 
     @model_validator(mode="after")
     def _naming(self) -> Self:
-        from bwbayes.data.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
+        from bwbayes.record.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
         Naming(self.columns or {}, self.units or {}, self.fs)
         return self

@@ -17,7 +17,7 @@ from bwbayes.errors import InputError
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.comparison.compared import Comparison
-    from bwbayes.data import Record
+    from bwbayes.record import Record
 
 __all__ = ["compare", "fit", "open_run", "resume"]
 

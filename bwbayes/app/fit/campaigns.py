@@ -22,11 +22,11 @@ from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.campaign_result import CampaignResult
 from bwbayes.app.running.predictions import Prediction, predict_another
-from bwbayes.data import Record, read_record, write_record
 from bwbayes.errors import InputError
 from bwbayes.population.population import Population, next_specimen
+from bwbayes.prediction.initial_state import Start
+from bwbayes.record import Record, read_record, write_record
 from bwbayes.report.figures import drawn
-from bwbayes.results.start import Start
 from bwbayes.shown import head
 
 __all__ = ["Campaign", "campaign"]

@@ -28,17 +28,17 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import Prediction, residuals_along
 from bwbayes.app.running.workers import executor
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Verdict
 from bwbayes.errors import NotConvergedError
 from bwbayes.inference.engine import Engine
+from bwbayes.prediction.loops import Loops
+from bwbayes.report.outputs import posterior_tree
 from bwbayes.report.page import fragment
 from bwbayes.report.report import Report
+from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
 from bwbayes.report.screen import as_text
-from bwbayes.results.loops import Loops
-from bwbayes.results.outputs import posterior_tree
-from bwbayes.results.result import Result, summary
-from bwbayes.results.standing import Standing
-from bwbayes.results.verdict import Verdict
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile

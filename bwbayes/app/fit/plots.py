@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from bwbayes.app.problem.problem import Problem
 from bwbayes.control.tracked import CONTROLLERS, Tracking
 from bwbayes.errors import InputError, suggestion
+from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import drawn
 from bwbayes.report.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.report.figures.coverage import draw_coverage
@@ -24,8 +25,7 @@ from bwbayes.report.figures.series import draw_bands
 from bwbayes.report.figures.spectrum import draw_spectrum
 from bwbayes.report.figures.tracking import draw_tracking
 from bwbayes.report.report import Figure
-from bwbayes.results.bands import Bands
-from bwbayes.results.result import Result
+from bwbayes.report.result import Result
 from bwbayes.shown import brief
 
 __all__ = ["Plots"]

@@ -31,13 +31,13 @@ from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import CountProgress
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
+from bwbayes.calibration.evaluation import Calibration, judge
+from bwbayes.calibration.records import OtherRecord
+from bwbayes.calibration.replicates import RANKED, Entry, Experiment
+from bwbayes.calibration.replicates import replicates as run_replicates
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.saving import save
-from bwbayes.results.calibration import Calibration, judge
-from bwbayes.results.replicates import RANKED, Entry, Experiment
-from bwbayes.results.replicates import replicates as run_replicates
-from bwbayes.results.simulated import OtherRecord
 
 __all__ = ["experiment", "resume", "start"]
 

@@ -22,16 +22,16 @@ from bwbayes.app.config.config import checked, dump, load
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_in
 from bwbayes.app.running.campaign_result import CampaignResult, Row
-from bwbayes.app.running.one_record import SPECIMEN, Ended, Task, fit_one
 from bwbayes.app.running.progress import CountProgress
+from bwbayes.app.running.record_task import SPECIMEN, Ended, Task, fit_one
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
+from bwbayes.calibration.replicates import as_done
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.population.population import FEWEST, population
 from bwbayes.population.specimen import Specimen
 from bwbayes.report.saving import save
-from bwbayes.results.replicates import as_done
-from bwbayes.results.standing import Standing
 
 __all__ = ["config_text", "resume", "start"]
 

@@ -14,9 +14,9 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.explaining import explained, lines
-from bwbayes.data import Record
-from bwbayes.diagnosis import conflict
-from bwbayes.inference import pointfit
+from bwbayes.diagnosis import conflict, identifiability, innovations
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.record import Record
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import (
     Banner,
@@ -28,7 +28,6 @@ from bwbayes.report.report import (
     remarks_banner,
 )
 from bwbayes.report.saving import save
-from bwbayes.results import identifiability, innovations
 
 __all__ = ["check"]
 

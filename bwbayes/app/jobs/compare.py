@@ -31,19 +31,19 @@ from bwbayes.app.running.predictions import predictions, scoring
 from bwbayes.app.running.run import begin, draw, resume
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
+from bwbayes.calibration.replicates import as_done
 from bwbayes.comparison.candidates import Candidate, judged
 from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import evidence, screening_evidence
 from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
 from bwbayes.comparison.recommendation import recommend
-from bwbayes.data import Record
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.table import ParameterTable
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from bwbayes.results.replicates import as_done
-from bwbayes.results.scores import score
-from bwbayes.results.standing import Standing
+from bwbayes.prediction.scores import score
+from bwbayes.record import Record
 from bwbayes.sampling.chain import draws, log_densities
 
 if TYPE_CHECKING:

@@ -20,12 +20,12 @@ from bwbayes.app.problem.problem import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
-from bwbayes.data.io.formats import read_reference
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.linear import parse_hold
-from bwbayes.results.prediction import thinned
+from bwbayes.prediction.prediction import thinned
+from bwbayes.record.io.formats import read_reference
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit

@@ -22,8 +22,11 @@ from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
 from bwbayes.comparison.designed import Design
-from bwbayes.data import Record, read_record
-from bwbayes.data.waveforms import (
+from bwbayes.errors import InputError
+from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.reversals import time_between_turns, turning_points
+from bwbayes.record import Record, read_record
+from bwbayes.record.waveforms import (
     Carrier,
     Decay,
     Sine,
@@ -33,9 +36,6 @@ from bwbayes.data.waveforms import (
     signal,
     signal_names,
 )
-from bwbayes.errors import InputError
-from bwbayes.model.drive import time_between_turns, turning_points
-from bwbayes.model.inverse.limits import Limits
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit

@@ -13,13 +13,13 @@ from bwbayes.app.running.predictions import (
     predict_another,
     training_record,
 )
-from bwbayes.data import Record, read_record
-from bwbayes.data.waveforms import signal as named_signal
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
+from bwbayes.prediction.prediction import Start
+from bwbayes.record import Record, read_record
+from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
-from bwbayes.results.outputs import write_bands, write_summary
-from bwbayes.results.prediction import Start
-from bwbayes.results.standing import Standing
+from bwbayes.report.outputs import write_bands, write_summary
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit

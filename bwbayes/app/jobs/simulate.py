@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 from bwbayes.app.problem.problem import generator
-from bwbayes.data import write_record
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Sine, Waveform
-from bwbayes.data.waveforms import signal as named
 from bwbayes.errors import InputError
+from bwbayes.record import write_record
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Sine, Waveform
+from bwbayes.record.waveforms import signal as named
 from bwbayes.report.saving import refuse_existing
 
 __all__ = ["simulate"]

@@ -19,7 +19,7 @@ from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracked import Tracking
 from bwbayes.control.tracking import track as tracked
 from bwbayes.errors import InputError
-from bwbayes.results.prediction import thinned
+from bwbayes.prediction.prediction import thinned
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit

@@ -17,8 +17,8 @@ import numpy as np
 from bwbayes.app.config.config import Config, RecordConfig, ValidationConfig
 from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.records import whole
-from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
+from bwbayes.record import Record
 
 __all__ = ["joined"]
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bwbayes.app.config.config import ActuatorConfig, Config, ModelConfig
-from bwbayes.data import Record
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Waveform
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep, creep_times
@@ -16,6 +13,9 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import HYSTERESIS, OPTIONS, made
+from bwbayes.record import Record
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Waveform
 
 __all__ = ["actuator_of", "explicit_model", "in_words", "planned", "recoverable", "stand_of"]
 

@@ -15,18 +15,18 @@ import numpy as np
 
 from bwbayes.app.config.config import ALONE, Config, ParameterConfig
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import joined, ranges_of
 from bwbayes.inference.noise import NOISES
+from bwbayes.inference.parameter_table import Column, JointTable
 from bwbayes.inference.parameters import Parameter
-from bwbayes.inference.table import Column, JointTable
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.record import Record
 
 __all__ = [
     "as_config",

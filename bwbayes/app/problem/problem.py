@@ -41,7 +41,6 @@ from bwbayes.app.problem.records import (
     windows_of,
 )
 from bwbayes.arrays import IntArray
-from bwbayes.data import Record
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
@@ -50,12 +49,13 @@ from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
+from bwbayes.inference.parameter_table import JointTable, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.table import JointTable, ParameterTable
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import OPTIONS
-from bwbayes.results.prediction import Start
+from bwbayes.prediction.prediction import Start
+from bwbayes.record import Record
 from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 

@@ -18,15 +18,15 @@ from bwbayes.app.config.config import (
 )
 from bwbayes.app.problem.model import planned, stand_of
 from bwbayes.app.problem.parameters import place_of
-from bwbayes.data import Record, read_record
-from bwbayes.data.io.formats import require_readable
-from bwbayes.data.record import Window
-from bwbayes.data.teststand import VirtualTestStand
-from bwbayes.data.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
-from bwbayes.results.prediction import Start
+from bwbayes.prediction.prediction import Start
+from bwbayes.record import Record, read_record
+from bwbayes.record.io.formats import require_readable
+from bwbayes.record.record import Window
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
 
 __all__ = [
     "Windows",

@@ -14,23 +14,23 @@ import numpy as np
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.cache import load, save, state_of
-from bwbayes.app.running.drawing import Beside
 from bwbayes.app.running.explaining import explained, lines
-from bwbayes.app.running.facts import facts_of, stepped
+from bwbayes.app.running.figure_worker import Beside
 from bwbayes.app.running.fingerprint import version_remarks, versions
 from bwbayes.app.running.predictions import judged, predictions, scoring
-from bwbayes.diagnosis import conflict
+from bwbayes.app.running.run_details import facts_of, stepped
+from bwbayes.diagnosis import conflict, identifiability, innovations
+from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.results import agreement, identifiability, innovations
-from bwbayes.results.learned import learned
-from bwbayes.results.loops import measure_loops
-from bwbayes.results.prediction import thinned
-from bwbayes.results.replicated import replicated
-from bwbayes.results.result import Result
-from bwbayes.results.scores import score
-from bwbayes.results.steps import measure_steps
-from bwbayes.results.verdict import Background
+from bwbayes.diagnosis.information import learned
+from bwbayes.diagnosis.predictive_checks import replicated
+from bwbayes.diagnosis.validation import Background
+from bwbayes.prediction.loops import measure_loops
+from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.scores import score
+from bwbayes.prediction.steps import measure_steps
+from bwbayes.report.result import Result
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile

@@ -18,8 +18,8 @@ from typing import ClassVar, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bwbayes.app.running.folder import Folder
-from bwbayes.data.io.formats import SUFFIXES
 from bwbayes.errors import InputError
+from bwbayes.record.io.formats import SUFFIXES
 
 __all__ = ["ENDED", "CampaignFolder", "Origin", "digest", "ended", "records_in"]
 

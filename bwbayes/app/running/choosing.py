@@ -12,8 +12,8 @@ import numpy as np
 from bwbayes.app.problem.problem import Problem
 from bwbayes.diagnosis.explanations import TIED
 from bwbayes.diagnosis.laplace import climb
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
-from bwbayes.inference.pointfit import PointFit
 
 __all__ = ["chosen_noise"]
 

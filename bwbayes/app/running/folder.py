@@ -19,9 +19,9 @@ from filelock import FileLock, Timeout
 
 from bwbayes.app.config.config import dump, load
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.data import write_record
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
-from bwbayes.results.standing import Standing
+from bwbayes.record import write_record
 
 __all__ = ["CalibrationFolder", "Folder", "RunFolder"]
 

@@ -16,10 +16,10 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import generator, resolve
 from bwbayes.app.running.explaining import explained
-from bwbayes.data import Record
 from bwbayes.diagnosis.explanations import followed_causes, likely_causes
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.record import Record
 
 __all__ = ["improve_model"]
 

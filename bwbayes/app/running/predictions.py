@@ -16,31 +16,31 @@ import numpy as np
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.arrays import FloatArray
-from bwbayes.data.io.grid import clock
-from bwbayes.data.record import Record
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.untried import with_creep
-from bwbayes.report.figures import drawn
-from bwbayes.report.page import fragment
-from bwbayes.report.report import Figure, Report
-from bwbayes.report.run import prediction_report
-from bwbayes.report.screen import as_text
 
 # The fields that Prediction inherits are read where it stands.
-from bwbayes.results.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.results.prediction import (
+from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
+from bwbayes.prediction.prediction import (
     Start,
     forecast,
     predict_record,
     predict_windows,
     thinned,
 )
-from bwbayes.results.scores import Scores, score
-from bwbayes.results.verdict import Background, Verdict, assess
+from bwbayes.prediction.scores import Scores, score
+from bwbayes.record.io.grid import clock
+from bwbayes.record.record import Record
+from bwbayes.report.figures import drawn
+from bwbayes.report.page import fragment
+from bwbayes.report.report import Figure, Report
+from bwbayes.report.run import prediction_report
+from bwbayes.report.screen import as_text
 from bwbayes.shown import head
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def predict_after(
 
     ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name, by default the
     first. All else is as in :func:`predict_another`; see
-    :func:`~bwbayes.results.prediction.forecast`.
+    :func:`~bwbayes.prediction.prediction.forecast`.
     """
     seed, of = problem.config.seed, training_record(problem, of)
     record = problem.records[of]

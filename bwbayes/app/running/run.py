@@ -25,19 +25,19 @@ from bwbayes.app.fit.opening import finished
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.choosing import chosen_noise
-from bwbayes.app.running.drawing import Beside, beside
+from bwbayes.app.running.figure_worker import Beside, beside
 from bwbayes.app.running.fingerprint import fingerprint, require_its_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.errors import InputError
-from bwbayes.inference import pointfit
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.pointfit import PointFit
+from bwbayes.inference.map_estimate import PointFit
 from bwbayes.report.figures import save_pictures
+from bwbayes.report.outputs import write_bands, write_posterior, write_summary
 from bwbayes.report.page import render
 from bwbayes.report.saving import draw_pictures
-from bwbayes.results.outputs import write_bands, write_posterior, write_summary
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.sampler import first_chain, sample

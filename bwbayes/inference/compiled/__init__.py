@@ -17,7 +17,7 @@ from bwbayes.inference.compiled import kernels, lanes
 from bwbayes.inference.compiled.motion import physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
 from bwbayes.inference.noise import Noise
-from bwbayes.inference.table import ParameterTable
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 

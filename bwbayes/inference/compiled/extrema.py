@@ -3,7 +3,7 @@
 Which branch a sample lies on is the voltage's affair alone: :func:`plan_of` says it for all models
 and the whole record at once. What is left is to remember the displacement of each model at each
 turn, in slots, and to add what :meth:`everett
-<bwbayes.model.operators.memory.RemembersExtrema.everett>` says from there on.
+<bwbayes.model.operators.extremum_memory.RemembersExtrema.everett>` says from there on.
 
 The unknown start gives each model an extremum of its own. While the voltage stays below all of
 these, or has passed all, nothing is different; in between, models are told apart one by one.
@@ -19,7 +19,7 @@ from numba import njit
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import everett
-from bwbayes.model.operators.memory import Memory, RemembersExtrema
+from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
 __all__ = ["ExtremaPlan", "along_branches", "rows"]
 

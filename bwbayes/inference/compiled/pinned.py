@@ -13,12 +13,12 @@ from numba import njit
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.model.compiled import compiled
 from bwbayes.model.declaration import Values
-from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operators import walls as formulas
-from bwbayes.model.operators.one_state import StateMemory
 from bwbayes.model.operators.pinned import LONGEST, Pinned
 from bwbayes.model.operators.rosenbrock import STAGES
+from bwbayes.model.operators.scalar_memory import StateMemory
 from bwbayes.model.operators.walls import KNOTS, LINES
+from bwbayes.model.reversals import monotone_stretches
 
 __all__ = ["drive"]
 

@@ -22,7 +22,7 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import FormulaType, move
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.memory import RemembersExtrema
+from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep

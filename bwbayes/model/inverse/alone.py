@@ -17,12 +17,12 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
-from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.inverse.dynamics import undone
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.stretch import first_crossing, reached
 from bwbayes.model.linear import Recursion, Sections
 from bwbayes.model.operator import UNIT
+from bwbayes.model.reversals import monotone_stretches
 
 __all__ = ["SHORTEST", "One", "Path"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.operators.one_state import (
+from bwbayes.model.operators.scalar_memory import (
     OneState,
     alpha,
     beta,

@@ -31,7 +31,7 @@ from bwbayes.model.declaration import (
     refuse,
 )
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operators.one_state import (
+from bwbayes.model.operators.scalar_memory import (
     HIGHEST_CEILING,
     OneState,
     alpha,

@@ -18,7 +18,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal, refuse
-from bwbayes.model.operators.one_state import (
+from bwbayes.model.operators.scalar_memory import (
     HIGHEST_CEILING,
     OneState,
     alpha,

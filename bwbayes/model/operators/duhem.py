@@ -22,7 +22,7 @@ from bwbayes.model.declaration import (
 )
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import (
+from bwbayes.model.operators.scalar_memory import (
     OneState,
     alpha,
     beta,

@@ -16,7 +16,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal, refuse
 from bwbayes.model.elementwise import select
-from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
+from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 from bwbayes.model.operators.preisach import DENSITY
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values, refuse
-from bwbayes.model.operators.memory import INITIAL
+from bwbayes.model.operators.extremum_memory import INITIAL
 from bwbayes.model.operators.prandtl_ishlinskii import InParallel, of_gain
 
 __all__ = ["MaxwellSlip"]

@@ -13,7 +13,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, d, initial_anywhere
+from bwbayes.model.operators.scalar_memory import OneState, d, initial_anywhere
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 

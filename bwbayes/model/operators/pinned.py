@@ -20,10 +20,9 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values, check, lognormal, refuse
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.drive import monotone_stretches
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.one_state import OneState, StateMemory, initial
 from bwbayes.model.operators.rosenbrock import STAGES
+from bwbayes.model.operators.scalar_memory import OneState, StateMemory, initial
 from bwbayes.model.operators.walls import (
     KNOTS,
     LINES,
@@ -36,6 +35,7 @@ from bwbayes.model.operators.walls import (
     irreversible,
     moves_from,
 )
+from bwbayes.model.reversals import monotone_stretches
 
 __all__ = ["DomainWall", "JilesAtherton", "Pinned"]
 

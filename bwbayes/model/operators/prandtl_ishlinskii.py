@@ -22,7 +22,7 @@ from bwbayes.model.declaration import Context, Declaration, Values, lognormal, r
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.elementwise import anywhere, gone, select
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
+from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.step import HysteresisStep
 
 __all__ = [

@@ -16,7 +16,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.elementwise import gone
-from bwbayes.model.operators.memory import INITIAL, RemembersExtrema
+from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 
 __all__ = ["DENSITY", "Preisach"]

@@ -1,6 +1,6 @@
 """Pictures: of a run's loops, bands along time, parameters, chains and coverage, and of products.
 
-:func:`drawings` says what there is to see of a :class:`~bwbayes.results.result.Result`, and
+:func:`drawings` says what there is to see of a :class:`~bwbayes.report.result.Result`, and
 :func:`picture_of` draws it as PNG. This package alone knows matplotlib, Pillow and corner; it opens
 no window and touches no global figure. They are loaded when something is drawn: whoever leaves that
 to another process need not wait.
@@ -19,7 +19,7 @@ from urllib.parse import quote
 import numpy as np
 
 from bwbayes.report.figures.style import STYLE
-from bwbayes.results.result import Result
+from bwbayes.report.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
+from bwbayes.diagnosis.consistency import Agreement
 from bwbayes.report.figures.style import COLORS, MEAN_COLOR
-from bwbayes.results.agreement import Agreement
 
 __all__ = ["draw_agreement"]
 

@@ -9,10 +9,10 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bwbayes.calibration.evaluation import LIMIT, Calibration
+from bwbayes.calibration.replicates import EXTRA
+from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.figures.style import COLORS, axis_label, hide_unused, share_legend
-from bwbayes.results.bands import KINDS, LEVELS
-from bwbayes.results.calibration import LIMIT, Calibration
-from bwbayes.results.replicates import EXTRA
 
 __all__ = ["draw_coverage", "draw_ecdf", "draw_histograms"]
 

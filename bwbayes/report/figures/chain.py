@@ -19,7 +19,7 @@ from bwbayes.report.figures.style import (
     share_legend,
     starts,
 )
-from bwbayes.results.result import Result
+from bwbayes.report.result import Result
 
 __all__ = ["draw_corner", "draw_ranks", "draw_trace"]
 

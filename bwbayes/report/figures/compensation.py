@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter
 
 from bwbayes.arrays import FloatArray
+from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.figures.style import (
     BAND_COLORS,
     COLORS,
@@ -20,7 +21,6 @@ from bwbayes.report.figures.style import (
     share_legend,
     zigzag,
 )
-from bwbayes.results.bands import Bands, Kind
 
 __all__ = ["Command", "draw_error", "draw_loops", "draw_tracking"]
 

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures.style import COLORS, plain, title
-from bwbayes.results.bands import LEVELS, Bands
-from bwbayes.results.scores import Scores
 
 __all__ = ["draw_coverage"]
 

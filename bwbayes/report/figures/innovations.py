@@ -7,8 +7,8 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.report.figures.style import COLORS, MEAN_COLOR, MEASURED_COLOR
-from bwbayes.results.innovations import Innovations
 
 __all__ = ["draw_innovations"]
 

@@ -30,6 +30,7 @@ from bokeh.resources import INLINE
 from markupsafe import Markup
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.figures.loop import paths, polygons
 from bwbayes.report.figures.style import (
     BAND_COLORS,
@@ -43,8 +44,7 @@ from bwbayes.report.figures.style import (
     title,
 )
 from bwbayes.report.page import PagePlots, Script
-from bwbayes.results.bands import Bands, Kind
-from bwbayes.results.result import Result
+from bwbayes.report.result import Result
 
 __all__ = ["draw", "made", "scripts"]
 

@@ -11,6 +11,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.figures.style import (
     BAND_COLORS,
     BAND_NAMES,
@@ -20,7 +21,6 @@ from bwbayes.report.figures.style import (
     plain,
     title,
 )
-from bwbayes.results.bands import Bands, Kind
 
 __all__ = ["along", "draw_loop", "paths", "polygons"]
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from bwbayes.prediction.loops import Loops
 from bwbayes.report.figures.style import COLORS, share_legend
-from bwbayes.results.loops import Loops
 
 __all__ = ["draw_loops"]
 

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data import Record
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.record import Record
 from bwbayes.report.figures.style import COLORS, LEAD_IN_COLOR, MEASURED_COLOR, zigzag
 
 __all__ = ["record_drawings"]

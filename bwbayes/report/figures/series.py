@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from bwbayes.arrays import FloatArray
+from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures.style import (
     BAND_COLORS,
     BAND_NAMES,
@@ -25,7 +26,6 @@ from bwbayes.report.figures.style import (
     with_gaps,
     zigzag,
 )
-from bwbayes.results.bands import Bands
 
 __all__ = ["draw_bands"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
+from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.report.figures.style import MEAN_COLOR, MEASURED_COLOR
-from bwbayes.results.innovations import Innovations
 
 __all__ = ["draw_spectrum"]
 

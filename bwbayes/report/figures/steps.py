@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
+from bwbayes.prediction.steps import CREEP_FROM, StepResponse
 from bwbayes.report.figures.style import COLORS, plain, share_legend
-from bwbayes.results.steps import CREEP_FROM, StepResponse
 
 __all__ = ["draw_steps"]
 

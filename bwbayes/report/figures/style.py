@@ -14,8 +14,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
+from bwbayes.prediction.bands import Bands, Kind, titled
 from bwbayes.report.words import label_with_unit
-from bwbayes.results.bands import Bands, Kind, titled
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

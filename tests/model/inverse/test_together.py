@@ -16,7 +16,7 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.inverse.together import MANY
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.operators.one_state import StateMemory
+from bwbayes.model.operators.scalar_memory import StateMemory
 from tests.control import cases
 from tests.model.inverse.test_chain import CLOSE, SPAN, TABLE_1, smooth
 

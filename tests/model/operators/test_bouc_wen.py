@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.data.waveforms import signal
 from bwbayes.errors import InputError
 from bwbayes.model.operators.bouc_wen import ceiling, hysteresis
+from bwbayes.record.waveforms import signal
 from tests.model.references import Model, assert_close, by_integration, by_samples, random_walk
 
 ALPHA = 0.3575

@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis import identifiability
 from bwbayes.diagnosis.conflict import conflicts
 from bwbayes.errors import InputError
-from bwbayes.inference.pointfit import PointFit, fit
+from bwbayes.inference.map_estimate import PointFit, fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.registry import HYSTERESIS, made
-from bwbayes.results import identifiability
 from tests.inference.problems import decaying_sine, posterior_of
 from tests.model.operators.differential import RANGES, SPAN, prior_draws, w_of
 

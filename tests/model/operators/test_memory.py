@@ -17,9 +17,9 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
-from bwbayes.model.operators.memory import RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 from tests.model.operators.slow import Rows, by_extrema, by_plays, path, rows, run, walk

@@ -14,8 +14,8 @@ from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.one_state import OneState
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
+from bwbayes.model.operators.scalar_memory import OneState
 from tests.model.operators.differential import SPAN, prior_draws, w_of
 
 OPERATORS: dict[str, OneState] = {

@@ -1,0 +1,1 @@
+"""Simulation-based calibration: whether posteriors and bands are what they say."""

@@ -1,0 +1,138 @@
+"""Records made by the model itself: what a replicate is fitted to, and others that it predicts.
+
+A record that is not fitted starts as :mod:`bwbayes.prediction.initial_state` takes it to: from a
+hysteretic state that a running drive of some amplitude leaves, with the dynamics as far from rest
+as their prior says, and with an offset of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.noise import Noise
+from bwbayes.inference.posterior import Posterior
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.prediction.initial_state import Start, started
+from bwbayes.prediction.prediction import predict_record
+from bwbayes.record.record import Record, Window
+
+__all__ = ["OtherRecord", "Simulated", "covered"]
+
+
+class Simulated(NamedTuple):
+    """A record with its truth, and the displacement of its model (samples,), um."""
+
+    record: Record
+    model: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        model: FloatArray,
+        noise: Noise,
+        parameters: FloatArray,
+        generator: np.random.Generator,
+    ) -> Self:
+        """Add the noise of ``parameters`` (1, parameters); missing readings stay missing."""
+        discrepancy, sensor = noise.draw(parameters, model.size, generator)
+        truth = model + discrepancy
+        reading = truth + sensor
+        if record.displacement is not None:
+            reading[np.isnan(record.displacement)] = np.nan
+        return cls(replace(record, displacement=reading, truth=truth), model)
+
+    def target(self, kind: Kind) -> FloatArray:
+        """Return what a kind of band is for, (samples,), um: model, truth or reading."""
+        values = {
+            "parameter": self.model,
+            "displacement": self.record.truth,
+            "sensor": self.record.displacement,
+        }[kind]
+        assert values is not None
+        return values
+
+
+@dataclass(frozen=True)
+class OtherRecord:
+    """Another record to be simulated, and predicted from the posterior of the one that is fitted.
+
+    Parameters
+    ----------
+    record
+        Its voltage and times. Of its displacement only counts where there are readings; without
+        any it is a planned voltage, whose start nothing tells.
+    start
+        What is known of its start.
+    window
+        Part of it (start, stop) that is predicted, s; by default all.
+    like
+        The record that was fitted whose own parameters it takes where nothing tells its own; by
+        default the first.
+    """
+
+    record: Record
+    start: Start = field(default_factory=Start)
+    window: Window | None = None
+    like: str = ""
+
+    def simulated(
+        self, posterior: Posterior, theta: FloatArray, generator: np.random.Generator
+    ) -> Simulated:
+        """Simulate it with the true parameters (1, parameters).
+
+        ``posterior`` is that of the record that was made with them, which tells the ranges of
+        voltage and offset.
+        """
+        planned = replace(self.record, displacement=None, truth=None)
+        start_states = started(posterior, theta, planned, self.start, generator)
+        model = start_states.advance(planned.voltage)[0][0]
+        if self.start.own_offset and self.record.displacement is not None:
+            model = model + posterior.only.extent * generator.standard_normal()
+        noise, parameters = posterior.only.noise, posterior.only.table.noise(theta)
+        return Simulated.of(
+            replace(self.record, truth=None),
+            model,
+            noise.at(planned.interval),
+            parameters,
+            generator,
+        )
+
+    def predicted(
+        self,
+        posterior: Posterior,
+        draws: FloatArray,
+        record: Record,
+        generator: np.random.Generator,
+    ) -> tuple[Bands, slice]:
+        """Predict it, once it is simulated; return the bands, and the samples that are judged."""
+        if self.record.displacement is None:
+            record = replace(record, displacement=None)
+        bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
+        judged_window = slice(0, record.samples)
+        if self.window is not None:
+            judged_window = record.window_slice(*self.window)
+        return bands, slice(judged_window.start + bands.scored_from, judged_window.stop)
+
+
+def covered(
+    predictions: Sequence[tuple[Bands, Simulated, slice]],
+) -> Iterator[tuple[Kind, int, float]]:
+    """Yield the part of simulated records' samples that lie inside each kind and level of band.
+
+    The last samples of the bands are those of the slice of the record that they come with. Samples
+    without a reading do not count for the sensor band.
+    """
+    for kind, level in product(KINDS, LEVELS):
+        inside = []
+        for bands, simulated, window in predictions:
+            values = simulated.target(kind)[window]
+            low, high = (edge[kind, level][-values.size :] for edge in (bands.lower, bands.upper))
+            inside.append(((low <= values) & (values <= high))[np.isfinite(values)])
+        yield kind, level, float(np.mean(np.concatenate(inside)))

@@ -1,0 +1,398 @@
+"""Replicates: fit records whose truth is known, because it was drawn from the prior.
+
+Draw parameters from the prior, simulate a record with them, fit it as a run does: if prior, model,
+likelihood and sampler are right, the truth is one more draw from the posterior. So its rank among
+as many independent draws is any of the possible ones, each as likely as the next, and a band covers
+as much as it promises (simulation-based calibration). :func:`replicate` is a pure function of an
+experiment, a seed and a number, so it does not matter where, when or in which order replicates are
+made; :mod:`bwbayes.calibration.evaluation` judges many of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
+from typing import TypedDict
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.calibration.records import OtherRecord, Simulated, covered
+from bwbayes.errors import InputError, one_line
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.prediction.loops import at_level, crossings
+from bwbayes.prediction.prediction import predict_windows, thinned
+from bwbayes.record.record import Record
+from bwbayes.sampling.chain import draws
+from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.shown import brief
+
+__all__ = [
+    "EXTRA",
+    "RANKED",
+    "Entry",
+    "Experiment",
+    "Replicate",
+    "as_done",
+    "replicate",
+    "replicates",
+]
+
+# Draws that a truth is ranked among.
+RANKED = 199
+
+# What is ranked besides the free parameters.
+EXTRA = ("log_likelihood", "opening", "range")
+
+
+class Entry(TypedDict):
+    """A replicate as it is stored: ranks by statistic, coverage by band ("sensor 95")."""
+
+    number: int
+    converged: bool
+    stop_reason: str
+    steps: int
+    spacing: int
+    truth: dict[str, float]
+    ranks: dict[str, int]
+    covered: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What all replicates have in common.
+
+    Parameters
+    ----------
+    posterior
+        Voltage, training windows, model and prior that are fitted; of its displacement nothing is
+        used.
+    plan
+        How to sample.
+    held_out
+        Windows (slices of a record's voltage) for which bands are predicted and held against the
+        simulated record, by name.
+    belongs
+        The record that a held-out window is of, by the window's name; by default the first.
+    others
+        Other records, by name: made with the same truth, but with a start and an offset of their
+        own, and predicted with the parameters from the posterior.
+    source
+        Where truths and records come from, if not from ``posterior``; its parameters must include
+        those of ``posterior``. A calibration then must fail: it says how an analysis fares on
+        records that it is wrong about.
+
+    Raises
+    ------
+    InputError
+        No training voltage goes back and forth, so that there is no loop to measure.
+    """
+
+    __repr__ = brief
+
+    posterior: Posterior
+    plan: SamplingPlan
+    held_out: Mapping[str, slice] = field(default_factory=dict)
+    others: Mapping[str, OtherRecord] = field(default_factory=dict)
+    source: Posterior | None = None
+    belongs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.looped is None:
+            raise InputError(
+                "record: its training voltage does not go back and forth, so there is no loop to "
+                "calibrate; take another signal"
+            )
+
+    @property
+    def truth(self) -> Posterior:
+        """The posterior whose prior and model make truths and records."""
+        return self.source or self.posterior
+
+    @property
+    def statistics(self) -> tuple[str, ...]:
+        """Names of what is ranked."""
+        return (*self.posterior.names, *EXTRA)
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Names of the bands that are held against samples that were not fitted.
+
+        Those of the held-out windows together ("sensor 95"), and of each other record
+        ("NAME sensor 95").
+        """
+        names = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
+        fitted_names = names if self.held_out else []
+        return (*fitted_names, *(f"{other} {name}" for other in self.others for name in names))
+
+    @cached_property
+    def looped(self) -> tuple[str, FloatArray] | None:
+        """The first record that goes back and forth, and its voltage up to the last reading."""
+        for data in self.posterior.datasets:
+            path = data.voltage[: data.training[-1].stop]
+            if all(passage.size for passage in crossings(path)[1:]):
+                return data.name, path
+        return None
+
+    @property
+    def level(self) -> float:
+        """Voltage at which loops are measured, V."""
+        assert self.looped is not None
+        return crossings(self.looped[1])[0]
+
+    def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
+        """Log likelihood and the two loop measures of models θ, (models, 3).
+
+        The opening (um) is the model's displacement where the voltage falls through zero, or
+        through the middle of a drive beside it, less that where it rises through it, interpolated
+        between samples, each the mean over all passages; the range (um) is its largest less its
+        smallest displacement. Of several records, in the first that goes back and forth.
+        """
+        assert self.looped is not None
+        name, path = self.looped
+        displacement = posterior.simulate(theta, record=name)
+        level, *passages = crossings(path)
+        rising, falling = (at_level(displacement, path, rows, level) for rows in passages)
+        extent = np.ptp(displacement, axis=1)
+        return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Replicate:
+    """One record, made and fitted.
+
+    Parameters
+    ----------
+    number
+        Which replicate.
+    converged, stop_reason, steps
+        How the sampling ended, and its steps that count.
+    spacing
+        Steps between two draws of one walker, at least one autocorrelation time if the sampling has
+        converged. The draws below are a random choice of all that are left.
+    names
+        Names of the statistics.
+    truth
+        (statistics,) their true values.
+    draws
+        (RANKED, statistics) their posterior draws; empty if there are not so many.
+    covered
+        Part of the samples inside each of the experiment's bands, by name; empty without draws.
+    """
+
+    __repr__ = brief
+
+    number: int
+    converged: bool
+    stop_reason: str
+    steps: int
+    spacing: int
+    names: tuple[str, ...]
+    truth: FloatArray
+    draws: FloatArray
+    covered: Mapping[str, float]
+
+    @property
+    def ranks(self) -> IntArray:
+        """How many draws lie below the truth, (statistics,), from 0 to ``RANKED``."""
+        return np.asarray(np.sum(self.draws < self.truth, axis=0), dtype=np.int64)
+
+    def entry(self) -> Entry:
+        """Return what is stored of it."""
+        has_draws = len(self.draws) > 0
+        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
+        return Entry(
+            number=self.number,
+            converged=self.converged,
+            stop_reason=self.stop_reason,
+            steps=self.steps,
+            spacing=self.spacing,
+            truth=dict(zip(self.names, truth, strict=True)),
+            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
+            covered=dict(self.covered),
+        )
+
+
+def replicates(
+    experiment: Experiment, seed: int, numbers: Iterable[int], executor: Executor, together: int = 1
+) -> Iterator[Replicate]:
+    """Make the replicates of those numbers, and yield each as soon as it is done.
+
+    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of any
+    replicate.
+    """
+    return as_done(executor, together, replicate, ((experiment, seed, n) for n in numbers))
+
+
+def as_done[T](
+    executor: Executor,
+    together: int,
+    call: Callable[..., T],
+    arguments: Iterable[tuple[object, ...]],
+) -> Iterator[T]:
+    """Call a function with each of the arguments, and yield each result as soon as it is there.
+
+    Only so many ``together`` are under way, so that whoever stops waits for those alone.
+    """
+    waiting = iter(arguments)
+    running: set[Future[T]] = set()
+    while True:
+        running |= {executor.submit(call, *a) for a in islice(waiting, together - len(running))}
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        yield from (future.result() for future in done)
+
+
+def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
+    """Draw a truth, simulate its record, fit that, and compare.
+
+    Raises
+    ------
+    InputError
+        The prior draws a model without a finite displacement.
+    """
+    generator = np.random.default_rng([seed, number])
+    simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
+    theta, simulated = _simulated(experiment, simulating)
+    readings = {
+        name: record.displacement
+        for name, (record, _) in simulated.items()
+        if record.displacement is not None
+    }
+    posterior = experiment.posterior.with_readings(readings)
+    true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
+    names, truth = experiment.statistics, _statistics(experiment, posterior, true)[0]
+    covered_parts: dict[str, float] = {}
+    unranked = names, truth, np.empty((0, len(names))), covered_parts
+    # InputError, and what linear algebra raises: one record must not end the whole calibration.
+    try:
+        outcome, chained = _sampled(posterior, experiment.plan, fitting, sampling)
+    except ValueError as error:
+        return Replicate(number, False, one_line(str(error)), 0, 0, *unranked)
+    time = float(np.max(outcome.check.autocorrelation))
+    spacing, free = _independent(chained, time, choosing)
+    ended = number, outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
+    if len(free) < RANKED:
+        return Replicate(*ended, *unranked)
+    # Fewer draws than a run's, to save time.
+    flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
+    drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
+    inside = _held_out(experiment, posterior, flat, simulated, predicting)
+    inside |= _others(experiment, posterior, flat, theta, readings, others)
+    return Replicate(*ended, names, truth, drawn, inside)
+
+
+def _simulated(
+    experiment: Experiment, generator: np.random.Generator
+) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
+    """Draw a truth; return it by parameter, (1,) each, and its records by name."""
+    source = experiment.truth
+    theta = source.prior.theta(source.prior.draw(generator, 1))
+    column = source.table.columns(theta)
+    made = {}
+    for fitted, dataset, likelihood in zip(
+        experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
+    ):
+        record_theta = source.table.of(theta, dataset.name)
+        sd = likelihood.start_sd(record_theta)
+        model = likelihood.actuator.advance(
+            dataset.table.actuator(record_theta),
+            dataset.voltage,
+            unrest=sd * generator.standard_normal(sd.shape),
+            from_rest=dataset.from_rest,
+        )[0][0]
+        record = Record(dataset.voltage, fitted.displacement, dataset.actuator.interval)
+        noise = dataset.table.noise(record_theta)
+        made[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
+    return column, made
+
+
+def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
+    """Free parameters and measures of models θ, (models, statistics)."""
+    free = [posterior.prior.names.index(name) for name in posterior.names]
+    return np.concatenate([theta[:, free], experiment.measures(posterior, theta)], axis=1)
+
+
+def _sampled(
+    posterior: Posterior,
+    plan: SamplingPlan,
+    fitting: np.random.Generator,
+    sampling: np.random.Generator,
+) -> tuple[Outcome, FloatArray]:
+    """Fit and sample by the path of a run; the draws are (steps, ensembles, walkers, free)."""
+    point = pointfit.fit(posterior, fitting)
+    chain = first_chain(posterior, point, plan, sampling)
+    with ThreadPoolExecutor(1) as executor:
+        outcome = sample(posterior, plan, chain, executor)
+    return outcome, draws(posterior, chain)
+
+
+def _independent(
+    chained: FloatArray, time: float, generator: np.random.Generator
+) -> tuple[int, FloatArray]:
+    """Choose ``RANKED`` draws, or all, as good as independent: spacing in steps, (RANKED, free).
+
+    Every walker keeps one step in as many as the longest autocorrelation time has; of what is left
+    of all walkers some are chosen at random. As two draws of a chain are correlated by 1/ESS on
+    average, that much of the ranks' evenness is lost, and no more.
+    """
+    steps, ensembles, walkers, free = chained.shape
+    # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
+    longest = steps * ensembles * walkers // RANKED
+    spacing = max(min(math.ceil(time) if math.isfinite(time) else 1, longest), 1)
+    return spacing, thinned(chained[::-spacing].reshape(-1, free), generator, RANKED)
+
+
+def _held_out(
+    experiment: Experiment,
+    posterior: Posterior,
+    draws: FloatArray,
+    simulated: Mapping[str, Simulated],
+    generator: np.random.Generator,
+) -> dict[str, float]:
+    """Part of the held-out samples, of all windows together, inside each band."""
+    predictions, first = [], posterior.table.records[0]
+    for name, single, record_draws in posterior.each(draws):
+        windows = {
+            window: samples
+            for window, samples in experiment.held_out.items()
+            if experiment.belongs.get(window, first) == name
+        }
+        if windows:
+            record = simulated[name]
+            bands = predict_windows(single, record_draws, record.record, windows, generator)
+            predictions += [(b, record, w) for b, w in zip(bands, windows.values(), strict=True)]
+    if not predictions:
+        return {}
+    return {f"{kind} {level}": share for kind, level, share in covered(predictions)}
+
+
+def _others(
+    experiment: Experiment,
+    posterior: Posterior,
+    draws: FloatArray,
+    theta: Mapping[str, FloatArray],
+    readings: Mapping[str, FloatArray],
+    generator: np.random.Generator,
+) -> dict[str, float]:
+    """Make the other records with the same truth; part of their samples inside each band."""
+    source = experiment.truth.with_readings(readings)
+    true = np.stack([theta[name] for name in source.prior.names], axis=1)
+    inside = {}
+    for name, other in experiment.others.items():
+        like = other.like or posterior.table.records[0]
+        simulated = other.simulated(source.alone(like), source.table.of(true, like), generator)
+        single, record_draws = posterior.alone(like), posterior.its(draws, like)
+        bands, window = other.predicted(single, record_draws, simulated.record, generator)
+        for kind, level, share in covered([(bands, simulated, window)]):
+            inside[f"{name} {kind} {level}"] = share
+    return inside

@@ -1,8 +1,0 @@
-"""Voltage and displacement records: what they are, how they are read, checked and written."""
-
-from __future__ import annotations
-
-from bwbayes.data.io.formats import read_record, write_record
-from bwbayes.data.record import Record, Split
-
-__all__ = ["Record", "Split", "read_record", "write_record"]

@@ -1,0 +1,236 @@
+"""Whether records that were fitted jointly agree: each under the joint fit, and under its own.
+
+A joint fit takes its records for those of one actuator. If one of them was measured with another
+gain or another mounting, the joint posterior lies between them and fits none. So each record is
+fitted alone, by a point fit with the joint fit's noise, and two things are compared with the joint
+one: its residuals, and where the shared parameters of the actuator are.
+
+With m and C mean and covariance of its parameters given all records, m_r and C_r given record r
+alone, and ℓ its log likelihood,
+
+    D = 2 [ℓ(m_r) − ℓ(m) + ∇ℓ(m_r)ᵀ (m − m_r)]
+
+is what the joint fit costs the record, less what the prior at m_r has cost it already. Were all
+normal, D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
+If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C): the
+covariance of a mean learned from more is larger by what the posterior's is smaller (the law of
+total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
+A (C_r − C): what the record does not tell, or tells alone, has no weight. That sum is nearly a
+multiple of a χ² variable, with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946;
+at p = 1e-3 off by less than a factor of two). With (m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in
+Hausman's test, a bent posterior would pass for a disagreement: D is a difference of likelihoods, in
+whatever coordinates.
+
+Another noise shows elsewhere: the innovations of a record at the joint mode have a root mean square
+of 1 if the noise that the records share is its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from scipy import linalg
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.innovations import innovations
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.posterior import Posterior
+
+__all__ = ["Agreement", "agreements", "disagreements"]
+
+# Probability of a false alarm for a record.
+ALARM = 1e-3
+
+# Step along m − m_r for the prior's slope there, as a part of it.
+STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How a record of a joint fit agrees with the others.
+
+    Parameters
+    ----------
+    joint_um, own_um
+        Root mean square of its residuals at the joint mode and at that of a fit of it alone, um.
+    distance, degrees
+        D in units in which it is a χ² variable, and its degrees of freedom; both zero if nothing
+        can be compared.
+    moved
+        The shared parameter that is farthest off, and by how many sds of the difference; empty if
+        nothing can be compared.
+    size
+        Root mean square of its innovations at the joint mode, and ``readings`` how many there are.
+    time, joint, own
+        (readings,) in s and um: the residuals, thinned.
+    """
+
+    joint_um: float
+    own_um: float
+    distance: float
+    degrees: float
+    moved: tuple[str, float]
+    size: float
+    readings: int
+    time: FloatArray
+    joint: FloatArray
+    own: FloatArray
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger distance if all records are of one actuator."""
+        return float(scipy.stats.chi2.sf(self.distance, self.degrees)) if self.degrees else 1.0
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the record does not go with the others, beyond chance and so that it matters."""
+        return self.p_value < ALARM and self.joint_um > 1.02 * self.own_um
+
+    @property
+    def noisier(self) -> bool:
+        """Whether its noise is another one than the records share, beyond chance and by much.
+
+        The discrepancy of a short record may be a fifth smaller or larger by chance.
+        """
+        below = scipy.stats.chi2.cdf(self.readings * self.size**2, self.readings)
+        return min(below, 1 - below) < ALARM / 2 and not 0.8 < self.size < 1.25
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it."""
+        return {
+            "residual_joint_um": self.joint_um,
+            "residual_own_um": self.own_um,
+            "chi_square": self.distance,
+            "degrees_of_freedom": self.degrees,
+            "p_value": self.p_value,
+            "farthest": self.moved[0],
+            "farthest_sds": self.moved[1],
+            "agrees": not self.disagrees,
+            "innovations_rms": self.size,
+        }
+
+
+def agreements(
+    posterior: Posterior,
+    point: PointFit,
+    generator: np.random.Generator,
+    begin: Mapping[str, float] | None = None,
+) -> dict[str, Agreement]:
+    """Compare each record of a joint posterior with all of them; nothing, if there is one alone.
+
+    Parameters
+    ----------
+    posterior
+        The joint posterior.
+    point
+        Its point fit.
+    generator
+        Starts the records' own point fits.
+    begin
+        Time of each record's first sample, s, by name; by default 0.
+    """
+    if len(posterior.datasets) == 1:
+        return {}
+    free, _ = posterior.prior.constrain(point.mode[np.newaxis])
+    compared = {}
+    for name, single, joint_free in posterior.each(free):
+        with_noise = _with_noise(single, joint_free)
+        own = pointfit.fit(with_noise, generator)
+        own_free, _ = with_noise.prior.constrain(own.mode[np.newaxis])
+        series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
+        own_residual = innovations(with_noise, own_free[0]).residual
+        # Residuals are kept for pictures, some 2,000 of them.
+        step = slice(None, None, -(-series.time.size // 2000))
+        compared[name] = Agreement(
+            float(np.sqrt(np.mean(series.residual**2))),
+            float(np.sqrt(np.mean(own_residual**2))),
+            *_distance(posterior, point, with_noise, own),
+            float(np.sqrt(np.mean(series.white**2))),
+            series.time.size,
+            series.time[step],
+            series.residual[step],
+            own_residual[step],
+        )
+    return compared
+
+
+def _with_noise(alone: Posterior, free: FloatArray) -> Posterior:
+    """Return the posterior of a record with the noise of some free parameters (1, free) known."""
+    theta, physical = alone.prior.theta(free)[0], alone.table.physical
+    parameters = (
+        p if p.name in physical else replace(p, prior=None, fixed=float(value))
+        for p, value in zip(alone.prior.parameters, theta, strict=True)
+    )
+    return replace(alone, prior=JointPrior(parameters, alone.prior.constraint))
+
+
+def _distance(
+    posterior: Posterior, point: PointFit, single: Posterior, own: PointFit
+) -> tuple[float, float, tuple[str, float]]:
+    """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off."""
+    physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
+    columns = [
+        posterior.names.index(posterior.table.name_of(name, single.only.name))
+        for name in single.names
+    ]
+    rows = [physical.index(column) for column in columns]
+    # The covariance given the noise, as that of the record's own fit is.
+    precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
+    taken = own.covariance - linalg.inv(precision)[np.ix_(rows, rows)]
+    added = linalg.inv(own.covariance) - linalg.inv(own.prior_covariance)
+    weights = np.maximum(linalg.eigvals(added @ taken).real, 0.0)
+    # What a record tells by itself alone differs by rounding: then nothing can be compared.
+    smallest = 0.05
+    if not weights.sum() > smallest:
+        return 0.0, 0.0, ("", 0.0)
+    unit = float(np.sum(weights**2) / np.sum(weights))
+    spread = np.sqrt(np.maximum(np.diag(taken), smallest * np.diag(own.covariance)))
+    shifts = {
+        name: float(shift)
+        for name, shift in zip(single.names, (own.mode - point.mode[columns]) / spread, strict=True)
+        if name in posterior.names
+    }
+    farthest = max(shifts, key=lambda name: abs(shifts[name]))
+    cost = max(_cost(single, own.mode, point.mode[columns]), 0.0)
+    return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
+
+
+def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
+    """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
+    step = STEP * (joint - coordinates)
+    places = np.stack([coordinates, joint, coordinates + step, coordinates - step])
+    _, log_prior = alone.prior.constrain(places)
+    log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
+    # At the mode, the likelihood's slope is the prior's turned round.
+    slope = (log_prior[3] - log_prior[2]) / (2 * STEP)
+    return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
+
+
+def disagreements(compared: Mapping[str, Agreement]) -> Iterator[Finding]:
+    """Yield the records that do not go with the others."""
+    for name, record in compared.items():
+        parameter, away = record.moved
+        if record.disagrees:
+            yield Finding(
+                name,
+                f"is inconsistent with the other records: its residual is {record.joint_um:.3g} um "
+                f"rms in the joint fit and {record.own_um:.3g} um in a fit of its own, where "
+                f"{parameter} is {abs(away):.1f} SD {'higher' if away > 0 else 'lower'} "
+                f"(chi-square {record.distance:.4g} with {record.degrees:.3g} degrees of freedom, "
+                f"p = {record.p_value:.1g})",
+                f'fit it alone, or set model.per_record = ["{parameter}"]',
+            )
+        if record.noisier:
+            yield Finding(
+                name,
+                f"has another noise than the records share: its innovations are {record.size:.2g} "
+                "times as large as they should be",
+                'set model.per_record = ["sensor_sd", "discrepancy_sd"]',
+            )

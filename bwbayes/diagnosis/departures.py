@@ -1,0 +1,253 @@
+"""How readings may depart from their bands: too few covered, too far off, to one side, too near.
+
+What luck alone may do to a mean of many readings depends on how many independent ones they are
+worth, and that is far fewer than there are: a discrepancy forgets slowly, and the parameters' error
+is one and the same all along. The bands themselves say how large each part is. Where luck may do
+it too, a departure comes with the chance of that on a record that the fitted model describes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from scipy.special import betainc, ndtri
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.model.reversals import rate
+from bwbayes.prediction.bands import LEVELS, Bands, Kind
+from bwbayes.record.io.grid import clock
+
+__all__ = ["Standardized", "percent"]
+
+# False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
+# Above the first a failure may be luck, and below the second a success may be none.
+ALARM, DOUBT = 2e-4, 0.01
+
+# Coverage counts as off only where its odds are off by this factor: 95 % is not 92.6 %, but 94.
+ODDS = 1.5
+
+
+@dataclass(frozen=True)
+class Standardized:
+    """Judged readings against their bands, and how many independent ones they are worth.
+
+    ``z`` (readings,) are residuals over the sensor band's sd; ``mean_size`` and ``square_size`` are
+    how many independent readings the record is worth to the mean of z and to that of z².
+    ``varying`` is z about its mean, scaled to a variance of one, worth ``varying_size`` readings to
+    that of its square; ``common`` is the part of the band's variance that is one and the same for
+    all readings, such as an offset's. ``noise_log_sd`` is the sd of the logarithm of the noise's
+    sd.
+    """
+
+    bands: Bands
+    judged: BoolArray
+    z: FloatArray
+    mean_size: float
+    square_size: float
+    varying: FloatArray
+    varying_size: float
+    common: float
+    noise_log_sd: float
+
+    @classmethod
+    def of(
+        cls, bands: Bands, judged: BoolArray, memory: float, noise_log_sd: float
+    ) -> Standardized:
+        """Take the residuals over their sd, and work out how many independent ones they are worth.
+
+        With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in
+        the variance, z at two samples t apart has the correlation c + p + q exp(-t/τ), and z² that
+        squared. About its mean the common error drops out. ``memory`` is τ, s.
+        """
+        assert bands.measured is not None
+
+        def sd(kind: Kind) -> FloatArray:
+            width = (bands.upper[kind, 90] - bands.lower[kind, 90])[judged]
+            half: FloatArray = width / (2 * ndtri(0.95))
+            return half
+
+        sensor = np.maximum(sd("sensor"), np.finfo(float).tiny)
+        z = (bands.measured - bands.mean)[judged] / sensor
+        total = float(np.mean(sensor**2))
+        p = min(float(np.mean(sd("parameter") ** 2)) / total, 1.0)
+        q = min(float(np.mean(sd("displacement") ** 2)) / total, 1.0) - p
+        q = max(q, 0.0) if memory > 0 else 0.0
+        once, twice = _mean_correlations(judged, bands.interval, memory)
+        single = 1 / z.size
+        common = min(bands.common_sd**2 / total, p)
+
+        def of_squares(p: float, q: float) -> float:
+            """Mean correlation of all pairs of squares."""
+            return p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * single
+
+        mean = p + q * once + (1 - p - q) * single
+        shared = (p - common) + q * (1 - once) + (1 - p - q) * (1 - single)
+        varying = of_squares(min((p - common) / shared, 1.0), min(q * (1 - once) / shared, 1.0))
+        return cls(
+            bands,
+            judged,
+            z,
+            1 / mean,
+            1 / of_squares(p, q),
+            (z - np.mean(z)) / np.sqrt(shared),
+            1 / varying,
+            common,
+            noise_log_sd,
+        )
+
+    @property
+    def noise_size(self) -> float:
+        """Independent readings that would tell the noise's sd as well as the fit has done."""
+        return 1 / max(2 * self.noise_log_sd**2, 1e-9)
+
+    @property
+    def effective_size(self) -> float:
+        """Independent readings, about their mean, that record and fit together are worth."""
+        return 1 / (1 / self.varying_size + 1 / self.noise_size)
+
+    def chances(self) -> list[tuple[str, float]]:
+        """Return what is off in coverage, size and bias, with the chance that luck does it.
+
+        Of each the least likely, if its chance is below ``DOUBT``.
+        """
+        departures = (self._coverage(), self._size(), self._bias())
+        rarest = [min(found, key=lambda pair: pair[1], default=("", 1.0)) for found in departures]
+        return [(text, chance) for text, chance in rarest if chance < DOUBT]
+
+    def reasons(self, span: tuple[float, float], extent: float) -> list[str]:
+        """Return why validation fails; nothing if it does not.
+
+        ``span`` are the lowest and the highest voltage of training, V, ``extent`` is the range of
+        its readings, um.
+        """
+        return [
+            *self._reversed(span),
+            *(text for text, chance in self.chances() if chance < ALARM),
+            *self._extremes(),
+            *(self._misfit(extent) if self.bands.training else ()),
+            *self._too_wide(),
+        ]
+
+    @property
+    def _residual(self) -> FloatArray:
+        assert self.bands.measured is not None
+        residual: FloatArray = (self.bands.measured - self.bands.mean)[self.judged]
+        return residual
+
+    def _coverage(self) -> Iterator[tuple[str, float]]:
+        """Find levels at which fewer readings lie in the sensor band than stated."""
+        assert self.bands.measured is not None
+        # Factors on the noise's sd, evenly probable, that the fit allows.
+        chance = (np.arange(200) + 0.5) / 200
+        scales = np.sqrt(self.noise_size / scipy.stats.chi2.ppf(chance, self.noise_size))
+        for level in reversed(LEVELS):
+            hits = self.bands.covers("sensor", level, self.bands.measured)[self.judged]
+            covered, nominal = float(np.mean(hits)), level / 100
+            odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
+            if odds >= 1 / ODDS:
+                continue
+            # The binomial distribution function, for a number of readings that is not whole.
+            inside = covered * self.square_size
+            outside = 2 * scipy.stats.norm.sf(scipy.stats.norm.isf((1 - nominal) / 2) / scales)
+            chances = betainc(self.square_size - inside, inside + 1, outside)
+            text = f"the {level}% sensor band covers {percent(covered)} of readings"
+            yield text, float(np.mean(chances))
+
+    def _size(self) -> Iterator[tuple[str, float]]:
+        """Find residuals that are larger than the sensor band, as they are and about their mean."""
+        for z, size, about in (
+            (self.z, self.square_size, ""),
+            (self.varying, self.varying_size, " about their mean"),
+        ):
+            square = float(np.mean(z**2))
+            if square > ODDS:
+                ratio = f"{np.sqrt(square):.2g} times as large{about}"
+                text = f"the residuals are {ratio} as the sensor band predicts"
+                yield text, float(scipy.stats.f.sf(square, size, self.noise_size))
+
+    def _bias(self) -> Iterator[tuple[str, float]]:
+        """Find a mean of half an sd or more; a smaller one cannot be seen in the coverage."""
+        mean = float(np.mean(self.z))
+        if abs(mean) >= 0.5:
+            errors = abs(mean) * np.sqrt(self.mean_size)
+            residual = float(np.mean(self._residual))
+            text = (
+                f"the readings lie {residual:+.3g} um off the mean, {errors:.2g} of its standard "
+                "errors"
+            )
+            # As sure as the size of the noise is.
+            yield text, 2 * float(scipy.stats.t.sf(errors, self.noise_size))
+
+    def _reversed(self, span: tuple[float, float]) -> Iterator[str]:
+        """Find readings that go against the voltage, where it goes up and down by enough.
+
+        A lag of many seconds and a gain beyond all reason can follow even these.
+        """
+        bands, judged = self.bands, self.judged
+        assert bands.measured is not None
+        change = rate(bands.voltage, bands.interval)[judged] * bands.interval
+        travel = min(float(np.sum(np.maximum(sign * change, 0))) for sign in (1, -1))
+        if travel < (span[1] - span[0]) / 2 or not np.ptp(bands.measured[judged]):
+            return
+        correlation = float(np.corrcoef(bands.voltage[judged], bands.measured[judged])[0, 1])
+        if correlation < -0.5:
+            yield f"the readings fall where the voltage rises (correlation {correlation:.2f})"
+
+    def _extremes(self) -> Iterator[str]:
+        """Find five readings six sds off: a good one is so once in five hundred million.
+
+        So a bad start or spikes are not lost in a long record.
+        """
+        # A noise whose size is hardly known may well be larger here.
+        rows = np.flatnonzero(np.abs(self.z) > 6 * np.exp(2 * self.noise_log_sd))
+        if rows.size >= 5:
+            first = clock(self.bands.time[self.judged][rows[0]], self.bands.interval)
+            yield (
+                f"{rows.size} readings lie more than 6 SDs off the mean, first at {first} s, the "
+                f"farthest {np.max(np.abs(self.z)):.2g} SDs"
+            )
+
+    def _misfit(self, extent: float) -> Iterator[str]:
+        """Find a fit that misses its own readings by more than a sensor's noise would.
+
+        By 5 % of the range: a Bouc-Wen model misses one or two percent of an actuator's
+        displacement. The range is that of all that was fitted: a short window's may be small.
+        """
+        assert self.bands.measured is not None
+        residual = self._residual
+        extent = max(extent, float(np.ptp(self.bands.measured[self.judged])))
+        steps = np.diff(residual)
+        # The median of a χ² variable of one degree of freedom is 0.4549.
+        fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
+        rms = float(np.sqrt(np.mean(residual**2)))
+        # Of a sensor's noise, which no model follows, nothing is the model's fault.
+        slow = np.sqrt(max(rms**2 - fast**2, 0.0))
+        if slow > max(0.05 * extent, fast) and extent:
+            yield f"NRMSE {percent(rms / extent)} on the training readings"
+
+    def _too_wide(self) -> Iterator[str]:
+        """Find residuals that are half as large as the sensor band says, or smaller."""
+        square = float(np.mean(self.z**2))
+        chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
+        if square < 0.25 and chance < ALARM:
+            yield f"the sensor band is {1 / max(np.sqrt(square), 1e-9):.2g} times too wide"
+
+
+def _mean_correlations(judged: BoolArray, interval: float, memory: float) -> tuple[float, float]:
+    """Mean correlation, and mean squared one, of all pairs of readings that forget by exp(-t/τ)."""
+    present = judged[slice(*np.flatnonzero(judged)[[0, -1]] + [0, 1])].astype(np.float64)
+    # Pairs of judged samples at each lag, those in either order.
+    pairs = np.rint(scipy.signal.correlate(present, present, method="fft")[present.size - 1 :])
+    pairs[1:] *= 2
+    if memory <= 0:
+        return float(pairs[0] / pairs.sum()), float(pairs[0] / pairs.sum())
+    decay = np.exp(-interval * np.arange(pairs.size) / memory)
+    return float(pairs @ decay / pairs.sum()), float(pairs @ decay**2 / pairs.sum())
+
+
+def percent(share: float) -> str:
+    """Return a part in percent."""
+    return f"{100 * share:.3g}%"

@@ -1,0 +1,165 @@
+"""What a record cannot tell: combinations of hysteresis parameters that stay as the prior had them.
+
+Every Bouc-Wen fit leaves a discrepancy of a percent of the range or so, and it comes back whenever
+the voltage takes the same way again: a hundred periods of one sine show one loop, not a hundred.
+So each distinct branch of the voltage counts once here, under a discrepancy of that percent, and
+a combination of parameters is named when a third of its prior sd or more would be left. The
+posterior itself, which trusts the noise model, may look surer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy import linalg
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.model.reversals import monotone_stretches, turning_points
+
+__all__ = ["LEFT_OPEN", "combined", "percent", "spectrum", "stretches_once", "undetermined"]
+
+# A combination is undetermined when this part of its prior sd or more is left.
+LEFT_OPEN = 1 / 3
+
+# Step of a slope, in prior sds.
+STEP = 1e-5
+
+
+def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
+    """Yield combinations of loop parameters that the record does not determine.
+
+    Each says how much of the prior's sd is left at a point fit, and what to measure.
+    """
+    names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
+    if not names:
+        return
+    parts, directions = spectrum(posterior, point)
+    for i in np.flatnonzero(parts > LEFT_OPEN):
+        text = f"{combined(directions[:, i], names)}: {percent(parts[i])} of the prior's SD remains"
+        if i + 1 < parts.size:
+            text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
+        yield Finding("not identifiable", text, _advice(posterior, point))
+
+
+def percent(share: float) -> str:
+    """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
+    return "all" if share >= 0.995 else f"{share:.0%}"
+
+
+def _advice(posterior: Posterior, point: PointFit) -> str:
+    """Say what to measure instead."""
+    windows = [data.voltage[window] for data in posterior.datasets for window in data.training]
+    half = max(float(np.ptp(voltage)) / 2 for voltage in windows)
+    swings = np.concatenate([np.abs(np.diff(v[turning_points(v)])) for v in windows])
+    free = posterior.prior.constrain(point.mode[np.newaxis])[0]
+    _, single, record_free = next(posterior.each(free))
+    columns = single.only.table.columns(single.prior.theta(record_free))
+    opening = single.only.actuator.hysteresis.opening(columns, half)
+    # A loop closes where its opening is about one; below 0.3 it hardly opens.
+    if opening is not None and opening[0] < 0.3:
+        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
+    if swings.size < 2 or swings.min() > 0.8 * swings.max():
+        return "vary the amplitude: let it decay to a tenth over ten periods"
+    return "add larger and smaller amplitudes"
+
+
+def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
+    """Return the part of the prior sd that is left along each principal direction of the loop.
+
+    The parts (loop parameters,), the largest first, and the directions as columns, in units of
+    each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
+    """
+    prior, columns = posterior.prior, _columns(posterior, posterior.table.physical)
+    free, _ = prior.constrain(point.mode[np.newaxis])
+    theta = prior.theta(free)
+    values = dict(zip(prior.names, theta[0], strict=True))
+    # Each parameter a step above and below the mode.
+    steps = np.zeros((len(columns), free.shape[1]))
+    steps[np.arange(len(columns)), columns] = STEP
+    steps[:, columns] *= [_prior_sd(prior, prior.free[column], values) for column in columns]
+    stepped = prior.theta(np.concatenate([free + steps, free - steps]))
+    information = sum(_information(posterior, data, theta, stepped) for data in posterior.datasets)
+    remaining = linalg.inv(np.eye(len(columns)) + information)
+    loop = [columns.index(column) for column in _columns(posterior, posterior.table.loop)]
+    variance, directions = linalg.eigh(remaining[np.ix_(loop, loop)])
+    return np.sqrt(variance[::-1]), directions[:, ::-1]
+
+
+def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
+    return [i for i, name in enumerate(posterior.names) if name in names]
+
+
+def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float]) -> float:
+    """Return a parameter's prior sd around its value in ``values``."""
+    assert parameter.prior is not None
+    columns = {name: np.array([value]) for name, value in values.items()}
+    lower, upper = parameter.limits(prior.seen(columns, parameter.record))
+    if np.isfinite(lower).all() and np.isfinite(upper).all():
+        # What the bounds leave to a parameter of which nothing else is known.
+        return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))
+    # Half of the central 68 % stands for the sd: some distributions have none.
+    low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
+    if parameter.positive:
+        return float(values[parameter.name] * np.log(high / low) / 2)
+    return (high - low) / 2
+
+
+def _information(
+    posterior: Posterior, dataset: Dataset, theta: FloatArray, stepped: FloatArray
+) -> FloatArray:
+    """Fisher information (physical, physical) of a record, each distinct branch counted once."""
+    # Change of the displacement per prior sd of each parameter, (physical, samples), um.
+    plus, minus = np.split(posterior.simulate(stepped, record=dataset.name), 2)
+    slopes = (plus - minus) / (2 * STEP)
+    noise_parameters = dataset.table.noise(posterior.table.of(theta, dataset.name))
+    _, sensor = dataset.noise.marginal_sd(noise_parameters)
+    rows = np.concatenate([np.arange(w.start, w.stop) for w in dataset.training])
+    weights, duration = stretches_once(dataset.voltage, rows)
+    # A percent of the range, which changes along the path: over about half a branch.
+    noise = DiscrepancyNoise(1.0)
+    values = np.array([[sensor[0], 0.01 * dataset.extent, duration / 2]])
+    total = np.zeros((len(slopes), len(slopes)))
+    for window in dataset.training:
+        (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])
+        total += (white * weights[window]) @ white.T
+    return total
+
+
+def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
+    """Weight of each sample, one over how often ``rows`` have its branch; mean samples a branch.
+
+    Branches of one direction are the same if they start within a percent of the voltage's range.
+    One that ends early, as a record's last one, counts as a part.
+    """
+    stretches = list(monotone_stretches(voltage))
+    starts = np.array([[voltage[s.first], s.direction] for s in stretches])
+    starts[:, 0] = np.round((starts[:, 0] - voltage.min()) / (0.01 * np.ptp(voltage) or 1))
+    _, kind = np.unique(starts, axis=0, return_inverse=True)
+    used = np.bincount(rows, minlength=voltage.size)
+    samples = np.array([np.sum(used[s.first + 1 : s.last + 1]) for s in stretches])
+    longest = np.zeros(kind.max() + 1)
+    np.maximum.at(longest, kind, samples)
+    share = np.maximum(longest, 1) / np.maximum(np.bincount(kind, samples), 1)
+    weights = np.empty(voltage.size)
+    for stretch, weight in zip(stretches, share[kind], strict=True):
+        weights[stretch.first : stretch.last + 1] = weight
+    return weights, voltage.size / len(stretches)
+
+
+def combined(direction: FloatArray, names: Sequence[str]) -> str:
+    """Name a direction (names,) in words, the largest component first.
+
+    ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
+    while the other falls; components below a fifth of the largest are left out.
+    """
+    shares = direction / direction[np.argmax(np.abs(direction))]
+    first, *others = [i for i in np.argsort(-np.abs(shares), kind="stable") if abs(shares[i]) > 0.2]
+    return " ".join(
+        [names[first], *(f"{'with' if shares[i] > 0 else 'against'} {names[i]}" for i in others)]
+    )

@@ -1,0 +1,191 @@
+"""Innovations: what each reading adds to those before it, and whether that is pure chance.
+
+Where model and noise model are right, a residual less what the readings before it predict, over
+its standard deviation, is an independent standard normal number. Two things show in these
+innovations that the residuals hide: whether they are white, and whether their mean depends on the
+voltage (its rate, its level, its direction). Oscillations, heavy tails and noise that grows are
+explanations (:mod:`bwbayes.diagnosis`). A departure is reported where it is both beyond chance and
+large enough to matter; on a record that the model describes this happens to fewer than one in a
+hundred.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.noise import Noise
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.reversals import rate
+from bwbayes.shown import brief
+
+__all__ = ["Innovations", "departures", "innovations"]
+
+# Probability of a false alarm of each of the tests, of which there are about ten.
+ALARM = 1e-4
+
+# Fewer innovations show nothing.
+MIN_READINGS = 100
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Normalized innovations of the readings that were fitted, and the voltage there.
+
+    All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
+    ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
+    the noise model for that interval, and ``parameters`` (parameters,) are its own.
+    """
+
+    __repr__ = brief
+
+    time: FloatArray
+    white: FloatArray
+    voltage: FloatArray
+    rate: FloatArray
+    residual: FloatArray
+    interval: float
+    noise: Noise | None = None
+    parameters: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def noise_density(self, frequency: FloatArray) -> FloatArray | None:
+        """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided.
+
+        None without a noise model.
+        """
+        if self.noise is None:
+            return None
+        return self.noise.density(self.parameters[np.newaxis], frequency)
+
+    def residual_density(self) -> tuple[FloatArray, FloatArray]:
+        """Return frequencies (frequencies,), Hz, and the residual's density there, um/√Hz.
+
+        One-sided, by Welch's method with four segments, of 2¹⁴ samples at most; missing readings
+        count as zero.
+        """
+        rows = np.rint((self.time - self.time[0]) / self.interval).astype(np.int64)
+        samples = int(rows[-1]) + 1
+        residual = np.zeros(samples)
+        residual[rows] = self.residual - np.mean(self.residual)
+        length = min(max(samples // 4, 1), 1 << 14)
+        frequency, power = scipy.signal.welch(residual, 1 / self.interval, nperseg=length)
+        return frequency[1:], np.sqrt(power * samples / rows.size)[1:]
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Autocorrelation at lags 1 to 40, (lags,)."""
+        centered = self.white - np.mean(self.white)
+        total = float(np.sum(centered**2))
+        lags = range(1, min(40, centered.size - 1) + 1)
+        return np.array([np.sum(centered[lag:] * centered[:-lag]) / total for lag in lags])
+
+    def by(self, quantity: str) -> tuple[tuple[str, FloatArray], ...]:
+        """Return innovations by the voltage's "rate", "voltage" or "direction", each with a name.
+
+        By its direction there are two groups, else three of equal size.
+        """
+        if quantity == "direction":
+            groups = self.rate < 0, self.rate > 0
+            return tuple(
+                (name, self.white[group])
+                for name, group in zip(("falling", "rising"), groups, strict=True)
+            )
+        values, names = {
+            "rate": (np.abs(self.rate), ("slow", "medium", "fast")),
+            "voltage": (self.voltage, ("low", "middle", "high")),
+        }[quantity]
+        bins = np.searchsorted(np.quantile(values, [1 / 3, 2 / 3]), values)
+        return tuple((name, self.white[bins == i]) for i, name in enumerate(names))
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of the innovations."""
+        correlation = self.correlation
+        largest = correlation[np.argmax(np.abs(correlation))] if correlation.size else None
+        return {
+            "readings": self.white.size,
+            "sd": float(np.std(self.white)),
+            "autocorrelation_1": float(correlation[0]) if correlation.size else None,
+            "largest_autocorrelation": None if largest is None else float(largest),
+            "excess_kurtosis": float(scipy.stats.kurtosis(self.white)),
+            "by": {
+                quantity: {
+                    name: {"mean": float(np.mean(group)), "sd": float(np.std(group))}
+                    for name, group in self.by(quantity)
+                    if group.size
+                }
+                for quantity in ("rate", "voltage", "direction")
+            },
+        }
+
+
+def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> Innovations:
+    """Return the innovations of the fitted readings at one set of free parameters (free,).
+
+    ``begin`` is the time of the record's first sample, s.
+    """
+    record, readings = posterior.only, posterior.only.readings
+    theta = posterior.prior.theta(free[np.newaxis])
+    residual = readings.values - posterior.simulate(theta, readings.rows)
+    parameters = record.table.noise(theta)
+    noise, interval = posterior.likelihood.spaced, record.actuator.interval
+    white, _ = noise.whiten(parameters, residual[:, np.newaxis], readings.skipped)
+    return Innovations(
+        begin + interval * readings.rows.astype(np.float64),
+        white[0, 0],
+        record.voltage[readings.rows],
+        rate(record.voltage, interval)[readings.rows],
+        residual[0],
+        interval * readings.stride,
+        noise,
+        parameters[0],
+    )
+
+
+def departures(series: Innovations) -> tuple[Finding, ...]:
+    """Return where the innovations depart from what the noise model assumes."""
+    if series.white.size < MIN_READINGS:
+        return ()
+    findings = [*_correlated(series)]
+    for quantity in ("rate", "voltage", "direction"):
+        findings += _one_sided(series, quantity)
+    return tuple(findings)
+
+
+def _correlated(series: Innovations) -> Iterator[Finding]:
+    """Find an autocorrelation beyond chance, and of at least 0.1."""
+    correlation = series.correlation
+    bound = scipy.stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
+    lag = int(np.argmax(np.abs(correlation)))
+    if abs(correlation[lag]) > max(bound, 0.1):
+        distance = series.time[lag + 1] - series.time[0]
+        yield Finding(
+            "noise model",
+            f"innovations {distance:.3g} s apart correlate by {correlation[lag]:.2f}",
+            "check whether the sensor filters; else the discrepancy does not forget exponentially",
+        )
+
+
+def _one_sided(series: Innovations, quantity: str) -> Iterator[Finding]:
+    """Find the group with the surest mean, if it is beyond chance and at least 0.15 SD."""
+    groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
+    if len(groups) < 2:
+        return
+    scores = [
+        float(np.mean(white)) * np.sqrt(white.size) / max(float(np.std(white)), 1e-300)
+        for _, white in groups
+    ]
+    name, white = groups[int(np.argmax(np.abs(scores)))]
+    mean = float(np.mean(white))
+    if np.max(np.abs(scores)) > scipy.stats.norm.isf(ALARM / 6) and abs(mean) > 0.15:
+        subject = "drive" if quantity == "rate" else "voltage"
+        yield Finding(
+            "noise model",
+            f"the innovations average {mean:+.2f} SD where the {subject} is {name}",
+            "try what explains it: bwbayes run --improve",
+        )

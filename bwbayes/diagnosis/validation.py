@@ -1,0 +1,240 @@
+"""Whether bands hold on a record: the verdict that stands first on screen and report.
+
+Bands are held against the readings in three ways: how many readings they cover, how large the
+residuals are, and whether the residuals lean to one side. What luck alone may do to these three
+depends on how many independent readings a record is worth, and that is far fewer than it has: its
+discrepancy forgets slowly, and the parameters' error is one and the same all along. The bands
+themselves say how large each part is, so that the number follows from the model
+(:mod:`bwbayes.diagnosis.departures`). Validation fails where luck would do it in one of 5,000 good
+records, and is inconclusive where it would in one of a hundred, or where the record is worth too
+few readings. A fit is judged on its own readings too. There the noise model grows until it covers
+whatever the model misses, so that a fit fails when it misses more than a part of the displacement's
+range.
+
+A verdict that fails names the likely cause: on readings that were fitted the explanation with the
+best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
+residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
+the best explanation is a transient, a drift or a step without which a parameter is another one: its
+noise model covers what it then misses everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
+from bwbayes.diagnosis.departures import Standardized, percent
+from bwbayes.diagnosis.explanations import followed_causes, likely_causes
+from bwbayes.diagnosis.finding import Finding, joined
+from bwbayes.diagnosis.scene import Explanation
+from bwbayes.inference.posterior import Posterior
+from bwbayes.prediction.bands import Bands, titled
+from bwbayes.record.io.grid import clock
+from bwbayes.shown import brief
+
+__all__ = ["STATUSES", "Background", "Verdict", "assess"]
+
+# Worth fewer independent readings than this a record cannot show that bands hold.
+MIN_EFFECTIVE_SIZE = 5.0
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a verdict needs to know of the fit, besides the bands.
+
+    Parameters
+    ----------
+    memory
+        Correlation time of the discrepancy, s; to be on the safe side, a high quantile of its
+        posterior. Zero without a discrepancy.
+    noise_log_sd
+        Sd of the logarithm of the noise's sd over the draws: how well its size is known.
+    fitted
+        Lowest and highest voltage that was fitted, V.
+    extent
+        Range of all readings of a record that were fitted, um, whatever their windows.
+    """
+
+    __repr__ = brief
+
+    memory: float = 0.0
+    noise_log_sd: float = 0.0
+    fitted: tuple[float, float] = (-np.inf, np.inf)
+    extent: float = 0.0
+
+    @classmethod
+    def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
+        """Return what a posterior and its draws (draws, free) say."""
+        memory, noise_log_sd = [], []
+        for _, single, record_draws in posterior.each(draws):
+            dataset = single.only
+            noise = dataset.table.noise(single.prior.theta(record_draws))
+            # Rather too long than too short.
+            memory.append(float(np.quantile(dataset.noise.correlation_time(noise), 0.9)))
+            sds = dataset.noise.marginal_sd(noise)
+            noise_log_sd.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
+        datasets = posterior.datasets
+        voltage = np.concatenate(
+            [dataset.voltage[window] for dataset in datasets for window in dataset.training]
+        )
+        return cls(
+            max(memory),
+            max(noise_log_sd),
+            (float(voltage.min()), float(voltage.max())),
+            max(dataset.extent for dataset in datasets),
+        )
+
+
+# How a validation came out, in a word.
+STATUSES = {True: "passed", False: "failed", None: "inconclusive"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether bands hold on one record or window.
+
+    Attributes
+    ----------
+    name, training, separate
+        Those of the bands.
+    holds
+        False if the bands fail one of the tests; None if luck may have passed or failed them, or
+        the record is too short to tell.
+    reasons
+        What is off and by how much, one line each, the most telling first; of None, why nothing can
+        be told.
+    cause
+        The likely cause with its fix, if the bands do not hold, or the fit has followed a drift.
+    notes
+        What else is to be known of the record, and decides nothing.
+    """
+
+    __repr__ = brief
+
+    name: str
+    training: bool
+    holds: bool | None
+    reasons: tuple[str, ...] = ()
+    cause: Finding | None = None
+    notes: tuple[str, ...] = ()
+    separate: bool = False
+
+    @property
+    def status(self) -> str:
+        """The outcome in a word."""
+        return STATUSES[self.holds]
+
+    @property
+    def where(self) -> str:
+        """Name and kind of the record."""
+        return titled(self.name, training=self.training, separate=self.separate)
+
+    @property
+    def line(self) -> str:
+        """The verdict in one line, without its status."""
+        why = "".join(f": {reason}" for reason in self.reasons[:1])
+        return f"{self.where}{why}" + ("" if self.cause is None else f". {self.cause.line}")
+
+    @property
+    def summary(self) -> dict[str, object]:
+        """The verdict as ``validation.NAME`` in summary.json has it."""
+        return {
+            "holds": self.holds,
+            "verdict": self.line,
+            "reasons": list(self.reasons),
+            "cause": None if self.cause is None else self.cause.kind,
+            "fix": None if self.cause is None else self.cause.fix,
+            "notes": list(self.notes),
+        }
+
+
+def assess(
+    bands: Bands,
+    background: Background,
+    *,
+    explanations: Sequence[Explanation] = (),
+    beyond: Sequence[Finding] = (),
+) -> Verdict | None:
+    """Judge bands by the readings after ``scored_from``; None if there are none.
+
+    A good record, one that the fitted model describes, fails with a probability below 1 %.
+
+    Parameters
+    ----------
+    bands
+        Bands with readings.
+    background
+        What is known of the fit.
+    explanations
+        Of a fitted record, what may explain it better, the best first.
+    beyond
+        In what the record's drive leaves the one that was fitted.
+    """
+    if bands.measured is None:
+        return None
+    judged = np.isfinite(bands.measured)
+    judged[: bands.scored_from] = False
+    if not judged.any():
+        return None
+    standard = Standardized.of(bands, judged, background.memory, background.noise_log_sd)
+    reasons = standard.reasons(background.fitted, background.extent)
+    likely = likely_causes(explanations)
+    verdict = Verdict(bands.name, bands.training, True, separate=bands.separate)
+    verdict = replace(verdict, notes=_lead_in(bands))
+    if reasons:
+        why = joined(likely) or (
+            REVERSED_SIGN
+            if reasons[0].startswith("the readings fall")
+            else cause(bands, judged, background.memory, beyond)
+        )
+        return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
+    advice = _offset_advice(standard)
+    doubts = [
+        f"{text}, which may be luck (p = {chance:.1g}){advice}"
+        for text, chance in standard.chances()
+    ]
+    followed = joined(followed_causes(explanations))
+    if followed is not None:
+        doubts.append(
+            f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
+        )
+    if standard.effective_size < MIN_EFFECTIVE_SIZE:
+        doubts.append(
+            f"effective sample size {standard.effective_size:.1f} is too small to validate the "
+            f"bands; use a record {MIN_EFFECTIVE_SIZE / standard.effective_size:.2g} times as long"
+        )
+    if doubts:
+        return replace(verdict, holds=None, reasons=tuple(doubts), cause=followed)
+    return verdict
+
+
+def _lead_in(bands: Bands) -> tuple[str, ...]:
+    """Note that the lead-in does not fit."""
+    lead = bands.lead_in
+    if lead is None or lead.p_value >= LEAD_IN_ALARM:
+        return ()
+    span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
+    p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
+    return (f"the lead-in of {span} s does not fit the model ({p_value})",)
+
+
+def _offset_advice(standard: Standardized) -> str:
+    """Name a large share of the offset in the variance, and the lead-in that makes it small."""
+    bands, small = standard.bands, 0.15
+    lead = bands.lead_in
+    if lead is None or standard.common <= small:
+        return ""
+    # The variance of a mean of correlated readings falls with their time.
+    length = (lead.stop - lead.start) * standard.common / small
+    half_duration = float(np.ptp(bands.time[standard.judged])) / 2
+    longer = (
+        f"lead_in = {length:.2g}" if length < half_duration else f"a record of {3 * length:.2g} s"
+    )
+    return (
+        f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
+        f"{percent(standard.common)} of the band's variance; use {longer} for {percent(small)}"
+    )

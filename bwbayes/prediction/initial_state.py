@@ -1,0 +1,400 @@
+"""The start of another record: what is unknown of it, and what its first readings tell.
+
+A record that was not fitted brings unknowns of its own: the hysteretic state it starts from, how
+the dynamics are moving then, and its sensor's offset. Each posterior draw gets its own values. The
+readings of a lead-in, which is not judged later, choose them: offset and dynamics enter linearly
+and are integrated out exactly; the hysteretic state comes from :mod:`bwbayes.prediction.histories`.
+The other parameters keep the posterior of the record that was fitted. Whether the lead-in fits the
+model at all is tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from scipy.special import ndtri
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.errors import InputError
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood, LinearStart
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.readings import Readings
+from bwbayes.model.actuator import Actuator, State
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from bwbayes.prediction.bands import LeadIn
+from bwbayes.prediction.discrepancy_state import Carried, carried
+from bwbayes.prediction.histories import Histories, States, chosen, uniform
+from bwbayes.record.record import Record
+from bwbayes.shown import brief
+
+if TYPE_CHECKING:
+    from bwbayes.inference.compiled.walk import Walk
+
+__all__ = ["Start", "Started", "fitted", "going_on", "started"]
+
+# Slow departures of a lead-in that are looked for, as polynomials of the time up to this degree, if
+# there are so many readings; and draws for which they are.
+SLOW = 3
+MANY = 20
+TESTED = 100
+
+# The default lead-in: a part of the record, so many correlation times of the discrepancy at most,
+# or so many samples where it forgets at once.
+PART, MEMORIES, AT_LEAST = 0.25, 10.0, 100
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of the start of another record.
+
+    Parameters
+    ----------
+    from_rest
+        The actuator starts demagnetized and at rest: the voltage came from zero volts. Otherwise
+        h is a state that an earlier drive within the voltage range could have left, and the
+        dynamics may be moving.
+    own_offset
+        The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
+        the training record, as it is for a planned voltage without a measurement.
+    lead_in
+        Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
+        the discrepancy at most: after these the offset hardly widens the bands.
+    lead_in_from
+        Time at which it begins, s; by default that of the record's first sample. What comes before
+        is simulated.
+    hold
+        What the voltage does between samples; by default what the record says of its voltage.
+    after
+        What comes after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
+        readings leave it.
+    settled
+        Without a lead-in: the actuator has waited at the first voltage until it stood still, with
+        whatever earlier drives have left of hysteresis and creep, and displacements count from
+        where it stands.
+    """
+
+    __repr__ = brief
+
+    from_rest: bool = False
+    own_offset: bool = True
+    lead_in: float | None = None
+    lead_in_from: float | None = None
+    hold: Hold | None = None
+    after: bool = False
+    settled: bool = False
+
+    def window(self, record: Record, memory: float = np.inf) -> slice | None:
+        """Return the samples of the lead-in, or None if nothing can be learned from one.
+
+        ``memory`` is the discrepancy's correlation time, s.
+
+        Raises
+        ------
+        InputError
+            It reaches outside the record, leaves nothing of it, or holds no reading; a forecast of
+            a record without any.
+        """
+        if self.after and record.displacement is None:
+            raise InputError(
+                f"{record.origin}: has no readings after which a forecast could start; give a "
+                "record with a measured lead-in, or leave the forecast out"
+            )
+        if record.displacement is None:
+            return None
+        if self.from_rest and not self.own_offset and not self.after:
+            return None
+        begin = record.start if self.lead_in_from is None else self.lead_in_from
+        first = round((begin - record.start) / record.interval)
+        # White noise forgets at once: then a hundred readings tell the offset.
+        longest = max(MEMORIES * memory, AT_LEAST * record.interval)
+        length = self.lead_in or min(PART * (record.samples - first) * record.interval, longest)
+        last = first + round(length / record.interval)
+        lead_in = f"a lead-in of {length:g} s from {record.clock(begin)} s on"
+        if not (0 <= first < last < record.samples):
+            end = record.start + record.duration
+            raise InputError(
+                f"{record.origin}: {lead_in} leaves nothing of the record from "
+                f"{record.clock(record.start)} to {record.clock(end)} s; choose another one"
+            )
+        if not np.isfinite(record.displacement[first:last]).any():
+            raise InputError(f"{record.origin}: no reading in {lead_in}; choose another one")
+        return slice(first, last)
+
+
+@dataclass(frozen=True)
+class Started:
+    """What every draw takes for a record's start.
+
+    ``actuators`` with the record's interval and hold, one for each history, and ``which`` (draws,)
+    of them it is; ``model`` (draws, parameters of the actuator) with initial state and offset;
+    ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of
+    the offset still; ``from_rest`` if the record starts so; ``lead_in`` says how that went, if
+    there is one, and ``judged_from`` is the first sample after it; ``carried`` is what its readings
+    leave of the discrepancy, for a forecast. ``engine`` is what simulates.
+    """
+
+    __repr__ = brief
+
+    actuators: tuple[Actuator, ...]
+    which: IntArray
+    model: FloatArray
+    unrest: FloatArray
+    offset_sd: FloatArray
+    from_rest: bool
+    lead_in: LeadIn | None = None
+    judged_from: int = 0
+    carried: Carried | None = None
+    engine: Engine = "numpy"
+
+    def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
+        """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
+        walks = self._walks(voltage)
+        states: Sequence[State | None] = ()
+        for first in range(0, voltage.size, size):
+            piece = voltage[first : first + size]
+            if walks is None:
+                simulated, states = self.advance(piece, states)
+            elif len(walks) == 1:
+                simulated = walks[0][1].to(first + piece.size)
+            else:
+                simulated = np.empty((len(self.model), piece.size))
+                for rows, walk in walks:
+                    simulated[rows] = walk.to(first + piece.size)
+            yield simulated
+
+    def _walks(self, voltage: FloatArray) -> list[tuple[IntArray, Walk]] | None:
+        """Put the draws of each history to the start on the compiled engine, if that can do it."""
+        if self.engine != "numba":
+            return None
+        # Here, because it is slow to load.
+        from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
+
+        walks = []
+        for number, actuator in enumerate(self.actuators):
+            rows = np.flatnonzero(self.which == number)
+            if not rows.size:
+                continue
+            walked = walk(
+                actuator, self.model[rows], voltage, self.unrest[rows], from_rest=self.from_rest
+            )
+            if walked is None:
+                return None
+            walks.append((rows, walked))
+        return walks
+
+    def advance(
+        self, voltage: FloatArray, states: Sequence[State | None] = ()
+    ) -> tuple[FloatArray, Sequence[State | None]]:
+        """Displacement (draws, samples) along the next piece, um, and all histories' states then.
+
+        Without states the record starts here.
+        """
+        result = np.empty((len(self.model), voltage.size))
+        after: list[State | None] = list(states) or [None] * len(self.actuators)
+        for number, actuator in enumerate(self.actuators):
+            rows = np.flatnonzero(self.which == number)
+            if rows.size:
+                result[rows], after[number] = actuator.advance(
+                    self.model[rows],
+                    voltage,
+                    after[number],
+                    self.unrest[rows],
+                    from_rest=self.from_rest,
+                )
+        return result, after
+
+
+def started(
+    posterior: Posterior,
+    theta: FloatArray,
+    record: Record,
+    start: Start,
+    generator: np.random.Generator,
+) -> Started:
+    """Give every draw θ (draws, parameters) a start of another record.
+
+    Raises
+    ------
+    InputError
+        A lead-in that does not fit into the record.
+    """
+    hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
+    span = _voltages(posterior, record)
+    actuator = replace(posterior.only.actuator, interval=record.interval, hold=hold, span=span)
+    memory = posterior.only.noise.correlation_time(posterior.only.table.noise(theta))
+    window = start.window(record, float(np.median(memory)))
+    whole = _likelihood(posterior, actuator, record, start, window)
+    earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
+    likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
+    if window is None:
+        return _unseen(likelihoods, theta, generator, settled=start.settled)
+    if start.own_offset:
+        assert record.displacement is not None
+        level = np.full(len(theta), np.nanmean(record.displacement[window]))
+        theta = whole.table.replaced(theta, "offset", level)
+    histories, begun = chosen(likelihoods, theta, generator)
+    told = _informed(histories, begun, record, window, generator)
+    return going_on(told, likelihoods[0], theta, generator) if start.after else told
+
+
+def going_on(
+    start: Started, likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator
+) -> Started:
+    """Let the discrepancy go on from where the readings of a likelihood leave it.
+
+    What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
+    """
+    column = start.actuators[0].parameters.index("offset")
+    model = start.model.copy()
+    if start.offset_sd.any():
+        model[:, column] += start.offset_sd * ndtri(uniform(generator, len(model)))
+    begun = replace(start, model=model, offset_sd=np.zeros(len(model)))
+    rows = likelihood.readings.rows
+    simulated = begun.advance(likelihood.voltage[: likelihood.readings.samples])[0][:, rows]
+    return replace(begun, carried=carried(likelihood, theta, simulated))
+
+
+def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
+    """Give every draw θ (draws, parameters) the start that the training record tells."""
+    likelihood = posterior.likelihood
+    start = likelihood.start(theta)
+    unrest = _normal(start.mean, start.covariance, generator)
+    model, none = posterior.only.table.actuator(theta), np.zeros(len(theta))
+    which = np.zeros(len(theta), dtype=np.int64)
+    actuators, from_rest = (likelihood.actuator,), posterior.only.from_rest
+    return Started(actuators, which, model, unrest, none, from_rest, engine=posterior.engine)
+
+
+def _voltages(posterior: Posterior, record: Record) -> Span:
+    """Return the least and the largest voltage of this record and of those that were fitted, V."""
+    low, high = posterior.only.span
+    return Span(min(float(np.min(record.voltage)), low), max(float(np.max(record.voltage)), high))
+
+
+def _likelihood(
+    posterior: Posterior, actuator: Actuator, record: Record, start: Start, window: slice | None
+) -> Likelihood:
+    low, high = _voltages(posterior, record)
+    readings = Readings.of(np.zeros(1), [slice(0, 1)])
+    if window is not None:
+        assert record.displacement is not None
+        readings = Readings.of(record.displacement, [window])
+    own = start.own_offset and window is not None
+    return Likelihood(
+        record.voltage,
+        readings,
+        actuator,
+        posterior.only.noise,
+        posterior.engine,
+        start.from_rest,
+        (high - low) / 2,
+        # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
+        posterior.only.extent if own else 0.0,
+    )
+
+
+def _unseen(
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    generator: np.random.Generator,
+    *,
+    settled: bool,
+) -> Started:
+    """Draw the start from what is known of it beforehand: all histories are equally probable."""
+    draws, first = len(theta), likelihoods[0]
+    alone = len(likelihoods) == 1
+    which = np.zeros(draws, dtype=np.int64)
+    if not alone:
+        which = (len(likelihoods) * uniform(generator, draws)).astype(np.int64)
+    histories = Histories(likelihoods, which)
+    (sd,) = histories.each(theta, lambda likelihood, rows: (likelihood.start_sd(rows),))
+    if settled:
+        sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
+    unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
+    below = uniform(generator, draws)
+    (begun,) = histories.each(
+        np.column_stack([theta, below]),
+        lambda likelihood, rows: (
+            States(likelihood, rows[:, :-1], alone=alone).drawn(rows[:, -1]),
+        ),
+    )
+    model, none = first.table.actuator(begun), np.zeros(draws)
+    actuators = tuple(likelihood.actuator for likelihood in likelihoods)
+    start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
+    if settled:
+        offset = first.actuator.parameters.index("offset")
+        model[:, offset] -= start.advance(first.voltage[:1])[0][:, 0]
+    return start
+
+
+def _informed(
+    histories: Histories,
+    theta: FloatArray,
+    record: Record,
+    window: slice,
+    generator: np.random.Generator,
+) -> Started:
+    """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
+    likelihood = histories.likelihoods[0]
+    posterior = LinearStart(*histories.each(theta, Likelihood.start))
+    offsets = int(likelihood.offset_sd > 0)
+    mean, covariance = posterior.mean, posterior.covariance
+    unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
+    begun, sd = theta, np.zeros(len(theta))
+    if offsets:
+        # Given the unrest the offset is normal still.
+        pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
+        shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
+        variance = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
+        level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
+        begun = likelihood.table.replaced(theta, "offset", level)
+        sd = np.sqrt(np.maximum(variance, 0.0))
+    lead_in = LeadIn(
+        float(record.time[window.start]),
+        float(record.time[window.stop]),
+        likelihood.readings.rows.size,
+        _p_value(histories, theta, posterior.squares),
+    )
+    model = likelihood.table.actuator(begun)
+    actuators = tuple(likelihood.actuator for likelihood in histories.likelihoods)
+    from_rest, which = likelihood.from_rest, histories.which
+    known = which, model, unrest, sd, from_rest, lead_in, window.stop
+    return Started(actuators, *known, engine=likelihood.engine)
+
+
+def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:
+    """Test whether the lead-in fits the models θ at all.
+
+    Two tests, either of which may object: the sum of all squared innovations, which sees any large
+    departure, and a score test of slow ones (drift, a transient), which many readings would hide.
+    """
+    readings = histories.likelihoods[0].readings.rows
+    p = scipy.stats.chi2.sf(squares, readings.size)
+    if readings.size > MANY:
+        few = slice(None, None, -(-len(theta) // TESTED))
+        relative_time = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
+        shapes = np.polynomial.legendre.legvander(relative_time, SLOW).T[1:]
+        tested = replace(histories, which=histories.which[few])
+        (taken,) = tested.each(
+            theta[few], lambda likelihood, rows: (likelihood.score(rows, shapes).together,)
+        )
+        slow = scipy.stats.chi2.sf(taken, SLOW)
+        p = np.minimum(2 * np.minimum(p[few], slow), 1.0)
+    return float(np.mean(p))
+
+
+def _normal(mean: FloatArray, covariance: FloatArray, generator: np.random.Generator) -> FloatArray:
+    """Draw (draws, n) from normal distributions, one a draw, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    score = np.zeros_like(mean)
+    for i in range(mean.shape[1]):
+        score[:, i] = ndtri(uniform(generator, len(mean)))
+    spread = np.sqrt(np.maximum(values, 0.0)) * score
+    drawn: FloatArray = mean + np.einsum("mij,mj->mi", vectors, spread)
+    return drawn

@@ -1,0 +1,301 @@
+"""Prediction: from posterior draws to displacement bands, for any voltage.
+
+Every draw simulates the record from its first sample; given a draw, a reading is normal around its
+simulation, and the bands are quantiles of the mixture over all draws. The record is walked through
+in pieces, so memory does not grow with its length. But for a forecast, the discrepancy enters by
+its marginal distribution, on training windows too, where the smoothed one would promise more than a
+new record can keep.
+
+Windows of the training record share its simulation and its offset. Another record has a start of
+its own, see :mod:`bwbayes.prediction.initial_state`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from bwbayes.arrays import ArrayLike, FloatArray, Floating
+from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
+from bwbayes.prediction import mixture
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.prediction.initial_state import Start, Started, fitted, going_on, started
+from bwbayes.record.record import Record, Window
+
+__all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "thinned"]
+
+# Posterior draws in the mixture.
+DRAWS = 1000
+
+# Samples that are simulated and summarized at once: few enough for a core's own cache. Not a power
+# of two: rows of draws that far apart would take each other's place in it.
+PIECE = 400
+
+# Threads that summarize pieces, while this one simulates the next.
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """The start of every draw's simulation, and the sds (draws,) of what is added to it, um.
+
+    ``scores`` (scores, draws) are what it is added with, the same along the whole record.
+    """
+
+    start: Started
+    discrepancy: FloatArray
+    sensor: FloatArray
+    scores: FloatArray
+
+    def sds(self, kind: Kind, first: int, samples: int) -> FloatArray:
+        """Sd of a band's quantity given a draw, um: (draws, samples), (draws, 1) if all alike."""
+        variance = self.start.offset_sd[:, np.newaxis] ** 2
+        if kind != "parameter":
+            discrepancy = self.discrepancy[:, np.newaxis] ** 2
+            if self.start.carried is not None:
+                discrepancy = discrepancy * (1 - self.start.carried.told(first, samples))
+            variance = variance + discrepancy
+        if kind == "sensor":
+            variance = variance + self.sensor[:, np.newaxis] ** 2
+        return np.sqrt(variance)
+
+
+def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
+    """Choose ``count`` of the draws (any, free) without repetition; all, if there are fewer."""
+    if draws.shape[0] <= count:
+        return draws
+    return draws[generator.choice(draws.shape[0], count, replace=False)]
+
+
+def predict_windows(
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    windows: Mapping[str, slice | Sequence[slice]],
+    generator: np.random.Generator,
+    watch: Callable[[int], None] = lambda _: None,
+) -> list[Bands]:
+    """Predict windows of the training record: one simulation, one offset.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units.
+    record
+        The training record, whole.
+    windows
+        Slices of its samples, by name: one, or several, which make one set of bands.
+    generator
+        Draws the state of the dynamics at the record's start, where that is unknown.
+    watch
+        Is called with a number of samples whenever so many more are done.
+    """
+    theta = posterior.prior.theta(draws)
+    mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
+    several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
+    edges = [(window.start, window.stop) for parts in several.values() for window in parts]
+    first = min(start for start, _ in edges)
+    whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)), watch)
+    bands = []
+    for name, parts in several.items():
+        training = any(
+            w.start < p.stop and p.start < w.stop for w in posterior.only.training for p in parts
+        )
+        moved = [slice(window.start - first, window.stop - first) for window in parts]
+        bands.append(replace(whole.within(moved), name=name, training=training))
+    return bands
+
+
+def forecast(
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    voltage: ArrayLike,
+    generator: np.random.Generator,
+    name: str = "forecast",
+) -> Bands:
+    """Predict what follows on the training record: its last sample goes on into a planned voltage.
+
+    Hysteresis, dynamics and creep start from where the record leaves them, and the sensor keeps its
+    offset. The discrepancy goes on from where the fitted readings leave it: the band is narrower at
+    first, and as wide as ever later. Creep with a time longer than the record is known by its prior
+    alone: the model needs times up to the forecast's length.
+
+    Parameters
+    ----------
+    posterior, draws, generator
+        As in :func:`predict_windows`.
+    record
+        The training record, whole.
+    voltage
+        (samples,), V, at the record's sampling interval.
+    name
+        Name of the bands.
+
+    Raises
+    ------
+    InputError
+        A voltage that is not one finite row.
+    """
+    planned = np.asarray(voltage, dtype=np.float64)
+    if planned.ndim != 1 or planned.size == 0 or not np.isfinite(planned).all():
+        raise InputError(f"{name}: voltage of shape {planned.shape}; give one finite row, in V")
+    joined = np.concatenate([record.voltage, planned])
+    longer = replace(record, voltage=joined, displacement=None, truth=None)
+    after = slice(record.samples, longer.samples)
+    theta = posterior.prior.theta(draws)
+    start_states = fitted(posterior, theta, generator)
+    start_states = going_on(start_states, posterior.likelihood, theta, generator)
+    return _bands(name, _draws(posterior, theta, start_states), longer, after)
+
+
+def predict_record(
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    start: Start,
+    generator: np.random.Generator,
+    name: str = "prediction",
+    window: Window | None = None,
+    watch: Callable[[int], None] = lambda _: None,
+) -> Bands:
+    """Predict another record, or a planned voltage without a measurement.
+
+    Parameters
+    ----------
+    posterior, draws
+        As in :func:`predict_windows`.
+    record
+        The other record, at any sampling interval: the model lives in continuous time.
+    start
+        What is known of its start.
+    generator
+        Draws the starts.
+    name
+        Name of the bands.
+    window
+        Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
+        its first sample in any case.
+    watch
+        Is called with a number of samples whenever so many more are done.
+
+    Raises
+    ------
+    InputError
+        A lead-in or window that does not fit into the record.
+    """
+    predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
+    theta = posterior.prior.theta(draws)
+    start_states = started(posterior, theta, record, start, generator)
+    if predicted_window.stop <= start_states.judged_from:
+        raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
+    bands = _bands(name, _draws(posterior, theta, start_states), record, predicted_window, watch)
+    scored_from = max(start_states.judged_from - predicted_window.start, 0)
+    return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
+
+
+def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
+    # The same for all predictions: bands differ by what is predicted, not by chance.
+    generator = np.random.default_rng(len(theta))
+    scores = mixture.stratified_scores(len(theta), generator)
+    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta, generator))
+    return _Draws(start, *sds, scores)
+
+
+def _bands(
+    name: str,
+    mixed: _Draws,
+    record: Record,
+    window: slice,
+    watch: Callable[[int], None] = lambda _: None,
+) -> Bands:
+    """Walk through a record and summarize the mixture over a window."""
+    samples = window.stop - window.start
+    joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
+    totals = np.zeros(len(mixed.start.model))
+    pending: deque[tuple[int, Future[dict[str, Floating]]]] = deque()
+
+    def put() -> None:
+        first, piece = pending.popleft()
+        for key, values in piece.result().items():
+            joined[key][first : first + values.size] = values
+        watch(values.size)
+
+    with ThreadPoolExecutor(THREADS) as executor:
+        for first, simulated in _simulated(mixed.start, record.voltage, window):
+            work = executor.submit(_summarized, mixed, record, first, simulated)
+            pending.append((first - window.start, work))
+            totals += simulated.sum(axis=1)
+            # A few pieces at a time: all of them would not fit into memory.
+            if len(pending) > THREADS:
+                put()
+        while pending:
+            put()
+    means = totals / samples
+    common = float(np.var(means) + np.mean(mixed.start.offset_sd**2))
+    return Bands(
+        name=name,
+        time=record.time[window],
+        voltage=record.voltage[window],
+        measured=None if record.displacement is None else record.displacement[window],
+        truth=None if record.truth is None else record.truth[window],
+        mean=joined["mean"],
+        lower={(k, level): joined[f"{k} {level} lower"] for k in KINDS for level in LEVELS},
+        upper={(k, level): joined[f"{k} {level} upper"] for k in KINDS for level in LEVELS},
+        pit=joined.get("pit"),
+        crps=joined.get("crps"),
+        log_score=joined.get("log_score"),
+        interval=record.interval,
+        time_offset=record.time_offset,
+        common_sd=float(np.sqrt(common)),
+    )
+
+
+def _simulated(
+    start: Started, voltage: FloatArray, window: slice
+) -> Iterator[tuple[int, FloatArray]]:
+    """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
+    first = 0
+    for simulated in start.pieces(voltage[: window.stop], PIECE):
+        skipped = max(window.start - first, 0)
+        if skipped < simulated.shape[1]:
+            yield first + skipped, simulated[:, skipped:]
+        first += simulated.shape[1]
+
+
+def _summarized(
+    mixed: _Draws, record: Record, first: int, simulated: FloatArray
+) -> dict[str, Floating]:
+    """Mean, band edges, and the judgment of the readings, each (samples,)."""
+    samples = simulated.shape[1]
+    expected, carried = simulated, mixed.start.carried
+    if carried is not None:
+        expected = simulated + carried.means(first, samples)
+    mean = np.mean(expected, axis=0)
+    summarized: dict[str, Floating] = {"mean": mean}
+    # About their mean, so that a single precision is one of the band's width.
+    scores = mixed.scores.astype(np.float32)
+    away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
+    for kind in KINDS:
+        means = apart if kind == "parameter" else away
+        sds = mixed.sds(kind, first, samples).astype(np.float32)
+        ranked = mixture.ranked_values(means, sds, scores)
+        for level in LEVELS:
+            tail = (100 - level) / 200
+            summarized[f"{kind} {level} lower"] = mean + mixture.quantile(ranked, tail)
+            summarized[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
+        if kind == "sensor" and record.displacement is not None:
+            reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
+            z = (reading - means) / sds
+            summarized["pit"] = np.mean(ndtr(z), axis=0, dtype=np.float64)
+            summarized["crps"] = mixture.crps(ranked, reading)
+            summarized["log_score"] = mixture.log_density(z, sds)
+    return summarized

@@ -1,0 +1,261 @@
+"""How good a prediction was: error of the mean, width and coverage of the bands, proper scores.
+
+Coverage alone proves little. A wide band covers too, so width, CRPS and interval score stand
+beside it; and the residuals of one record are correlated, so that a window holds few independent
+chances to miss. A block bootstrap says how far the coverage may lie from nominal by luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.errors import InputError
+from bwbayes.prediction.bands import LEVELS, Bands, Kind
+from bwbayes.sampling.diagnostics import autocorrelation_time
+from bwbayes.shown import brief
+
+__all__ = ["Scores", "block_bootstrap_error", "block_length", "score"]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one stretch, over its samples from ``scored_from`` on.
+
+    Attributes
+    ----------
+    nrmse
+        Root mean square of measured - mean over the range (largest - smallest) of the measured;
+        nan if the measured does not vary.
+    nrmse_full
+        The same over the range of all readings that were fitted; None if it is not known.
+    max_error_um
+        Largest absolute measured - mean.
+    log_score
+        Mean log density of a reading under the sensor's distribution, nats, per um; None if it is
+        not known.
+    crps_um
+        Mean continuous ranked probability score of the sensor's distribution.
+    width_um
+        Mean width of the sensor band by level.
+    interval_score_um
+        Mean interval score of the sensor band by level: width + 2/a times the distance of a
+        reading outside of the band to it, a = 1 - level (Gneiting and Raftery 2007, eq. (43)).
+    coverage
+        Fraction of readings inside the sensor band, and of the noise-free displacement inside
+        the displacement band, by level; None without a truth.
+    coverage_error
+        Standard errors of ``coverage`` by block bootstrap, not taken as smaller where a band is
+        hardly missed than as many independent hits would have it as the window is worth. The
+        distribution of coverage is skewed: on a window of some twenty correlation times
+        coverage is more than two errors off in one of seven perfect predictions.
+    worst_second
+        Lowest coverage of the sensor band over any second, by level.
+    """
+
+    __repr__ = brief
+
+    nrmse: float
+    max_error_um: float
+    crps_um: float
+    width_um: dict[int, float]
+    interval_score_um: dict[int, float]
+    coverage: dict[str, dict[int, float] | None]
+    coverage_error: dict[str, dict[int, float] | None]
+    worst_second: dict[int, float]
+    log_score: float | None = None
+    nrmse_full: float | None = None
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``validation.NAME`` in summary.json has of them; null for what is no number."""
+
+        def by_level(values: dict[int, float]) -> dict[str, float]:
+            return {str(level): value for level, value in values.items()}
+
+        def by_kind(values: Mapping[str, dict[int, float] | None]) -> dict[str, object]:
+            return {k: None if levels is None else by_level(levels) for k, levels in values.items()}
+
+        known = self.log_score is not None and np.isfinite(self.log_score)
+        return {
+            "nrmse": self.nrmse if np.isfinite(self.nrmse) else None,
+            "nrmse_full": self.nrmse_full,
+            "max_error_um": self.max_error_um,
+            "log_score": self.log_score if known else None,
+            "crps_um": self.crps_um,
+            **{f"width_{level}_um": width for level, width in self.width_um.items()},
+            **{f"interval_score_{level}_um": s for level, s in self.interval_score_um.items()},
+            "coverage": by_kind(self.coverage),
+            "coverage_error": by_kind(self.coverage_error),
+            "worst_second": by_level(self.worst_second),
+        }
+
+
+def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Scores:
+    """Judge bands against what was measured, and against the truth where it is known.
+
+    ``full`` is the range of all readings that were fitted, um, if it is known.
+
+    Raises
+    ------
+    InputError
+        If there is no measurement to judge by, or no sample from ``scored_from`` on.
+    """
+    if bands.measured is None or bands.crps is None:
+        raise InputError(
+            f"{bands.name}: nothing was measured, so the bands cannot be scored; "
+            "give a record with a displacement"
+        )
+    if bands.scored_from >= bands.measured.size:
+        raise InputError(
+            f"{bands.name}: no sample is left after the lead-in of "
+            f"{bands.scored_from * bands.interval:g} s; shorten the lead-in or give a longer record"
+        )
+    judged = np.isfinite(bands.measured)
+    judged[: bands.scored_from] = False
+    if not judged.any():
+        raise InputError(f"{bands.name}: all readings are missing; judge another window")
+    measured = bands.measured[judged]
+    residual = measured - bands.mean[judged]
+    extent, rmse = float(np.ptp(measured)), float(np.sqrt(np.mean(residual**2)))
+    targets: dict[Kind, FloatArray | None] = {
+        "sensor": bands.measured,
+        "displacement": bands.truth,
+    }
+    coverage: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
+    error: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
+    for kind, values in targets.items():
+        if values is None:
+            continue
+        finite = np.isfinite(values)
+        finite[: bands.scored_from] = False
+        hits = {level: bands.covers(kind, level, values)[finite] for level in LEVELS}
+        coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
+        block = block_length((values - bands.mean)[finite])
+        error[kind] = _coverage_errors(hits, block, generator)
+    width, interval_score, worst = {}, {}, {}
+    for level in LEVELS:
+        lower, upper = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
+        distance = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
+        width[level] = float(np.mean(upper - lower))
+        interval_score[level] = float(np.mean(upper - lower + 2 / (1 - level / 100) * distance))
+        inside = bands.covers("sensor", level, bands.measured)
+        scored = slice(bands.scored_from, None)
+        worst[level] = _worst_second(inside[scored], judged[scored], bands.interval)
+    return Scores(
+        nrmse=rmse / extent if extent > 0 else np.nan,
+        nrmse_full=rmse / full if full else None,
+        max_error_um=float(np.abs(residual).max()),
+        crps_um=float(bands.crps[judged].mean()),
+        width_um=width,
+        interval_score_um=interval_score,
+        coverage=coverage,
+        coverage_error=error,
+        worst_second=worst,
+        log_score=None if bands.log_score is None else float(bands.log_score[judged].mean()),
+    )
+
+
+def block_bootstrap_error(
+    hits: BoolArray | FloatArray,
+    block: int,
+    generator: np.random.Generator,
+    replicates: int = 2000,
+) -> float:
+    """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
+
+    The series is closed to a ring, whole blocks are drawn from it with replacement until they
+    make up its length, and the standard deviation of their means is taken over replicates. Means
+    of blocks scatter around the mean of the series, not around the unknown one, which loses the
+    share block / samples of the variance; it is given back.
+
+    Parameters
+    ----------
+    hits
+        (samples,) whether the band holds the value; or any other series.
+    block
+        Samples in a block, see `block_length`; kept between 1/500 and a quarter of all samples.
+    generator
+        Draws the blocks.
+    replicates
+        Series drawn; 2000 leave 2 % of chance in the error.
+
+    Returns
+    -------
+    float
+        Standard error; 0 if all hits are equal, since then the series shows no variance.
+
+    Notes
+    -----
+    D. N. Politis and J. P. Romano, A circular block-resampling procedure for stationary data,
+    in Exploring the Limits of Bootstrap, Wiley 1992, 263-270.
+    """
+    samples = hits.size
+    if (hits == hits[0]).all():
+        return 0.0
+    # More than 500 blocks only cost time, and fewer than four say little.
+    block = max(1, samples // 500, min(block, samples // 4))
+    total = np.concatenate([[0.0], np.cumsum(np.concatenate([hits, hits[: block - 1]]))])
+    means = (total[block:] - total[:-block]) / block
+    blocks = samples / block
+    starts = generator.integers(samples, size=(replicates, round(blocks)))
+    variance = means[starts].mean(axis=1).var() * round(blocks) / blocks
+    return float(np.sqrt(variance / (1 - block / samples)))
+
+
+def block_length(residual: FloatArray) -> int:
+    """Choose the samples in a block of the bootstrap: three integrated autocorrelation times.
+
+    The time is the residual's, estimated with Sokal's window. A hit depends on the residual's
+    size, not on its sign, and the square of a Gaussian series forgets twice as fast as the
+    series, so that a block is at least six times as long as the hits' own time. 1 for a residual
+    that does not vary.
+
+    Parameters
+    ----------
+    residual
+        (samples,) value minus the mean of its band.
+    """
+    time = autocorrelation_time(residual[np.newaxis])
+    return max(1, round(3 * time)) if np.isfinite(time) else 1
+
+
+def _coverage_errors(
+    hits: dict[int, BoolArray], block: int, generator: np.random.Generator
+) -> dict[int, float]:
+    """Estimate the errors of coverage by level, also where a band is hardly ever missed.
+
+    With few misses, or none, the bootstrap takes the luck of the window for certainty. The level
+    nearest a half shows best how many independent hits m the window is worth, p (1 - p) / m being
+    the squared error; another level's error is at least that of m hits at Jeffreys' estimate
+    (m p + 1/2) / (m + 1) of its coverage.
+    """
+    errors = {level: block_bootstrap_error(hit, block, generator) for level, hit in hits.items()}
+    covered = {level: float(hit.mean()) for level, hit in hits.items()}
+    nearest = min(covered, key=lambda level: abs(covered[level] - 0.5))
+    p = covered[nearest]
+    worth = hits[nearest].size / block
+    if errors[nearest] > 0:
+        worth = p * (1 - p) / errors[nearest] ** 2
+    for level, p in covered.items():
+        estimate = (worth * p + 0.5) / (worth + 1)
+        errors[level] = max(errors[level], float(np.sqrt(estimate * (1 - estimate) / worth)))
+    return errors
+
+
+def _worst_second(hits: BoolArray, judged: BoolArray, interval: float) -> float:
+    """Lowest coverage of the readings in a second, in all of them if they last less.
+
+    A second that holds fewer than half as many readings as the fullest one says little, and is
+    left out.
+    """
+    block = max(1, min(round(1 / interval), hits.size))
+    covered, readings = (
+        np.concatenate([[0], np.cumsum(flags)]) for flags in (hits & judged, judged)
+    )
+    counts = readings[block:] - readings[:-block]
+    full = 2 * counts >= counts.max()
+    return float(((covered[block:] - covered[:-block])[full] / counts[full]).min())

@@ -1,0 +1,205 @@
+"""Step responses: how fast an actuator rises, whether it overshoots, and how it creeps.
+
+Every posterior draw, demagnetized and at rest, gets an ideal step of the voltage from zero, as in
+the paper's Fig. 5. The recursions are exact at any interval, so the displacement a time t after the
+step is that of one sample as long as t: the response comes at times that are evenly spaced on a log
+axis, from a microsecond to minutes, whatever the sampling rate of the record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
+from bwbayes.model.linear import Recursion
+from bwbayes.prediction.loops import Curve, Estimate
+from bwbayes.record.record import Record
+from bwbayes.shown import brief
+
+__all__ = [
+    "STEP_MEASURES",
+    "Step",
+    "StepResponse",
+    "measure_step",
+    "measure_steps",
+    "step_of",
+]
+
+# The first time that is looked at, s.
+FIRST = 1e-6
+
+# Time after a step from which creep is counted, s, as data sheets do.
+CREEP_FROM = 0.1
+
+# What is measured of a step response: its name in a summary, title and unit for people.
+STEP_MEASURES: Mapping[str, tuple[str, str]] = {
+    "level_um": ("Displacement, without creep", "um"),
+    "rise_s": ("Rise time, 10 to 90 %", "s"),
+    "overshoot_percent": ("Overshoot", "%"),
+    "creep_percent": ("Creep per decade of time", "%"),
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the voltage from zero to ``height``, V, that is held for ``held``, s."""
+
+    __repr__ = brief
+
+    height: float
+    held: float
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """What a posterior says of a step.
+
+    ``time`` (times,), s since the step; ``response`` the displacement since then, um; ``crept`` its
+    growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
+    those of :func:`measure_step`; a number is None if the model has none.
+    """
+
+    __repr__ = brief
+
+    step: Step
+    time: FloatArray
+    response: Curve
+    crept: Curve | None
+    estimates: Mapping[str, Estimate | None]
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What ``summary.json`` has of it."""
+        levels: dict[str, object] = {"height_V": self.step.height, "held_s": self.step.held}
+        return levels | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
+
+
+def step_of(record: Record) -> Step | None:
+    """Return the step from zero that a record's voltage is, or None if it is something else."""
+    voltage = record.voltage
+    height = float(np.median(voltage[voltage.size // 2 :]))
+    slack = 0.02 * abs(height)
+    up = np.abs(voltage - height) <= slack
+    first = int(np.argmax(up))
+    # One sample may lie on the way.
+    if not (slack > 0 and up[first:].all() and np.abs(voltage[: max(first - 1, 1)]).max() <= slack):
+        return None
+    return Step(height, (record.samples - first) * record.interval)
+
+
+def measure_steps(
+    posterior: Posterior, draws: FloatArray, records: Mapping[str, Record]
+) -> dict[str, StepResponse]:
+    """Measure the step responses of those records, by name, whose voltage is a step from zero."""
+    steps = {name: step_of(record) for name, record in records.items()}
+    return {n: measure_step(posterior, draws, step) for n, step in steps.items() if step}
+
+
+def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepResponse:
+    """Measure the response to a step.
+
+    With x(t) the displacement since the step, x_d(t) that without creep, x_∞ where x_d settles, and
+    c(t) = x(t) − x_d(t):
+
+    ``level_um``
+        x_∞.
+    ``rise_s``
+        From the first time at which x_d passes 10 % of x_∞ to the first at which it passes 90 %;
+        None without dynamics.
+    ``overshoot_percent``
+        By how much the largest x_d exceeds x_∞, zero if it does not; None without dynamics.
+    ``creep_percent``
+        100 (c(T) − c(0.1 s)) / (x_∞ + c(0.1 s)) / log₁₀(T / 0.1 s), with T the end of the step;
+        None without creep, or if T is less than a second.
+
+    Parameters
+    ----------
+    posterior
+        The posterior that was sampled.
+    draws
+        (draws, free), parameters in their own units.
+    step
+        The step.
+    """
+    _, single, record_draws = next(posterior.each(draws))
+    dataset = single.only
+    column = dataset.table.columns(single.prior.theta(record_draws))
+    column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
+    actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")
+    held = max(step.held, 10 * FIRST)
+    time = np.geomspace(FIRST, held, round(60 * np.log10(held / FIRST)) + 1)
+    settled, without, creep = _responses(actuator, column, step.height, time)
+    estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
+    estimates["level_um"] = Estimate.of(settled)
+    if actuator.filter.parameters:
+        share = without / settled[:, np.newaxis]
+        estimates["rise_s"] = Estimate.of(_passes(time, share, 0.9) - _passes(time, share, 0.1))
+        overshoot = 100 * np.maximum(np.max(share, axis=1) - 1, 0.0)
+        estimates["overshoot_percent"] = Estimate.of(overshoot)
+    crept = None
+    if actuator.creep is not None and held >= 10 * CREEP_FROM:
+        before = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
+        grown = creep - before[:, np.newaxis]
+        decades = np.log10(held / CREEP_FROM)
+        percent = 100 * grown[:, -1] / (settled + before) / decades
+        estimates["creep_percent"] = Estimate.of(percent)
+        crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
+    return StepResponse(step, time, Curve.of(without + creep), crept, estimates)
+
+
+def _responses(
+    actuator: Actuator, column: Values, height: float, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what a step from zero volts brings, um.
+
+    Where the dynamics settle (models,), and the displacement since the step (models, times):
+    without creep, and what creep adds to it.
+    """
+    voltage = np.array([0.0, height])
+    still = replace(actuator, dynamics="none", hold="first", creep=None)
+    theta = np.stack([column[name] for name in still.parameters], axis=1)
+    drive = still.displacement(theta, voltage, from_rest=True)
+    settled = drive[:, 1] - drive[:, 0]
+    steps = [settled]
+    if actuator.creep is not None:
+        crept = actuator.creep.drive(column, drive, voltage)
+        steps += [crept[:, 1] - crept[:, 0]] * len(actuator.creep.times)
+    parts = np.empty((2, settled.size, time.size))
+    for i, t in enumerate(time.tolist()):
+        sections = replace(actuator, interval=t).sections(column)
+        moved = [
+            gain * _after_a_sample(recursion) * by
+            for recursion, gain, by in zip(sections.recursions, sections.gains, steps, strict=True)
+        ]
+        parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))
+    return settled, parts[0], parts[1]
+
+
+def _after_a_sample(recursion: Recursion) -> FloatArray:
+    """Return what a recursion makes of a unit that has been held for one sample, (models,)."""
+    now, before = recursion.numerator[:, 0], recursion.numerator[:, 1]
+    passed: FloatArray = now + before - recursion.denominator[:, 1] * now
+    return passed
+
+
+def _passes(time: FloatArray, fraction: FloatArray, level: float) -> FloatArray:
+    """Return the times (models,) at which responses (models, times) first pass a level.
+
+    On straight lines over the log of the time; before the first of the times, that; beyond the
+    last, nan.
+    """
+    passed = fraction >= level
+    after = np.argmax(passed, axis=1)
+    rows = np.arange(after.size)
+    before = np.maximum(after - 1, 0)
+    low, high = fraction[rows, before], fraction[rows, after]
+    share = np.where(after > 0, (level - low) / np.where(high > low, high - low, 1.0), 0.0)
+    logs = np.log(time)
+    at = np.exp(logs[before] + share * (logs[after] - logs[before]))
+    return np.where(passed.any(axis=1), at, np.nan)

@@ -1,0 +1,8 @@
+"""Voltage and displacement records: what they are, how they are read, checked and written."""
+
+from __future__ import annotations
+
+from bwbayes.record.io.formats import read_record, write_record
+from bwbayes.record.record import Record, Split
+
+__all__ = ["Record", "Split", "read_record", "write_record"]

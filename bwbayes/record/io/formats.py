@@ -1,0 +1,242 @@
+"""Read and write records: text of any kind, HDF5, MATLAB and LabVIEW files.
+
+What a file is, its content says, not its suffix. Records are written by the suffix: ``.csv``,
+``.txt``, ``.h5``, ``.hdf5``, ``.mat``. The noise-free displacement of a simulated record travels
+with it: in a second text file ``NAME.truth.csv`` beside ``NAME.csv``, or as ``truth_um`` inside the
+binary formats.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.record.io.checks import VoltageIs, checked, checked_reference, require_voltage_is
+from bwbayes.record.io.columns import QUANTITIES, Naming
+from bwbayes.record.io.hdf5 import is_hdf5, read_hdf5, write_hdf5
+from bwbayes.record.io.labview import read_tdms
+from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
+from bwbayes.record.io.memory import array_source
+from bwbayes.record.io.series import Source
+from bwbayes.record.io.table import FileTable, table_of
+from bwbayes.record.record import Record
+
+__all__ = [
+    "SUFFIXES",
+    "read_record",
+    "read_reference",
+    "read_source",
+    "read_table",
+    "require_readable",
+    "write_record",
+]
+
+_TEXT = (".csv", ".txt")
+_BINARY = (".h5", ".hdf5", ".mat")
+# What a folder of records is searched for.
+SUFFIXES = (*_TEXT, *_BINARY, ".lvm", ".tdms")
+
+
+def read_record(
+    path: str | Path,
+    *,
+    voltage_is: VoltageIs | None = None,
+    need_displacement: bool = True,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    fs: float | None = None,
+) -> Record:
+    """Read and check a record.
+
+    Parameters
+    ----------
+    path : path
+        Text of any layout, HDF5, MATLAB, LabVIEW's LVM or TDMS; the content says which. Columns
+        may carry their units in their names, `time_s`, `voltage_V`, `displacement_um` or with other
+        SI prefixes; time must be uniform. Other names are recognized where they can mean nothing
+        else: ``t [ms]``, ``U_mV``, ``pos (nm)``.
+    voltage_is : "command", "output" or None
+        Overrides what the file says about its voltage; a file that says nothing means "output".
+    need_displacement : bool
+        False also accepts a planned voltage without a displacement.
+    columns : dict
+        The columns by quantity, where they are not to be recognized: their names, the ends of
+        their paths in the file, or their numbers, counted from 1:
+        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "3"}``.
+    units : dict
+        Units by quantity, ``{"displacement": "nm"}``, where the file does not state them; ``"-nm"``
+        turns the sign.
+    fs : float, Hz
+        The sampling rate, in place of a time column.
+
+    Raises
+    ------
+    InputError
+        For every problem, in one line: ``file:line: column: problem; what to do``, with
+        ``sample N`` (counted from 0) for the line in formats that have none.
+
+    Warns
+    -----
+    InputWarning
+        If columns are ignored, a column is recognized by nothing but its unit, or a commanded
+        voltage is held where samples are missing.
+    """
+    path = Path(path)
+    if voltage_is is not None:
+        require_voltage_is(voltage_is)
+    needed = QUANTITIES if need_displacement else ("time", "voltage")
+    table = read_table(path, Naming(columns or {}, units or {}, fs), needed)
+    record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
+    truth_path = _truth_path(path)
+    if path.suffix.lower() in _TEXT and truth_path.exists():
+        return _with_truth(record, truth_path)
+    return record
+
+
+def read_reference(path: str | Path) -> tuple[FloatArray, float]:
+    """Read what a displacement is to be: its samples, um, and their interval, s.
+
+    The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes;
+    a voltage in it does not count.
+
+    Raises
+    ------
+    InputError
+        For every problem, in one line, as of :func:`read_record`.
+    """
+    return checked_reference(read_table(Path(path), Naming(), ("time", "displacement")))
+
+
+def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> FileTable:
+    """Read the columns of a file that count, with the naming that they were recognized by.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or a column that is needed is not known.
+    """
+    return table_of(read_source(Path(path)), naming, needed)
+
+
+def read_source(path: Path) -> Source:
+    """Read what a file holds.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; give the file in it")
+        if not path.exists():
+            raise InputError(f"{path}: does not exist; check the path")
+        if not path.is_file():
+            raise InputError(f"{path}: is not a regular file; give one")
+        with path.open("rb") as file:  # a file without permission says so in every format
+            begin = file.read(8)
+        if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+            return read_mat(path)
+        if is_hdf5(path):
+            return read_hdf5(path)
+        if begin.startswith(b"TDSm"):
+            return read_tdms(path)
+        if begin.startswith(b"PK") or begin.startswith(b"\xd0\xcf\x11\xe0"):
+            raise InputError(f"{path}: a workbook or an archive; export it as CSV")
+        if path.suffix.lower() in _BINARY:
+            raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+        from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+
+        return read_text(path)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read ({error}); check the file") from error
+
+
+def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
+    """Write a record so that reading it gives the same numbers.
+
+    An existing file is replaced at once or not at all. The truth goes beside a text file, and
+    that of an earlier record is removed.
+
+    Raises
+    ------
+    InputError
+        If the suffix is unknown or the place cannot be written to.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (*_TEXT, *_BINARY):
+        suffixes = ", ".join((*_TEXT, *_BINARY))
+        raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {suffixes}")
+    if suffix == ".mat":
+        _write_whole(path, lambda draft: write_mat(record, draft, mat_version))
+    elif suffix not in _TEXT:
+        _write_whole(path, lambda draft: write_hdf5(record, draft))
+    else:
+        from bwbayes.record.io.text import write_text  # noqa: PLC0415  # pandas is slow to load
+
+        truth_path = _truth_path(path)
+        truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
+        _write_whole(path, lambda draft: write_text(record, draft))
+        if record.truth is not None:
+            truth = replace(record, displacement=record.truth)
+            _write_whole(truth_path, lambda draft: write_text(truth, draft))
+
+
+def require_readable(record: Record, where: str) -> None:
+    """Refuse a record that could be written to a file and not be read back.
+
+    Raises
+    ------
+    InputError
+        As for a file that is called ``where``.
+    """
+    arrays = {
+        "time": record.time,
+        "voltage": record.voltage,
+        "displacement": record.displacement,
+        "truth": record.truth,
+    }
+    source = array_source(where, arrays, {}, {"interval_s": repr(record.interval)})
+    need = record.displacement is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        table = table_of(source, Naming(), QUANTITIES if need else ("time", "voltage"))
+        checked(table, need_displacement=need)
+
+
+def _truth_path(path: Path) -> Path:
+    return path.with_suffix(f".truth{path.suffix}")
+
+
+def _with_truth(record: Record, path: Path) -> Record:
+    truth = Record(**checked(read_table(path, Naming())))
+    same = truth.samples == record.samples and np.allclose(
+        truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
+    )
+    if not same:
+        raise InputError(f"{path}: time_s: not the times of the record; remove or replace the file")
+    return replace(record, truth=truth.displacement)
+
+
+def _write_whole(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then put it in place in one step."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        write(draft)
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())
+        draft.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error}); choose another place") from error
+    finally:
+        draft.unlink(missing_ok=True)

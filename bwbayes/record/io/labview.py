@@ -1,0 +1,124 @@
+"""LabVIEW's files: measurements as text (``.lvm``), and National Instruments' binary ``.tdms``.
+
+An ``.lvm`` file has a header of its own, and one for each segment of rows, with the channels' units
+and, where no column has the times, their step: :func:`plain_lvm` makes it the table that any other
+text file is. ``.tdms`` files are read by npTDMS; channels are named by their group,
+``group/channel``, and waveforms state their sampling interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bwbayes.errors import InputError
+from bwbayes.record.io.series import Series, Source, damaged
+
+__all__ = ["is_lvm", "plain_lvm", "read_tdms"]
+
+_END = "***End_of_Header***"
+
+
+def is_lvm(text: str) -> bool:
+    """Tell whether a text is a LabVIEW measurement."""
+    return text.startswith("LabVIEW Measurement")
+
+
+def plain_lvm(path: Path, text: str) -> tuple[str, dict[str, str]]:
+    """Return a measurement's rows below one header with units, and its notes.
+
+    Segments follow each other. The note ``dt`` is the sampling interval, s, of a file without a
+    column of times; the line numbers of the first segment stay as they are.
+
+    Raises
+    ------
+    InputError
+        There are no rows in it.
+    """
+    head, *parts = text.split(_END)
+    separator = "," if _keys(head, ",").get("Separator") == ["Comma"] else "\t"
+    x_columns = _keys(head, separator).get("X_Columns", ["One"])[0]
+    if len(parts) < 2:
+        raise InputError(f"{path}: no segment of samples in it; export it again")
+    keys, lines = _keys(parts[0], separator), [""] * f"{head}{parts[0]}".count("\n")
+    for number, segment in enumerate(parts[1:]):
+        rows = segment.partition("\nChannels")[0].split("\n")[1:]
+        names, *samples = [row for row in rows if row.strip(f" {separator}")]
+        if number == 0:
+            lines += ["", separator.join(_with_units(names.split(separator), keys, x_columns))]
+        lines += samples
+    if x_columns == "No":  # the column of times is there, and empty
+        lines = [line.partition(separator)[2] for line in lines]
+    step = keys.get("Delta_X", [""])[0].replace(",", ".")
+    notes = {"dt": step} if x_columns == "No" and step else {}
+    return "\n".join(lines) + "\n" * text.endswith("\n"), notes
+
+
+def _keys(header: str, separator: str) -> dict[str, list[str]]:
+    """Return the values of a header's keys, one a channel."""
+    rows = [line.split(separator) for line in header.split("\n")]
+    return {row[0].strip(): [cell.strip() for cell in row[1:] if cell.strip()] for row in rows}
+
+
+def _with_units(names: list[str], keys: Mapping[str, list[str]], x_columns: str) -> list[str]:
+    """Return the names of columns with their channels' units."""
+    stride = 2 if x_columns == "Multi" else 1
+    units = {1 + stride * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
+    if keys.get("X_Dimension", ["Time"])[0] == "Time":
+        units[0] = "s"
+    named = [f"{name} [{units[i]}]" if units.get(i) else name for i, name in enumerate(names)]
+    # Of several columns of times the first one counts.
+    later = range(2, len(names) - 1, 2) if x_columns == "Multi" else ()
+    return [f"{name} {i + 1}" if i in later else name for i, name in enumerate(named)]
+
+
+def read_tdms(path: Path) -> Source:
+    """Return the channels of a TDMS file.
+
+    Raises
+    ------
+    InputError
+        npTDMS is not installed, or the file is damaged.
+    """
+    try:
+        from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+    except ImportError:
+        raise InputError(
+            f"{path}: reading TDMS needs npTDMS; pip install 'bwbayes[tdms]'"
+        ) from None
+    try:
+        channels = [c for group in TdmsFile.read(path).groups() for c in group.channels()]
+        steps = {c.properties.get("wf_increment") for c in channels if len(c)}
+        starts = {float(c.properties.get("wf_start_offset", 0.0)) for c in channels if len(c)}
+        series = [
+            Series(
+                f"{channel.group_name}/{channel.name}",
+                len(channel),
+                partial(_values, channel),
+                str(channel.properties.get("unit_string", "")),
+                channel.name,
+            )
+            for channel in channels
+        ]
+    except Exception as error:
+        raise damaged(path, error) from error
+    step = steps.pop() if len(steps) == 1 else None
+    return Source(
+        path,
+        tuple(series),
+        interval=float(step) if step else None,
+        start=starts.pop() if len(starts) == 1 else 0.0,
+    )
+
+
+def _values(channel: Any) -> NDArray[Any]:
+    """Return a channel's numbers; time stamps in seconds."""
+    values = np.asarray(channel[:])
+    if values.dtype.kind == "M":
+        values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
+    return values

@@ -1,0 +1,400 @@
+"""One measurement of an actuator: voltage in, displacement out, sampled at a steady rate.
+
+A :class:`Record` is what every file is read into and what every later step starts from. Its units
+are volts, micrometers and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
+names the data exactly. Parts of a record are addressed by time: a window is the pair (start, stop).
+The voltage is known at every sample, since it drives the simulation; a displacement may be missing
+(nan), and what is missing is not judged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
+from bwbayes.errors import InputError, one_line
+from bwbayes.record.io.checks import VoltageIs, checked, require_voltage_is
+from bwbayes.record.io.columns import QUANTITIES, Naming
+from bwbayes.record.io.grid import clock
+from bwbayes.record.io.memory import array_source, frame_source, frozen_vector, in_seconds
+from bwbayes.record.io.table import table_of
+from bwbayes.shown import brief
+
+__all__ = ["Record", "Split", "Window"]
+
+# Of a sample: what rounding may do to a time.
+ROUNDING = 1e-6
+
+Window = tuple[float, float]
+"""A stretch of time in s: start <= time < stop."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Training and held-out windows of one record, as slices of its samples.
+
+    The slices belong to the whole record, so that one simulation from its first sample serves
+    every window.
+    """
+
+    training: tuple[slice, ...]
+    held_out: tuple[slice, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Voltage and displacement on the uniform time grid ``start + interval * arange(samples)``.
+
+    Parameters
+    ----------
+    voltage : array (samples,), V
+    displacement : array (samples,), um, or None
+        nan where the reading is missing; None for a planned voltage without a measurement.
+    interval : float, s
+        Sampling interval.
+    start : float, s
+        Time of the first sample.
+    voltage_is : "command" or "output"
+        What the voltage column is: the command that a DAC holds until the next sample, or the
+        amplifier's output, which is continuous.
+    origin : str
+        Where the record comes from: a file's name or free text. Line breaks and other characters
+        that do not print become blanks.
+    truth : array (samples,), um, or None
+        Noise-free displacement, known for simulated records only.
+    time_offset : float, s
+        What a clock adds to the record's times, which count from about its first sample: the time
+        stamp of time zero.
+
+    Raises
+    ------
+    InputError
+        If an array is not a vector of finite numbers (of the displacement one is enough), lengths
+        differ, the interval is not a positive number, or `voltage_is` is unknown.
+
+    Examples
+    --------
+    >>> record = Record([0.0, 5.0, 10.0], [0.0, np.nan, 6.1], interval=0.01)
+    >>> record.samples, record.readings, record.duration
+    (3, 2, 0.03)
+    """
+
+    __repr__ = brief
+
+    voltage: FloatArray
+    displacement: FloatArray | None
+    interval: float
+    start: float = 0.0
+    voltage_is: VoltageIs = "output"
+    origin: str = ""
+    truth: FloatArray | None = None
+    time_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        samples = np.size(self.voltage)
+        for name in ("voltage", "displacement", "truth"):
+            values = getattr(self, name)
+            if values is not None:
+                object.__setattr__(self, name, frozen_vector(name, values, samples))
+        if not (math.isfinite(self.interval) and self.interval > 0):
+            raise InputError(f"interval: {self.interval} s is not a positive time; give it in s")
+        if not math.isfinite(self.start):
+            raise InputError(f"start: {self.start} s is not a time; give it in s")
+        object.__setattr__(self, "interval", float(self.interval))
+        object.__setattr__(self, "start", float(self.start) + 0.0)  # turns -0.0 into 0.0
+        object.__setattr__(self, "time_offset", float(self.time_offset))
+        object.__setattr__(self, "voltage_is", require_voltage_is(self.voltage_is))
+        object.__setattr__(self, "origin", one_line(self.origin))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        voltage: ArrayLike,
+        displacement: ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        start: float | None = None,
+        time: ArrayLike | None = None,
+        units: Mapping[str, str] | None = None,
+        voltage_is: VoltageIs = "output",
+        origin: str = "arrays",
+    ) -> Self:
+        """Return the record of a voltage and a displacement, checked as a file is.
+
+        Parameters
+        ----------
+        voltage, displacement : arrays (samples,), V and um
+            The displacement is nan where a reading is missing, and None for a planned voltage.
+        interval, start : float, s
+            Sampling interval, and time of the first sample (default: 0).
+        time : array (samples,), s
+            Times of the samples, uniform, in place of interval and start; dates and durations too.
+        units : dict
+            Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
+            ``"-nm"`` turns the sign.
+        voltage_is, origin
+            As of the record itself.
+
+        Raises
+        ------
+        InputError
+            What cannot be used, as of a file: too few samples, times that are not uniform, a
+            voltage that does not move; neither interval nor time, or both.
+
+        Warns
+        -----
+        InputWarning
+            If samples are missing between the times, in which a commanded voltage was held.
+
+        Examples
+        --------
+        >>> ms, sine = np.arange(1000.0), np.sin(np.arange(1000.0))
+        >>> units = {"time": "ms", "displacement": "nm"}
+        >>> record = Record.from_arrays(sine, 700 * sine, time=ms, units=units)
+        >>> record.interval, round(float(record.displacement.max()), 3)
+        (0.001, 0.7)
+        """
+        units = units or {}
+        if (time is None) == (interval is None) or (time is not None and start is not None):
+            raise InputError(f"{origin}: give either interval (and start), in s, or time, a vector")
+        if time is None and "time" in units:
+            raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
+        # The record makes arrays of what it gets, or says that it cannot.
+        arguments: Any = {"voltage": voltage, "displacement": displacement}
+        arguments |= {"interval": 1.0 if interval is None else interval, "start": start or 0.0}
+        record = cls(**arguments, voltage_is=voltage_is, origin=origin)
+        times = None
+        if time is not None:
+            times = frozen_vector("time", in_seconds(np.asarray(time)), record.samples)
+        arrays = {
+            "time": record.time if times is None else times,
+            "voltage": record.voltage,
+            "displacement": record.displacement,
+        }
+        notes = {"origin": record.origin}
+        if times is None:
+            notes["interval_s"] = repr(record.interval)
+        need = displacement is not None
+        needed = QUANTITIES if need else ("time", "voltage")
+        table = table_of(array_source(origin, arrays, units, notes), Naming(units=units), needed)
+        return cls(**checked(table, voltage_is=record.voltage_is, need_displacement=need))
+
+    @classmethod
+    def from_pandas(
+        cls,
+        frame: Any,
+        *,
+        time: str | None = None,
+        voltage: str | None = None,
+        displacement: str | None = None,
+        units: dict[str, str] | None = None,
+        fs: float | None = None,
+        voltage_is: VoltageIs = "output",
+        origin: str = "DataFrame",
+    ) -> Self:
+        """Return the record of a pandas table, whose time column gives the sampling interval.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+            A column each for time, voltage and displacement; without the last one it is a planned
+            voltage. The time may be the index; dates count from the first sample.
+        time, voltage, displacement : str
+            The columns' names, if they are neither ``time_s``, ``voltage_mV`` and the like, nor can
+            be recognized as those of a file are.
+        units : dict
+            Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
+        fs : float, Hz
+            The sampling rate, in place of a time column.
+        voltage_is, origin
+            As of the record itself.
+
+        Raises
+        ------
+        InputError
+            A column that is missing or without a unit, times that are not uniform, and all else
+            that a file is refused for.
+
+        Warns
+        -----
+        InputWarning
+            If a column is recognized by nothing but its unit, or samples are missing in which a
+            commanded voltage was held.
+        """
+        names = {"time": time, "voltage": voltage, "displacement": displacement}
+        columns = {quantity: name for quantity, name in names.items() if name is not None}
+        naming = Naming(columns, units or {}, fs)
+        # Without a displacement it is a planned voltage; which it is, only what is said can tell.
+        needed = QUANTITIES if displacement is not None else ("time", "voltage")
+        table = table_of(frame_source(frame, origin), naming, needed)
+        need = displacement is not None
+        return cls(**checked(table, voltage_is=voltage_is, need_displacement=need))
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.voltage.size
+
+    @property
+    def time(self) -> FloatArray:
+        """Times of the samples, (samples,), s."""
+        return self.start + self.interval * np.arange(self.samples, dtype=np.float64)
+
+    @property
+    def duration(self) -> float:
+        """Length of the record in s: samples times interval, the last one's included."""
+        return self.samples * self.interval
+
+    @property
+    def has_reading(self) -> BoolArray:
+        """Whether the displacement was read, (samples,)."""
+        if self.displacement is None:
+            return np.zeros(self.samples, dtype=np.bool_)
+        return ~np.isnan(self.displacement)
+
+    @property
+    def readings(self) -> int:
+        """Number of samples at which the displacement was read."""
+        return int(np.count_nonzero(self.has_reading))
+
+    @property
+    def range_voltage(self) -> tuple[float, float]:
+        """Smallest and largest voltage, V."""
+        return float(self.voltage.min()), float(self.voltage.max())
+
+    @property
+    def sha256(self) -> str:
+        """Hex digest of the data: voltage, displacement, interval and start, not the origin."""
+        digest = hashlib.sha256(f"{self.samples} {self.displacement is not None}\n".encode())
+        digest.update(np.array([self.interval, self.start], dtype="<f8").tobytes())
+        digest.update(self.voltage.astype("<f8").tobytes())
+        if self.displacement is not None:
+            digest.update(self.displacement.astype("<f8").tobytes())
+        return digest.hexdigest()
+
+    def window_slice(self, start: float, stop: float) -> slice:
+        """Return the slice of the samples with start <= time < stop.
+
+        Times within half an interval of a border count as on it, so windows that share a border
+        share no sample and leave none out.
+
+        Raises
+        ------
+        InputError
+            If the window is empty or reaches outside the record; the text names the record's span.
+        """
+        # Whole samples from the record's start, rounded half down: border - interval/2 <= time.
+        first = math.ceil(_offset(self, start) - 0.5)
+        last = math.ceil(_offset(self, stop) - 0.5)
+        if first < 0 or last > self.samples:
+            problem = "reaches outside the record"
+        elif first >= last:
+            problem = "holds no sample"
+        else:
+            return slice(first, last)
+        end = self.start + self.duration
+        raise InputError(
+            f"window {self.clock(start)} to {self.clock(stop)} s: {problem}; choose start < stop "
+            f"within {self.clock(self.start)} to {self.clock(end)} s"
+        )
+
+    def clock(self, time: float) -> str:
+        """Return a time in s with the decimals that tell neighboring samples apart."""
+        return clock(time, self.interval)
+
+    def window(self, start: float, stop: float) -> Record:
+        """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
+        return self._part(self.window_slice(start, stop))
+
+    def upto(self, stop: float, first_reading: float | None = None) -> Record:
+        """Return the record before `stop`, without the readings before `first_reading` (both s).
+
+        The voltage is kept from the first sample on: what it did before the readings that count is
+        the history that the hysteresis remembers.
+        """
+        end = self.window_slice(self.start if first_reading is None else first_reading, stop)
+        record = self._part(slice(0, end.stop))
+        return record if first_reading is None else record.without(slice(0, end.start))
+
+    def without(self, left_out: slice | BoolArray | IntArray) -> Record:
+        """Return the record without the readings at the samples `left_out`, a slice or index."""
+        if self.displacement is None:
+            return self
+        displacement = self.displacement.copy()
+        displacement[left_out] = np.nan
+        return replace(self, displacement=displacement)
+
+    def exclude(self, windows: Sequence[Window]) -> Record:
+        """Return the record without the readings in `windows`, pairs (start, stop) in s.
+
+        A window that begins or ends between two samples takes both of them.
+        """
+        left_out = np.zeros(self.samples, dtype=np.bool_)
+        for start, stop in windows:
+            # Refuses what is outside, or ends before it begins.
+            self.window_slice(start, max(stop, start + self.interval) if start < stop else stop)
+            edges = _offset(self, start) + ROUNDING, _offset(self, stop) - ROUNDING
+            left_out[max(math.floor(edges[0]), 0) : math.ceil(edges[1])] = True
+        return self.without(left_out)
+
+    def decimate(self, factor: int) -> Record:
+        """Return the record with every `factor`-th reading, from the first one on.
+
+        Only readings are left out. The voltage keeps all its samples, because its turning points
+        are what the hysteresis remembers, and a thinned voltage would move them.
+        """
+        if factor != int(factor) or factor < 1:
+            raise InputError(f"decimate: {factor} is not a whole number of samples; give 1 or more")
+        readings = np.flatnonzero(self.has_reading)[:: int(factor)]
+        left_out = np.ones(self.samples, dtype=np.bool_)
+        left_out[readings] = False
+        return self.without(left_out)
+
+    def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
+        """Return training windows, in order of time, and held-out ones as slices of this record.
+
+        Parameters
+        ----------
+        training, held_out : sequences of (start, stop), s
+
+        Raises
+        ------
+        InputError
+            If a window is empty or outside the record, if a training window overlaps a held-out
+            one (nothing would be held out) or another training window (samples would count twice).
+        """
+        trained = [(window, self.window_slice(*window)) for window in sorted(training)]
+        held = [(window, self.window_slice(*window)) for window in held_out]
+        for index, (window, samples) in enumerate(trained):
+            for kind, others in (("training", trained[:index]), ("held-out", held)):
+                for other, other_slice in others:
+                    if samples.start < other_slice.stop and other_slice.start < samples.stop:
+                        raise InputError(
+                            f"training window {self.clock(window[0])} to {self.clock(window[1])} "
+                            f"s: overlaps the {kind} window {self.clock(other[0])} to "
+                            f"{self.clock(other[1])} s; move one (record.train)"
+                        )
+        return Split(tuple(cut for _, cut in trained), tuple(cut for _, cut in held))
+
+    def _part(self, samples: slice) -> Record:
+        return replace(
+            self,
+            voltage=self.voltage[samples],
+            displacement=None if self.displacement is None else self.displacement[samples],
+            truth=None if self.truth is None else self.truth[samples],
+            start=self.start + self.interval * samples.start,
+        )
+
+
+def _offset(record: Record, time: float) -> float:
+    """Return the samples from the start to `time`, cut off where it is outside anyway."""
+    offset = (time - record.start) / record.interval
+    if math.isnan(offset):
+        raise InputError(f"window: {time} s is not a time; give it in s")
+    return min(max(offset, -2.0), record.samples + 2.0)

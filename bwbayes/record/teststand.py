@@ -1,0 +1,385 @@
+"""A virtual test stand: the paper's amplifier, ring bender and laser sensor (its section 2).
+
+A commanded electrode voltage goes through the DAC and the amplifier, drives the actuator of the
+paper's Table 1, and comes back through the laser sensor and the ADC as a
+:class:`~bwbayes.record.record.Record`. Another actuator can be put on it, made of any parts that a
+model can have. Because real actuators do what no model says, the displacement can also have a
+discrepancy of known kind and size, so that an analysis can be held against the truth.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import scipy
+
+from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.errors import InputError, InputWarning, suggestion
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Recursion, first_order_lag
+from bwbayes.model.operators.scalar_memory import OneState
+from bwbayes.record.record import Record
+from bwbayes.record.true_values import true_values
+from bwbayes.record.waveforms import Waveform
+from bwbayes.shown import brief
+
+__all__ = ["Amplifier", "LaserSensor", "RingBender", "VirtualTestStand", "creep"]
+
+# The discrepancies are part of the stand and not adjustable.
+PROCESS_SD = 1.5  # um
+PROCESS_TIME = 0.5  # s
+CREEP_PER_DECADE = 0.01
+QUADRATIC_AT_100_V = 1.0  # um
+DRIFT = 0.5  # um over the record
+
+# Two lags per decade of time make the creep's slope even to 0.3 %.
+CREEP_LAGS = tuple(10.0 ** (half / 2) for half in range(-4, 9))  # 0.01 s to 10,000 s
+
+
+@dataclass(frozen=True)
+class RingBender:
+    """The actuator's parameters: Table 1 of the paper, alpha read as um/V.
+
+    ``d`` and ``alpha`` in um/V, ``beta`` and ``gamma`` in 1/V (at exponent 1), ``initial`` in um,
+    ``mass`` in kg, ``damping`` in N s/m, ``stiffness`` in N/m, ``offset`` in um.
+    """
+
+    d: float = 0.7
+    alpha: float = 0.3575
+    beta: float = 0.0272
+    gamma: float = 0.0172
+    exponent: float = 1.0
+    initial: float = 0.0
+    mass: float = 0.00134
+    damping: float = 1580.0
+    stiffness: float = 4.10e5
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Amplifier:
+    """A DAC and the high-voltage amplifier behind it, into the capacitance of one electrode.
+
+    Parameters
+    ----------
+    gain : float
+        V at the electrode per V of the DAC.
+    limit : float
+        Largest voltage at the electrode, either sign, V.
+    current : float
+        Largest current, A; with the capacitance it limits the slew to current / capacitance.
+    capacitance : float
+        F.
+    dac_bits : int
+        Width of the DAC's two's complement code.
+    dac_range : float
+        Range of the DAC, either sign, V.
+    """
+
+    gain: float = 20.0
+    limit: float = 100.0
+    current: float = 0.065
+    capacitance: float = 940e-9
+    dac_bits: int = 12
+    dac_range: float = 10.0
+
+    @property
+    def step(self) -> float:
+        """The DAC's smallest step, seen at the electrode, V."""
+        return self.gain * 2 * self.dac_range / 2.0**self.dac_bits
+
+    @property
+    def slew(self) -> float:
+        """Fastest change of the electrode's voltage, V/s."""
+        return self.current / self.capacitance
+
+    def output(self, command: FloatArray, interval: float) -> FloatArray:
+        """Voltage at the electrode, held from each sample to the next.
+
+        The level follows the quantized and limited command by at most slew x interval per sample;
+        the ramp inside a sample is not resolved. It starts settled at the first command.
+
+        Parameters
+        ----------
+        command : (samples,) array
+            Commanded voltage at the electrode, V.
+        interval : float
+            Sampling interval, s.
+
+        Returns
+        -------
+        (samples,) array
+            V.
+        """
+        levels = np.clip(_quantize(command, self.step, self.dac_bits), -self.limit, self.limit)
+        reach = self.slew * interval
+        followed = itertools.accumulate(
+            levels.tolist(), lambda held, level: min(max(level, held - reach), held + reach)
+        )
+        return np.fromiter(followed, dtype=np.float64, count=levels.size)
+
+
+@dataclass(frozen=True)
+class LaserSensor:
+    """A laser displacement sensor and the ADC that reads it, zeroed at mid-range.
+
+    Parameters
+    ----------
+    sd : float
+        Standard deviation of its white, Gaussian noise (the data sheet's resolution), um.
+    span : float
+        Range, um; the reading clips at +-span/2.
+    adc_bits : int
+        Width of the ADC's two's complement code, which spans the range.
+    """
+
+    sd: float = 0.5
+    span: float = 2000.0
+    adc_bits: int = 16
+
+    @property
+    def step(self) -> float:
+        """The ADC's smallest step, um."""
+        return self.span / 2.0**self.adc_bits
+
+    def read(self, displacement: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return the readings (samples,) of a displacement (samples,), both in um."""
+        noise = self.sd * generator.standard_normal(displacement.size)
+        return _quantize(displacement + noise, self.step, self.adc_bits)
+
+
+@dataclass(frozen=True)
+class VirtualTestStand:
+    """The whole stand: command in, :class:`bwbayes.Record` with its truth out.
+
+    The actuator follows the amplifier's held output, starting at rest and demagnetized at the
+    first sample; an operator that remembers extrema came there straight from zero volts. On top of
+    its displacement comes one of three discrepancies:
+
+    ``"none"``
+        nothing;
+    ``"process"``
+        a stationary Ornstein-Uhlenbeck process, sd 1.5 um, correlation time 0.5 s: peaks of about
+        5 um, as in the paper's Fig. 8;
+    ``"structural"``
+        :func:`creep` of 1 % of the displacement per decade of time, an even term of
+        1 um (V / 100 V)^2 that goes through the same dynamics, and a steady drift of 0.5 um from
+        the first sample to the last.
+
+    Parameters
+    ----------
+    discrepancy : {"none", "process", "structural"}
+        Which discrepancy.
+    sample_rate : float
+        Hz.
+    amplifier : Amplifier
+        What drives it.
+    sensor : LaserSensor
+        What reads it.
+    actuator : Actuator
+        The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
+        interval is the stand's, its hold that of the amplifier.
+    true : mapping of str to float
+        True values of its parameters; of those that are not given the ring bender's, or typical
+        ones. With an ``initial`` the hysteresis starts in that state.
+
+    Raises
+    ------
+    InputError
+        If the discrepancy is unknown, the sample rate not above zero, or a true value is none of
+        the actuator's parameters.
+    """
+
+    __repr__ = brief
+
+    discrepancy: Literal["none", "process", "structural"] = "process"
+    sample_rate: float = 1000.0
+    amplifier: Amplifier = Amplifier()
+    sensor: LaserSensor = LaserSensor()
+    actuator: Actuator = field(default_factory=lambda: Actuator("second-order", "zero"))
+    true: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.discrepancy not in ("none", "process", "structural"):
+            raise InputError(
+                f"test stand: discrepancy: no {self.discrepancy!r}; "
+                "give 'none', 'process' or 'structural'"
+            )
+        if not (math.isfinite(self.sample_rate) and self.sample_rate > 0):
+            raise InputError(
+                f"test stand: sample_rate: {self.sample_rate} Hz is not above zero; "
+                "give a positive, finite number"
+            )
+        for name in self.true:
+            if name not in self.actuator.parameters:
+                raise InputError(
+                    f"test stand: {name}: its actuator has no such parameter; "
+                    f"{suggestion(name, self.actuator.parameters)}"
+                )
+
+    def parameters(self) -> dict[str, float]:
+        """Return all true values by name: the actuator's, ``sensor_sd`` and the process's.
+
+        ``discrepancy_sd`` (um) and ``discrepancy_time`` (s) exist for ``"process"`` only. There is
+        no ``initial`` where no value of it is the demagnetized state.
+        """
+        truth = {**self._values, "sensor_sd": self.sensor.sd}
+        if self._from_rest:
+            del truth["initial"]
+        if self.discrepancy == "process":
+            truth |= {"discrepancy_sd": PROCESS_SD, "discrepancy_time": PROCESS_TIME}
+        return truth
+
+    def run(self, drive: Waveform | ArrayLike, generator: np.random.Generator) -> Record:
+        """Drive the actuator and record it.
+
+        Parameters
+        ----------
+        drive : Waveform or (samples,) array
+            Commanded voltage at the electrode, V; an array has the stand's sample rate.
+        generator : numpy.random.Generator
+            Source of the discrepancy process and of the sensor's noise.
+
+        Returns
+        -------
+        Record
+            Its voltage is the command, before DAC and amplifier; its truth is the actuator's
+            displacement with the discrepancy, which a perfect sensor would read.
+
+        Raises
+        ------
+        InputError
+            If the voltage is not one finite row of at least two samples.
+
+        Warns
+        -----
+        InputWarning
+            If the command goes beyond the amplifier's limit.
+        """
+        command = self._command(drive)
+        output = self.amplifier.output(command, 1 / self.sample_rate)
+        truth = self._displacement(output)
+        truth = truth + self._discrepancy(output, truth, generator)
+        return Record(
+            voltage=command,
+            displacement=self.sensor.read(truth, generator),
+            interval=1 / self.sample_rate,
+            voltage_is="command",
+            origin=f"virtual test stand, discrepancy {self.discrepancy}",
+            truth=truth,
+        )
+
+    def _command(self, drive: Waveform | ArrayLike) -> FloatArray:
+        if isinstance(drive, Waveform):
+            command = drive.sample(self.sample_rate)[1]
+        else:
+            command = np.array(drive, dtype=np.float64)
+        if command.ndim != 1 or command.size < 2 or not np.isfinite(command).all():
+            raise InputError(
+                f"test stand: voltage of shape {command.shape}: give one row of at least two "
+                "finite values"
+            )
+        if np.abs(command).max() > self.amplifier.limit:
+            warnings.warn(
+                f"test stand: voltage: the command reaches {np.abs(command).max():g} V, the "
+                f"amplifier limits it to {self.amplifier.limit:g} V; use a smaller amplitude",
+                InputWarning,
+                stacklevel=3,
+            )
+        return command
+
+    @cached_property
+    def _values(self) -> dict[str, float]:
+        """The true values of the actuator's parameters."""
+        return true_values(self.actuator, asdict(RingBender())) | dict(self.true)
+
+    @property
+    def _from_rest(self) -> bool:
+        """Whether the voltage came straight from zero; else ``initial`` is the first state."""
+        one_state = isinstance(self.actuator.hysteresis, OneState)
+        return not one_state and "initial" not in self.true
+
+    def _displacement(self, output: FloatArray) -> FloatArray:
+        actuator = replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
+        theta = np.array([[self._values[name] for name in actuator.parameters]])
+        try:
+            (displacement,) = actuator.displacement(theta, output, from_rest=self._from_rest)
+        except InputError as error:
+            raise InputError(f"test stand: {error}") from None
+        return np.asarray(displacement, dtype=np.float64)
+
+    def _discrepancy(
+        self, output: FloatArray, displacement: FloatArray, generator: np.random.Generator
+    ) -> FloatArray:
+        interval = 1 / self.sample_rate
+        match self.discrepancy:
+            case "process":
+                return _ornstein_uhlenbeck(displacement.size, interval, generator)
+            case "structural":
+                drift = np.linspace(0.0, DRIFT, displacement.size)
+                return creep(displacement, interval) + self._even_term(output, interval) + drift
+            case "none":
+                return np.zeros_like(displacement)
+
+    def _even_term(self, output: FloatArray, interval: float) -> FloatArray:
+        strain = QUADRATIC_AT_100_V * (output / 100.0) ** 2
+        column = {name: np.array([value]) for name, value in self._values.items()}
+        dynamics = self.actuator.filter.recursion(column, 1, interval, "zero")
+        moved: FloatArray = strain[0] + _from_rest(dynamics, strain[np.newaxis] - strain[0])[0]
+        return moved
+
+
+def creep(displacement: FloatArray, interval: float) -> FloatArray:
+    """Creep of 1 % of the displacement per decade of time, by Kelvin-Voigt elements.
+
+    Each element i is a lag, ``tau_i c_i' + c_i = 0.005 x``, and the creep is their sum. The times
+    tau_i are two per decade from 0.01 s to 10,000 s, so that after a step the creep rises by 1 %
+    of it per decade within a hundredth of that, from 0.1 s to 100 s after the step. The elements
+    are at rest for zero displacement before the first sample, and the displacement is taken as
+    linear between samples.
+
+    Parameters
+    ----------
+    displacement : (samples,) array
+        x, um.
+    interval : float
+        Sampling interval, s.
+
+    Returns
+    -------
+    (samples,) array
+        um.
+    """
+    elements = first_order_lag(np.array(CREEP_LAGS), interval, "first")
+    driven = np.tile(displacement, (len(CREEP_LAGS), 1))
+    crept: FloatArray = CREEP_PER_DECADE / 2 * _from_rest(elements, driven).sum(axis=0)
+    return crept
+
+
+def _from_rest(dynamics: Recursion, drive: FloatArray) -> FloatArray:
+    """Response (models, samples) of dynamics that are at rest at zero before the first sample."""
+    return dynamics.run(drive, dynamics.at_rest())
+
+
+def _ornstein_uhlenbeck(
+    samples: int, interval: float, generator: np.random.Generator
+) -> FloatArray:
+    """Draw the process (samples,) in um from its stationary distribution, exact at any interval."""
+    decay = math.exp(-interval / PROCESS_TIME)
+    shocks = PROCESS_SD * generator.standard_normal(samples)
+    shocks[1:] *= math.sqrt(-math.expm1(-2 * interval / PROCESS_TIME))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
+
+
+def _quantize(values: FloatArray, step: float, bits: int) -> FloatArray:
+    """Round to the levels of a two's complement converter, clipped at its ends."""
+    half = 2.0 ** (bits - 1)
+    levels: FloatArray = step * np.clip(np.round(values / step), -half, half - 1)
+    return levels

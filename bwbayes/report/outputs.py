@@ -1,0 +1,145 @@
+"""The files of a finished run: posterior, bands, summary.
+
+Each is written under another name and renamed when it is whole, so a reader never sees half a
+file. This module alone knows arviz's labeled posterior.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.prediction.bands import Bands
+from bwbayes.record.record import Record
+from bwbayes.report.result import Result
+
+__all__ = ["posterior_tree", "write_bands", "write_posterior", "write_summary"]
+
+
+def write_posterior(
+    path: Path, result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
+) -> None:
+    """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
+    tree = posterior_tree(result, log_likelihood, records)
+    temporary = path.with_suffix(".partial")
+    # From memory: HDF5 does not survive a disk that is full.
+    temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
+    temporary.replace(path)
+
+
+def posterior_tree(
+    result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
+) -> Any:
+    """Return the draws as arviz groups, an xarray.DataTree, and whether they have converged.
+
+    Groups: posterior, sample_stats, log_likelihood (of all readings together), observed_data and
+    constant_data. A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say
+    which. The attribute ``converged`` is 1 or 0: without convergence the draws are none of the
+    posterior.
+
+    Parameters
+    ----------
+    result
+        The run.
+    log_likelihood
+        (steps, ensembles, walkers), nats.
+    records
+        The training records by name. The variables and times of several have their record's name
+        behind their own: ``displacement_loops``.
+    """
+    import arviz_base  # noqa: PLC0415  # slow to load
+
+    _, ensembles, walkers, _ = result.draws.shape
+
+    def chains(values: FloatArray) -> FloatArray:
+        return np.moveaxis(values, 0, 2).reshape(
+            ensembles * walkers, len(values), *values.shape[3:]
+        )
+
+    of = {f"_{name}" if len(records) > 1 else "": record for name, record in records.items()}
+    measured = {f"displacement{end}": np.asarray(record.displacement) for end, record in of.items()}
+    driven = {f"voltage{end}": record.voltage for end, record in of.items()}
+    times = {f"time{end}": record.time for end, record in of.items()}
+    drawn = chains(result.draws)
+    tree = arviz_base.from_dict(
+        {
+            "posterior": {p.name: drawn[..., i] for i, p in enumerate(result.free)},
+            "sample_stats": {"lp": chains(result.log_density)},
+            "observed_data": measured,
+            "constant_data": driven,
+        },
+        coords=times,
+        dims={f"{name}{end}": [f"time{end}"] for end in of for name in ("displacement", "voltage")},
+        check_conventions=False,  # more walkers than steps are as they should be
+    )
+    along = {
+        "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
+        "walker": ("chain", np.tile(np.arange(walkers), ensembles)),
+    }
+    for group in ("posterior", "sample_stats"):
+        tree[group] = tree[group].to_dataset().assign_coords(along)
+    density = ("chain", "draw"), chains(log_likelihood)
+    statistics = tree["sample_stats"].to_dataset()
+    tree["log_likelihood"] = statistics.drop_vars("lp").assign(displacement=density)
+    for group, names, unit in (
+        ("observed_data", measured, "um"),
+        ("constant_data", driven, "V"),
+    ):
+        for name, time in zip(names, times, strict=True):
+            tree[group][name].attrs["units"] = unit
+            tree[group][time].attrs["units"] = "s"
+    tree.attrs["converged"] = tree["posterior"].attrs["converged"] = int(result.outcome.converged)
+    for parameter in result.free:
+        tree["posterior"][parameter.name].attrs["units"] = parameter.unit
+    return tree
+
+
+def write_bands(path: Path, bands: Sequence[Bands]) -> None:
+    """Write bands as CSV; of several sets, a first column ``set`` names each.
+
+    Every column has seven digits of its range, however far from zero it lies.
+    """
+    temporary = path.with_suffix(".partial")
+    with temporary.open("w", encoding="utf-8") as file:
+        for number, predicted in enumerate(bands):
+            names, columns = zip(*predicted.columns(), strict=True)
+            if number == 0:
+                file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
+            prefix = f"{predicted.name}," if len(bands) > 1 else ""
+            row = prefix + ",".join(_format(n, c) for n, c in zip(names, columns, strict=True))
+            row += "\n"
+            file.writelines(row % values for values in zip(*columns, strict=True))
+    temporary.replace(path)
+
+
+def _format(name: str, column: FloatArray) -> str:
+    """Return the format of a column (samples,), which may hold NaN."""
+    values = column[np.isfinite(column)]
+    span = float(np.ptp(values)) if values.size else 0.0
+    far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
+    # A float has no more than 17 digits.
+    extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
+    return f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g"
+
+
+def write_summary(path: Path, summary: Mapping[str, object]) -> None:
+    """Write a summary as JSON; numbers that are not finite become null."""
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n")
+    temporary.replace(path)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,191 @@
+"""A finished run in one object, and its summary in numbers.
+
+Everything that is written or drawn after sampling comes from a :class:`Result`. If the sampling
+has not converged, the result keeps the draws but speaks of no interval: no parameter table, no
+bands, no scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.consistency import Agreement
+from bwbayes.diagnosis.information import Learned
+from bwbayes.diagnosis.innovations import Innovations
+from bwbayes.diagnosis.predictive_checks import Replicated
+from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Verdict
+from bwbayes.inference.parameters import Parameter
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.loops import Loops
+from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.steps import StepResponse
+from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.shown import brief
+
+__all__ = ["Result", "summary"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run.
+
+    Parameters
+    ----------
+    name
+        The run's name.
+    outcome
+        How the sampling ended.
+    parameters
+        All parameters, fixed ones included.
+    draws
+        (steps, ensembles, walkers, free), parameters in their own units.
+    log_density
+        (steps, ensembles, walkers), nats.
+    moves
+        How often each kind of move was proposed to a walker on the way to these draws, and
+        accepted.
+    bands, scores
+        Of every window and record that was predicted; ``scores`` by the bands' name, for those
+        with a measurement. Both empty unless converged.
+    verdicts
+        Whether the bands hold, by their name, for those with a measurement.
+    innovations
+        The innovation of each fitted reading, at the most probable draw, by the record; empty
+        unless converged.
+    loops
+        The loops of the actuator, measured; None unless converged.
+    steps
+        The responses to the steps among the records that were predicted, by name; empty unless
+        converged.
+    agreement
+        Of several records, how each agrees with the others, by name; empty unless converged.
+    explanations
+        What may explain each fitted record better, by name, the best first; empty unless converged.
+    learned
+        What the record taught: prior against posterior; None unless converged.
+    replicated
+        Each fitted record among replicated ones, by name; empty unless converged.
+    facts
+        What was run, for people: one line each, by subject.
+    remarks
+        What a user should know: warnings of the record, undetermined combinations.
+    truth
+        The true parameters, of a simulated record.
+    """
+
+    __repr__ = brief
+
+    name: str
+    outcome: Outcome
+    parameters: tuple[Parameter, ...]
+    draws: FloatArray
+    log_density: FloatArray
+    moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    bands: tuple[Bands, ...] = ()
+    scores: Mapping[str, Scores] = field(default_factory=dict)
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
+    loops: Loops | None = None
+    steps: Mapping[str, StepResponse] = field(default_factory=dict)
+    agreement: Mapping[str, Agreement] = field(default_factory=dict)
+    explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
+    learned: Learned | None = None
+    replicated: Mapping[str, Replicated] = field(default_factory=dict)
+    facts: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    truth: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """The sampled parameters, in the order of the draws."""
+        return tuple(p for p in self.parameters if p.fixed is None)
+
+    @property
+    def flat_draws(self) -> FloatArray:
+        """All draws, (draws, free)."""
+        return self.draws.reshape(-1, self.draws.shape[-1])
+
+    @property
+    def standing(self) -> Standing:
+        """Whether all bands hold."""
+        return Standing.of(self.verdicts.values())
+
+
+def summary(result: Result) -> dict[str, object]:
+    """Return a run's numbers as ``summary.json`` holds them.
+
+    ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
+    ``identifiability``, ``replicated`` and ``explanations`` are None unless the sampling has
+    converged; ``agreement`` is there for several records alone.
+    """
+    outcome, check = result.outcome, result.outcome.check
+    numbers: dict[str, object] = {
+        "converged": outcome.converged,
+        "stop_reason": outcome.stop_reason,
+        "steps": check.steps,
+        "acceptance": check.acceptance,
+        "sampling": {
+            "proposals": {move: proposed for move, (proposed, _) in result.moves.items()},
+            "acceptance": {
+                move: accepted / proposed for move, (proposed, accepted) in result.moves.items()
+            },
+            "pareto_k": check.pareto_k,
+        },
+        "remarks": list(result.remarks),
+    }
+    if not outcome.converged:
+        sections = ("parameters", "validation", "innovations", "loops", "step_responses")
+        return numbers | dict.fromkeys((*sections, "identifiability", "replicated", "explanations"))
+    validation = {
+        name: scores.numbers | (result.verdicts[name].summary if name in result.verdicts else {})
+        for name, scores in result.scores.items()
+    }
+    innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
+    if len(innovations) == 1:
+        # Those of one record stand alone, those of several by their names.
+        innovations = next(iter(result.innovations.values())).numbers
+    if result.agreement:
+        numbers["agreement"] = {n: record.numbers for n, record in result.agreement.items()}
+    return numbers | {
+        "parameters": _parameters(result),
+        "validation": validation,
+        "innovations": innovations or None,
+        "loops": None if result.loops is None else result.loops.numbers,
+        "step_responses": {name: step.numbers for name, step in result.steps.items()},
+        "identifiability": None if result.learned is None else result.learned.numbers,
+        "replicated": {n: checks.numbers for n, checks in result.replicated.items()} or None,
+        "explanations": {
+            name: [explanation.numbers for explanation in explanations]
+            for name, explanations in result.explanations.items()
+        },
+    }
+
+
+def _parameters(result: Result) -> dict[str, dict[str, object]]:
+    flat, check = result.flat_draws, result.outcome.check
+    lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
+    sd = np.std(flat, axis=0, ddof=1)
+    columns = {
+        "mean": np.mean(flat, axis=0),
+        "sd": sd,
+        "median": median,
+        "lower_95": lower,
+        "upper_95": upper,
+        "ess_bulk": check.ess_bulk,
+        "ess_tail": check.ess_tail,
+        "rhat": check.rhat,
+        "mcse_mean": sd / np.sqrt(check.ess_mean),
+    }
+    table: dict[str, dict[str, object]] = {}
+    for i, parameter in enumerate(result.free):
+        row: dict[str, object] = {key: float(values[i]) for key, values in columns.items()}
+        table[parameter.name] = row | {"unit": parameter.unit}
+        if parameter.name in result.truth:
+            table[parameter.name]["truth"] = result.truth[parameter.name]
+    return table

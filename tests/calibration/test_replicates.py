@@ -1,0 +1,245 @@
+"""Replicates: records come from the model that is fitted, and statistics are what they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.calibration import replicates as module
+from bwbayes.calibration.records import OtherRecord, Simulated, covered
+from bwbayes.calibration.replicates import RANKED, Experiment, replicate, replicates
+from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.distributions import Distribution
+from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.prediction.prediction import Start
+from bwbayes.record.record import Record
+from bwbayes.sampling.plan import SamplingPlan
+from tests.app import example
+from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
+
+# Three free parameters, so that a replicate takes a fraction of a second.
+FIXED = {"initial": 0.0, "offset": 0.0, "beta": 0.0272, "gamma": 0.0172}
+PRIORS = {
+    "d": Distribution("normal", {"mean": 0.7, "sd": 0.05}),
+    "alpha": Distribution("normal", {"mean": 0.3, "sd": 0.05}),
+    "sensor_sd": Distribution("lognormal", {"median": 0.5, "sigma": 0.3}),
+}
+PLAN = SamplingPlan(ess=100, walkers=12, block=10, most_pilot_steps=30, most_steps=2_000)
+
+
+def small(**changes: object) -> Experiment:
+    """Return an experiment of 80 samples, of which 20 are held out."""
+    posterior = short_posterior("white", 80, fixed=FIXED, priors=PRIORS, training=(slice(0, 60),))
+    return replace(Experiment(posterior, PLAN, {"end": slice(60, 80)}), **changes)  # type: ignore[arg-type]
+
+
+def test_replicate_depends_on_seed_and_number_alone() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        made = {one.number: one.entry() for one in replicates(small(), 1, [0, 1], executor, 2)}
+    both = [made[0], made[1]]
+    assert both[1] == replicate(small(), 1, 1).entry()
+    assert both[1]["truth"] != both[0]["truth"]
+    assert both[1]["truth"] != replicate(small(), 2, 1).entry()["truth"]
+
+
+def test_entry_is_plain_and_complete() -> None:
+    made = replicate(small(), 1, 3)
+    entry = made.entry()
+    assert entry == json.loads(json.dumps(entry))
+    names = ["d", "alpha", "sensor_sd", "log_likelihood", "opening", "range"]
+    assert names == list(entry["ranks"]) == list(entry["truth"])
+    assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
+    assert (3, True) == (entry["number"], entry["converged"])
+    assert (RANKED, len(names)) == made.draws.shape
+    for name, true, draws in zip(names, made.truth, made.draws.T, strict=True):
+        assert sum(draw < true for draw in draws) == entry["ranks"][name]
+
+
+def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise np.linalg.LinAlgError("priors: no draw has a finite posterior density")
+
+    monkeypatch.setattr("bwbayes.inference.map_estimate.fit", refuse)
+    entry = replicate(small(), 1, 0).entry()
+    assert (False, {}, {}) == (entry["converged"], entry["ranks"], entry["covered"])
+    assert "finite posterior density" in entry["stop_reason"]
+    assert 6 == len(entry["truth"])
+
+
+def test_each_band_is_held_against_what_it_is_for() -> None:
+    """Model, truth and readings lie 10 um apart, and each kind of band around its own."""
+    model = np.zeros(80)
+    record = Record(model, model + 20, 0.01, truth=model + 10)
+    middles = zip(KINDS, (0.0, 10.0, 20.0), strict=True)
+    around = {(kind, level): middle for kind, middle in middles for level in LEVELS}
+    bands = replace(
+        example.bands(samples=20),
+        lower={key: np.full(20, middle - 1) for key, middle in around.items()},
+        upper={key: np.full(20, middle + 1) for key, middle in around.items()},
+    )
+    parts = list(covered([(bands, Simulated(record, model), slice(60, 80))]))
+    assert [(kind, level, 1.0) for kind, level in around] == parts
+
+
+def test_replicate_with_too_few_draws_is_not_ranked() -> None:
+    """Among fewer than others it would have other ranks."""
+    plan = replace(PLAN, walkers=6, block=5, most_steps=5)
+    made = replicate(small(plan=plan), 1, 0)
+    assert (5, False, {}, {}) == (made.steps, made.converged, made.entry()["ranks"], made.covered)
+
+
+def test_only_so_many_are_under_way_together() -> None:
+    """Who stops after the first has to wait for no more than those."""
+    begun: list[Any] = []
+
+    class Watched(ThreadPoolExecutor):
+        def submit[**P, T](
+            self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
+        ) -> Future[T]:
+            begun.append(args[-1])
+            return super().submit(fn, *args, **kwargs)
+
+    with Watched(1) as executor:
+        made = replicates(small(), 1, range(100), executor, 2)
+        next(made)
+        assert [0, 1] == begun
+        next(made)
+        assert 3 >= len(begun)
+
+
+def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
+    steps, time = 300, 20.0
+    kept = np.exp(-1 / (time / 2))
+    generator = np.random.default_rng(1)
+    chain = generator.standard_normal((steps, 4, 12, 1))
+    for step in range(1, steps):
+        chain[step] = kept * chain[step - 1] + np.sqrt(1 - kept**2) * chain[step]
+    spacing, chosen = module._independent(chain, time, np.random.default_rng(2))
+    assert (20, (RANKED, 1)) == (spacing, chosen.shape)
+    assert RANKED == np.unique(chosen).size
+    assert np.isin(chosen, chain[::-20]).all()
+
+
+# Simulated records
+
+
+def another(**changes: object) -> OtherRecord:
+    """Return a sine of another rate; the last reading is missing, and a tenth is the lead-in."""
+    voltage = 60 * np.sin(2 * np.pi * np.arange(200) / 100 + 1)
+    reading = np.where(np.arange(200) < 199, 0.0, np.nan)
+    other = OtherRecord(Record(voltage, reading, 0.005), Start(lead_in=0.1))
+    return replace(other, **changes)  # type: ignore[arg-type]
+
+
+def test_bands_of_other_records_are_held_against_them() -> None:
+    common = small(others={"one": another(), "part": another(window=(0.5, 1.0))})
+    entry = replicate(common, 1, 3).entry()
+    assert list(common.bands) == list(entry["covered"])
+    assert entry["covered"]["one sensor 50"] != entry["covered"]["part sensor 50"]
+    # It does not matter to the rest whether there are others.
+    alone = replicate(small(), 1, 3).entry()
+    assert alone["ranks"] == entry["ranks"]
+    assert alone["covered"] == {name: entry["covered"][name] for name in alone["covered"]}
+
+
+def moving_posterior() -> tuple[Posterior, FloatArray]:
+    posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
+    return posterior, truth(posterior)
+
+
+def test_another_record_starts_anywhere() -> None:
+    """Its h is even between the extremes, its unrest and its offset have the sds of their priors.
+
+    Without dynamics and hysteresis: the offset's alone.
+    """
+    posterior, theta = moving_posterior()
+    other = another()
+    drive = theta[0, posterior.prior.names.index("d")] * other.record.voltage[0]
+    many = [other.simulated(posterior, theta, np.random.default_rng(i)).model for i in range(400)]
+    late, first = np.array(many)[:, -1], np.array(many)[:, 0] - drive
+    offset_sd = np.ptp(posterior.only.readings.values)
+    assert np.std(late) == pytest.approx(offset_sd, rel=0.12)
+    unrest_sd = theta[0, 0] * np.ptp(posterior.only.voltage) / 2
+    assert np.std(first - late) == pytest.approx(unrest_sd, rel=0.12)
+
+
+def test_one_discrepancy_goes_through_all_training_windows() -> None:
+    """As the likelihood takes it: over 200 records, neighbors on a border are correlated too.
+
+    Less than those in a window only because correlation times that the prior draws differ.
+    """
+    windows = (slice(0, 30), slice(30, 60))
+    fixed = FIXED | {"discrepancy_time": 0.2}
+    posterior = short_posterior("discrepancy", 80, fixed=fixed, training=windows)
+    experiment = Experiment(posterior, PLAN)
+    away = []
+    for seed in range(200):
+        theta, records = module._simulated(experiment, np.random.default_rng(seed))
+        made = records["record"]
+        assert made.record.truth is not None
+        away.append((made.record.truth - made.model) / theta["discrepancy_sd"])
+    last_but_one, last, first = np.array(away)[:, 28:31].T
+    within, across = (np.corrcoef(last, other)[0, 1] for other in (last_but_one, first))
+    assert across > 0.5
+    assert across == pytest.approx(within, abs=0.2)
+
+
+def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
+    """The dynamics' state at the first sample has the spread that the likelihood expects."""
+    posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
+    moving = Experiment(posterior.altered(from_rest=False), PLAN)
+    names = posterior.only.actuator.parameters
+    away = []
+    for seed in range(300):
+        theta, records = module._simulated(moving, np.random.default_rng(seed))
+        model = records["record"].model
+        rest = theta["d"][0] * posterior.only.voltage[0] - theta["initial"][0] + theta["offset"][0]
+        away.append((model[0] - rest) / (theta["d"][0] * np.ptp(posterior.only.voltage) / 2))
+    assert "lag" in names
+    assert np.std(away) == pytest.approx(1.0, rel=0.2)
+
+
+# Loop measures
+
+
+def test_loop_of_a_lag_is_known_in_closed_form() -> None:
+    """Without hysteresis a sine V sin ωt comes out as d V/√(1 + (ωτ)²) sin(ωt − φ), tan φ = ωτ.
+
+    So the loop opens by 2 d V ωτ/(1 + (ωτ)²) at zero and ranges over 2 d V/√(1 + (ωτ)²).
+    """
+    samples, interval, lag, d = 4_000, 1e-3, 0.02, 0.7
+    time = interval * np.arange(samples)
+    # From the crest, where it is at rest: the sine has settled by the first passage.
+    voltage = 100 * np.cos(2 * np.pi * time)
+    posterior = posterior_of(voltage, voltage, Actuator("lag", "first", interval), "white")
+    experiment = Experiment(posterior, PLAN)
+    known = {"d": d, "alpha": 1e-9, "beta": 0.02, "exponent": 1.0, "lag": lag, "sensor_sd": 1.0}
+    theta = np.array([[known.get(name, 0.0) for name in posterior.prior.names]])
+    _, opening, extent = experiment.measures(posterior, theta)[0]
+    turn = 2 * np.pi * lag
+    np.testing.assert_allclose(2 * d * 100 * turn / (1 + turn**2), opening, rtol=1e-3)
+    # The crest that it starts from is the range's upper end.
+    np.testing.assert_allclose(d * 100 * (1 + 1 / np.sqrt(1 + turn**2)), extent, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])
+def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None) -> None:
+    voltage = decaying_sine(80) + shift
+    posterior = small().posterior.altered(voltage=voltage)
+    expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
+    assert expected == Experiment(posterior, PLAN).level
+
+
+def test_voltage_without_a_loop_is_refused() -> None:
+    posterior = small().posterior.altered(voltage=np.linspace(0.0, 100.0, 80))
+    with pytest.raises(InputError, match="does not go back and forth"):
+        Experiment(posterior, PLAN)

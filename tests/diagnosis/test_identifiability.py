@@ -1,0 +1,166 @@
+"""One constant amplitude does not identify the model, decaying amplitudes do, and the user hears.
+
+At the test stand's 1000 Hz, with the damping free. What is left depends on the record and the mode
+alone, so the mode is put at the truth.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.identifiability import percent, spectrum, undetermined
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.distributions import Distribution
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Sine, Waveform, signal
+from tests.inference.problems import (
+    TRUE_NOISE,
+    posterior_of,
+    posterior_of_record,
+    short_posterior,
+    truth,
+)
+
+FIXED = {"mass": 0.00134, "stiffness": 4.1e5, "initial": 0.0}
+
+Discrepancy = Literal["none", "process", "structural"]
+
+
+def combinations(posterior: Posterior, point: PointFit) -> list[str]:
+    """Name the combinations that a record does not determine."""
+    return [finding.text.split(":")[0] for finding in undetermined(posterior, point)]
+
+
+def measured(
+    drive: Waveform, discrepancy: Discrepancy = "process", seed: int = 1, rate: float = 1000.0
+) -> Posterior:
+    record = VirtualTestStand(discrepancy, rate).run(drive, np.random.default_rng(seed))
+    return posterior_of_record(record, FIXED)
+
+
+def at_truth(posterior: Posterior) -> PointFit:
+    columns = [posterior.prior.names.index(name) for name in posterior.names]
+    mode = posterior.prior.unconstrain(truth(posterior)[:, columns])[0]
+    unit = np.eye(mode.size)
+    return PointFit(mode, unit, 0.0, mode[np.newaxis], unit)
+
+
+def left(posterior: Posterior) -> FloatArray:
+    return spectrum(posterior, at_truth(posterior))[0]
+
+
+def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
+    return Waveform(Sine(amplitude, frequency), periods / frequency)
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "frequency", "discrepancy"),
+    [(100.0, 1.0, "none"), (50.0, 0.5, "process"), (100.0, 0.5, "structural")],
+)
+def test_one_sine_leaves_a_combination_with_gamma_open(
+    amplitude: float, frequency: float, discrepancy: Discrepancy
+) -> None:
+    posterior = measured(sine(amplitude, frequency), discrepancy)
+    (finding,) = undetermined(posterior, at_truth(posterior))
+    assert finding.text.startswith("gamma")
+    assert "% of the prior's SD remains (next alpha" in finding.text
+    assert finding.fix == "vary the amplitude: let it decay to a tenth over ten periods"
+
+
+def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
+    """What it shows is d - alpha and alpha beta: both may grow while beta falls."""
+    fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
+    record = measured(sine(10.0, 1.0, 3.0), rate=250.0).only
+    small = posterior_of(record.voltage, record.displacement, record.actuator, "discrepancy", fixed)
+    (finding,) = undetermined(small, at_truth(small))
+    assert finding.text.startswith("alpha with d against beta: ")
+    assert finding.fix == "drive over more than 20 V peak to peak, if the actuator allows it"
+
+
+@pytest.mark.parametrize("discrepancy", ["none", "structural"])
+def test_decaying_amplitudes_leave_nothing_open(discrepancy: Discrepancy) -> None:
+    posterior = measured(signal("identification"), discrepancy)
+    assert [] == combinations(posterior, at_truth(posterior))
+
+
+def test_no_more_than_all_of_a_prior_is_left() -> None:
+    """A posterior that is wider than its prior has all of it, and not 101 %."""
+    assert ["34%", "99%", "all", "all"] == [percent(part) for part in (0.34, 0.99, 0.996, 1.25)]
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.03])
+def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float) -> None:
+    """With d alone, whose slope is the voltage, and a discrepancy of a percent of the range.
+
+    No stretch comes twice, so each counts; the discrepancy's time is half of a stretch.
+    """
+    known = {"alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0, "offset": 0.0}
+    prior = {"d": Distribution("lognormal", {"median": 0.7, "sigma": sigma})}
+    posterior = short_posterior("white", 400, fixed=known, priors=prior)
+    voltage = posterior.only.voltage
+    turns = 1 + np.count_nonzero(np.diff(np.sign(np.diff(voltage))))
+    lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
+    floor = 0.01 * np.ptp(posterior.only.displacement)
+    covariance = floor**2 * np.exp(-lags / (200 / turns)) + TRUE_NOISE["sensor_sd"] ** 2 * np.eye(
+        400
+    )
+    slope = 0.7 * sigma * voltage
+    expected = (1 + slope @ np.linalg.solve(covariance, slope)) ** -0.5
+    assert 0.1 < expected < 0.95
+    np.testing.assert_allclose(expected, left(posterior), rtol=0.03)
+
+
+def test_decaying_amplitudes_leave_less_open_than_a_sine_the_more_of_them_the_less() -> None:
+    """The verification signal has four amplitudes besides its largest, the other twenty."""
+    constant = left(measured(sine(100.0, 0.1, periods=4.0)))
+    four = left(measured(signal("verification")))
+    twenty = left(measured(signal("identification")))
+    assert (four < 0.9 * constant).all()
+    assert (twenty < 0.9 * four).all()
+
+
+def test_more_periods_of_the_same_loop_tell_hardly_more() -> None:
+    """Each distinct stretch counts once; only the sensor noise averages out."""
+    short, long = (left(measured(sine(100.0, 1.0, periods))) for periods in (4.0, 16.0))
+    np.testing.assert_allclose(short, long, rtol=0.1)
+
+
+def test_what_comes_after_the_training_window_does_not_matter() -> None:
+    """Periods that the likelihood does not see are no reason to count those it sees less."""
+    posterior = measured(sine(100.0, 1.0))
+    seen = slice(0, 2250)
+    alone = posterior.altered(
+        voltage=posterior.only.voltage[seen],
+        displacement=posterior.only.displacement[seen],
+    )
+    expected, got = (left(p.altered(training=(seen,))) for p in (alone, posterior))
+    np.testing.assert_allclose(expected, got, rtol=0.05)
+
+
+def at_rest(posterior: Posterior) -> Posterior:
+    return posterior.altered(voltage=0 * posterior.only.voltage)
+
+
+def test_a_constant_voltage_tells_nothing_about_the_loop() -> None:
+    posterior = at_rest(short_posterior(samples=200))
+    assert ("d", "alpha", "beta", "gamma") == posterior.names[:4]
+    np.testing.assert_allclose(1, left(posterior), atol=1e-6)
+
+
+def test_a_known_loop_has_nothing_open() -> None:
+    """Whatever else is free."""
+    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
+    posterior = short_posterior(samples=60, fixed=known)
+    assert "offset" in posterior.names
+    assert [] == combinations(posterior, at_truth(posterior))
+
+
+def test_a_loop_with_one_free_parameter_is_named_after_it() -> None:
+    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "initial": 0.0}
+    usual = short_posterior(samples=60, fixed=known)
+    assert ["gamma"] == combinations(at_rest(usual), at_truth(usual))

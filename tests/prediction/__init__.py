@@ -1,0 +1,1 @@
+"""Tests of bwbayes.prediction: predictions and how they are judged."""

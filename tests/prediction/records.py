@@ -1,0 +1,97 @@
+"""Bands whose error is known, and records that spoil them: to test verdicts without sampling.
+
+A record is a loop of the model; its bands have an error of the parameters (an offset and a gain,
+drawn once a record), an Ornstein-Uhlenbeck discrepancy and white sensor noise, of just the sizes
+that the bands say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.operators.bouc_wen import hysteresis
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+
+__all__ = ["Made", "bands_of", "made", "process"]
+
+
+@dataclass(frozen=True)
+class Made:
+    """A record that its bands describe: arrays (samples,), um, V, s; ``memory`` in s."""
+
+    time: FloatArray
+    voltage: FloatArray
+    mean: FloatArray
+    error: FloatArray
+    sds: dict[Kind, FloatArray]
+    memory: float
+    sensor: float
+
+
+def process(
+    generator: np.random.Generator, samples: int, interval: float, memory: float
+) -> FloatArray:
+    """Return a stationary process (samples,) of unit variance that forgets by exp(-t/memory)."""
+    kept = np.exp(-interval / memory)
+    shocks = generator.normal(size=samples) * np.sqrt(1 - kept**2)
+    shocks[0] /= np.sqrt(1 - kept**2)
+    values: FloatArray = lfilter([1.0], [1.0, -kept], shocks)
+    return values
+
+
+def made(
+    generator: np.random.Generator,
+    length: float = 20.0,
+    interval: float = 0.01,
+    memory: float = 0.3,
+    discrepancy: float = 1.0,
+    sensor: float = 0.3,
+    parameters: float = 0.3,
+) -> Made:
+    """Make a good record of ``length`` seconds; sds of the parts in um."""
+    time = interval * np.arange(round(length / interval), dtype=np.float64)
+    frequency = generator.uniform(0.3, 2.0)
+    voltage = 100 * np.sin(2 * np.pi * frequency * time) * np.exp(-0.03 * time)
+    mean = 0.7 * voltage - hysteresis(voltage, alpha=0.3575, beta=0.0272, gamma=0.0172)[0]
+    about = (mean - mean.mean()) / np.std(mean)
+    shifts = generator.normal(size=2) * parameters / np.sqrt(2)
+    error = shifts[0] + shifts[1] * about
+    error = error + discrepancy * process(generator, time.size, interval, memory)
+    error = error + sensor * generator.normal(size=time.size)
+    own = parameters * np.sqrt((1 + about**2) / 2)
+    slow = np.sqrt(own**2 + discrepancy**2)
+    sds: dict[Kind, FloatArray] = {
+        "parameter": own,
+        "displacement": slow,
+        "sensor": np.sqrt(slow**2 + sensor**2),
+    }
+    return Made(time, voltage, mean, error, sds, memory, sensor)
+
+
+def bands_of(record: Made, spoilt: FloatArray | float = 0.0, *, training: bool = False) -> Bands:
+    """Return the bands of a record whose readings have ``spoilt`` (samples,) um added."""
+    half = {
+        (kind, level): norm.ppf(0.5 + level / 200) * record.sds[kind]
+        for kind in KINDS
+        for level in LEVELS
+    }
+    measured = record.mean + record.error + spoilt
+    return Bands(
+        name="training" if training else "held-out",
+        time=record.time,
+        voltage=record.voltage,
+        measured=measured,
+        truth=None,
+        mean=record.mean,
+        lower={key: record.mean - width for key, width in half.items()},
+        upper={key: record.mean + width for key, width in half.items()},
+        pit=norm.cdf((measured - record.mean) / record.sds["sensor"]),
+        crps=np.abs(measured - record.mean),
+        interval=float(record.time[1] - record.time[0]),
+        training=training,
+    )

@@ -1,0 +1,221 @@
+"""Runs in short: records of a simulated stand, fitted, predicted and judged as a run does it.
+
+The draws are those of a mixture around the point fit, weighted toward the posterior by
+Pareto-smoothed importance sampling (Vehtari et al., "Pareto smoothed importance sampling", 2024)
+and chosen again by their weights: a run in two seconds. All else is the run's own code.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from scipy.signal import lfilter
+
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.running.assembling import assemble
+from bwbayes.app.running.explaining import explained
+from bwbayes.app.running.fingerprint import versions
+from bwbayes.app.running.predictions import judged
+from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.validation import Background, Verdict
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.prediction import predict_record, predict_windows
+from bwbayes.record import Record
+from bwbayes.report.result import Result
+from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.storage import ChainFile
+
+__all__ = [
+    "CONVERGED",
+    "Judged",
+    "Stand",
+    "covered",
+    "judge",
+    "noise",
+    "posterior_draws",
+    "problem_of",
+    "run",
+    "weighted_draws",
+]
+
+# What is enough for a test.
+CONVERGED = "\n[sampling]\ness = 400\n"
+
+# Draws of each round, to which the mixture of the next one is fitted; draws of the last; those that
+# stay. Three rounds find a tail that is several times as long as the point fit's sd says.
+PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250
+
+# No draw of the pilot weighs more than so many times the mean.
+HEAVIEST = 10.0
+
+
+def noise(samples: int, kept: float, generator: np.random.Generator) -> FloatArray:
+    """Draw a process of unit variance that keeps the part ``kept`` of itself each sample."""
+    shocks = generator.standard_normal(samples)
+    shocks[1:] *= np.sqrt(1 - kept**2)
+    drawn: FloatArray = lfilter([1.0], [1.0, -kept], shocks)
+    return drawn
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The paper's ring bender with a lag (s), its discrepancy (um, s) and its sensor (um)."""
+
+    lag: float = 0.02
+    discrepancy: float = 0.3
+    memory: float = 0.3
+    sensor: float = 0.1
+    rate: float = 100.0
+    d: float = 0.7
+
+    def measure(
+        self,
+        voltage: FloatArray,
+        generator: np.random.Generator,
+        *,
+        offset: float = 2.0,
+        cut: int = 0,
+    ) -> Record:
+        """Drive it from rest along ``voltage`` (samples,) and record all but the first ``cut``."""
+        actuator = Actuator("lag", "first", 1 / self.rate)
+        known = {"d": self.d, "alpha": self.d * 0.51, "beta": 0.0272, "gamma": 0.0172}
+        known |= {"exponent": 1.0, "initial": 0.0, "lag": self.lag, "offset": offset}
+        theta = np.array([[known[name] for name in actuator.parameters]])
+        displacement = actuator.displacement(theta, voltage)[0]
+        kept = float(np.exp(-1 / self.rate / self.memory))
+        displacement += self.discrepancy * noise(voltage.size, kept, generator)
+        displacement += self.sensor * generator.standard_normal(voltage.size)
+        return Record(voltage[cut:], displacement[cut:], 1 / self.rate, origin="stand")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a run says: draws (draws, free), bands and verdicts by name."""
+
+    problem: Problem
+    draws: FloatArray
+    bands: Mapping[str, Bands]
+    verdicts: Mapping[str, Verdict]
+
+    def column(self, name: str) -> FloatArray:
+        """Return the draws of one parameter."""
+        return self.draws[:, self.problem.posterior.names.index(name)]
+
+
+def problem_of(text: str, folder: Path) -> Problem:
+    """Resolve a config's text, its files in ``folder``."""
+    return resolve(parse(text, "config"), folder)
+
+
+def posterior_draws(
+    posterior: Posterior, source: np.random.Generator
+) -> tuple[PointFit, FloatArray]:
+    """Fit, and draw (KEPT, free) in the parameters' own units."""
+    point = pointfit.fit(posterior, source)
+    draws, weights = weighted_draws(posterior, source, point)
+    return point, draws[source.choice(len(draws), KEPT, p=weights)]
+
+
+def weighted_draws(
+    posterior: Posterior, source: np.random.Generator, point: PointFit | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return draws (draws, free) in the parameters' own units and weights (draws,)."""
+    if point is None:
+        point = pointfit.fit(posterior, source)
+    random = np.random.RandomState(source.bit_generator)
+    proposal = StudentMixture.around(point.optima, *pointfit.peaks(posterior, point))
+    for _ in range(ROUNDS):
+        places, ratio = _tried(posterior, proposal, random, PILOT)
+        if not np.isfinite(ratio).any():
+            # A fit at the edge of what is possible, as a reversed record's: the point itself.
+            places, ratio = point.mode[np.newaxis], np.zeros(1)
+        weights = np.exp(np.clip(ratio - np.max(ratio), -30, 0)) * np.isfinite(ratio)
+        weights = np.minimum(weights, HEAVIEST * np.mean(weights))
+        weights /= np.sum(weights)
+        chosen = places[source.choice(len(places), PILOT, p=weights)]
+        try:
+            proposal = StudentMixture.fitted(chosen)
+        except np.linalg.LinAlgError:
+            # The weight is all on a few draws: at such an edge too.
+            return posterior.prior.constrain(places)[0], weights
+    places, ratio = _tried(posterior, proposal, random, DRAWS)
+    # A place that is not possible has a weight of next to none; arviz takes finite ones alone.
+    lowest = np.min(ratio, where=np.isfinite(ratio), initial=0.0) - 100.0
+    smoothed, _ = array_stats.psislw(-np.maximum(ratio, lowest))  # type: ignore[no-untyped-call]
+    weights = np.exp(smoothed - np.max(smoothed)) * np.isfinite(ratio)
+    return posterior.prior.constrain(places)[0], weights / np.sum(weights)
+
+
+def _tried(
+    posterior: Posterior,
+    proposal: StudentMixture,
+    random: np.random.RandomState,
+    count: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Draw places (count, free) of a proposal; log density of the posterior over its (count,)."""
+    places = proposal.draw(random, count)
+    ratio: FloatArray = posterior.log_density(places) - proposal.log_density(places)
+    return places, ratio
+
+
+def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) -> Judged:
+    """Fit, predict all that the config names, and judge it.
+
+    Without explanations (``again``) only the verdict on the training window is another one.
+    """
+    posterior, record = problem.posterior, problem.record
+    point, draws = posterior_draws(posterior, source)
+    windows = {"training": posterior.only.training}
+    windows |= {name: v.windows for name, v in problem.validations.items() if v.windows}
+    bands = predict_windows(posterior, draws, record, windows, source)
+    for name, other in problem.validations.items():
+        if other.record is not None:
+            bands.append(
+                predict_record(
+                    posterior, draws, other.record, other.start, source, name, other.judged
+                )
+            )
+    best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
+    background = Background.of(posterior, draws)
+    verdicts = judged(problem, bands, background, {})
+    if again:
+        failed = verdicts["training"].holds is False
+        places = posterior.prior.unconstrain(best[np.newaxis])
+        places = np.concatenate([places, point.optima])
+        found = explained(problem, "record", places, thorough=failed)
+        verdicts = judged(problem, bands, background, {"record": found})
+    return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
+
+
+def run(text: str, folder: Path) -> tuple[Problem, Result]:
+    """Do what a run does, but for its files."""
+    problem = problem_of(text + CONVERGED, folder)
+    posterior, seed = problem.posterior, problem.config.seed
+    with one_thread(), executor(1, posterior.engine) as pool:
+        point = pointfit.fit(posterior, generator(seed, "point fit"))
+        first = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
+        noted = {"versions": json.dumps(versions(posterior.engine))}
+        path = folder / "chain"
+        chain = ChainFile.create(path, first, point, problem.plan.block, noted)
+        outcome = sample(posterior, problem.plan, chain, pool)
+        result = assemble(problem, chain, outcome)
+    assert outcome.converged, outcome.stop_reason
+    return problem, result
+
+
+def covered(bands: Bands, level: int = 95) -> float:
+    """Part of the judged readings inside the sensor band."""
+    assert bands.measured is not None
+    return float(np.mean(bands.covers("sensor", level, bands.measured)[bands.scored_from :]))

@@ -1,0 +1,164 @@
+"""A prediction from one draw is a normal distribution whose mean and sd are known.
+
+So the bands, the scores of the readings and what a lead-in tells of the offset are held against
+closed forms and dense matrices, with sds that differ much, at the training record's sampling
+interval and at others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.prediction.bands import LEVELS, Bands, Kind
+from bwbayes.prediction.prediction import Start, predict_record, predict_windows
+from bwbayes.record.record import Record
+from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
+from tests.prediction.running import left_by_running_drives
+
+# Far from each other, so that none can stand for another.
+SENSOR, DISCREPANCY, TIME = 0.9, 0.25, 0.3
+
+LEAD_IN = 1.0  # s
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    return short_posterior(dynamics="lag", fixed={})
+
+
+@pytest.fixture(scope="module")
+def draw(posterior: Posterior) -> FloatArray:
+    """Return the truth with the sds above, as one draw (1, free)."""
+    theta = truth(posterior)[0]
+    named = dict(zip(posterior.prior.names, theta, strict=True))
+    named |= {"sensor_sd": SENSOR, "discrepancy_sd": DISCREPANCY, "discrepancy_time": TIME}
+    return np.array([[named[name] for name in posterior.names]])
+
+
+def simulated(posterior: Posterior, voltage: FloatArray, interval: float) -> FloatArray:
+    """Displacement (samples,) of the true model from rest and without an offset, um."""
+    actuator = Actuator("lag", "first", interval)
+    theta = truth(posterior)[:, : len(actuator.parameters)]
+    theta[:, actuator.parameters.index("offset")] = 0.0
+    moved: FloatArray = actuator.displacement(theta, voltage)[0]
+    return moved
+
+
+def another(posterior: Posterior, interval: float, offset: float = 12.0) -> Record:
+    """Make a record of four seconds at another interval, from rest, some readings far off."""
+    voltage = decaying_sine(round(4.0 / interval), amplitude=80.0)
+    reading = simulated(posterior, voltage, interval) + offset
+    reading += SENSOR * np.random.default_rng(1).standard_t(3, voltage.size)
+    return Record(voltage, reading, interval)
+
+
+def sds(bands: Bands, kind: Kind) -> FloatArray:
+    """Return the sd (samples,) of a normal band, from its widths at all levels, um."""
+    half = [
+        (bands.upper[kind, level] - bands.lower[kind, level]) / 2 / norm.ppf(0.5 + level / 200)
+        for level in LEVELS
+    ]
+    np.testing.assert_allclose(half, np.mean(half, axis=0) * np.ones_like(half), rtol=2e-3)
+    result: FloatArray = np.mean(half, axis=0)
+    return result
+
+
+def assert_scores_are_of(bands: Bands, mean: FloatArray, sd: float) -> None:
+    """Hold PIT and CRPS against those of a normal distribution."""
+    assert bands.measured is not None
+    assert bands.pit is not None
+    assert bands.crps is not None
+    z = (bands.measured - mean) / sd
+    np.testing.assert_allclose(norm.cdf(z), bands.pit, atol=1e-3)
+    crps = sd * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+    np.testing.assert_allclose(crps, bands.crps, atol=1e-3 * sd)
+
+
+def offset_of_lead_in(
+    posterior: Posterior, record: Record, sensor: float = SENSOR, discrepancy: float = DISCREPANCY
+) -> tuple[float, float]:
+    """Mean and sd of the offset, um, by the dense normal equations of a lead-in."""
+    assert record.displacement is not None
+    samples = round(LEAD_IN / record.interval)
+    moved = simulated(posterior, record.voltage, record.interval)[:samples]
+    lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples))) * record.interval
+    covariance = discrepancy**2 * np.exp(-lags / TIME) + sensor**2 * np.eye(samples)
+    weight = np.linalg.solve(covariance, np.ones(samples))
+    mean = float(weight @ (record.displacement[:samples] - moved) / weight.sum())
+    return mean, float(weight.sum() ** -0.5)
+
+
+def test_readings_are_judged_by_the_sensors_distribution(
+    posterior: Posterior, draw: FloatArray
+) -> None:
+    """Its sd is the root of both squares; the discrepancy's alone is less than a third of it."""
+    record = Record(posterior.only.voltage, posterior.only.displacement + 0.5, INTERVAL)
+    bands = predict_windows(
+        posterior, draw, record, {"all": slice(0, record.samples)}, np.random.default_rng(2)
+    )[0]
+    sd = float(np.hypot(SENSOR, DISCREPANCY))
+    assert_scores_are_of(bands, bands.mean, sd)
+    np.testing.assert_allclose(sd, sds(bands, "sensor"), rtol=2e-3)
+    np.testing.assert_allclose(DISCREPANCY, sds(bands, "displacement"), rtol=2e-3)
+
+
+@pytest.mark.parametrize("interval", [INTERVAL / 4, INTERVAL, 2 * INTERVAL])
+def test_a_lead_in_tells_the_offset_as_the_dense_matrix_does(
+    posterior: Posterior, draw: FloatArray, interval: float
+) -> None:
+    """Mean and variance, at the record's own interval; and all bands have that variance."""
+    record = another(posterior, interval)
+    start = Start(from_rest=True, lead_in=LEAD_IN)
+    bands = predict_record(posterior, draw, record, start, np.random.default_rng(1))
+    offset, sd = offset_of_lead_in(posterior, record)
+    mean = simulated(posterior, record.voltage, interval) + offset
+    np.testing.assert_allclose(mean, bands.mean, atol=0.01 * sd)
+    np.testing.assert_allclose(sd, sds(bands, "parameter"), rtol=5e-3)
+    np.testing.assert_allclose(np.hypot(sd, DISCREPANCY), sds(bands, "displacement"), rtol=5e-3)
+    whole = float(np.sqrt(sd**2 + DISCREPANCY**2 + SENSOR**2))
+    np.testing.assert_allclose(whole, sds(bands, "sensor"), rtol=5e-3)
+    assert_scores_are_of(bands, mean, whole)
+
+
+def test_twin_the_training_intervals_noise_would_be_seen(posterior: Posterior) -> None:
+    """Four times as many samples a second, taken for as many: the offset's sd is a third less."""
+    record = another(posterior, INTERVAL / 4)
+    _, sd = offset_of_lead_in(posterior, record)
+    assert record.displacement is not None
+    stretched = replace(record, interval=INTERVAL)
+    samples = round(LEAD_IN / record.interval)
+    lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples))) * stretched.interval
+    covariance = DISCREPANCY**2 * np.exp(-lags / TIME) + SENSOR**2 * np.eye(samples)
+    wrong = np.linalg.solve(covariance, np.ones(samples)).sum() ** -0.5
+    assert wrong < 0.8 * sd
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
+    posterior: Posterior, draw: FloatArray, sign: float
+) -> None:
+    """At the end of the voltage's range the last drive went there: h is close to its ceiling.
+
+    Any other drive would leave h anywhere between both ceilings, 0 on average.
+    """
+    named = dict(zip(posterior.prior.names, posterior.prior.theta(draw)[0], strict=True))
+    top = named["alpha"] / (named["beta"] + named["gamma"])
+    every = np.array([-100.0, 100.0])
+    left = float(np.mean(left_by_running_drives(named, sign * 100.0, every, 1000)))
+    assert 0.9 * top < sign * left < top
+    held = Record(np.full(60, sign * 100.0), None, INTERVAL)
+    bands = predict_record(posterior, np.repeat(draw, 400, axis=0), held, Start(), _seeded())
+    # Late, when the dynamics have settled; h stays as the voltage does.
+    h = named["d"] * held.voltage[-1] + named["offset"] - bands.mean[-1]
+    assert left == pytest.approx(h, abs=0.02 * top)
+
+
+def _seeded() -> np.random.Generator:
+    return np.random.default_rng(5)

@@ -1,0 +1,149 @@
+"""What is written is what is read: through every format, in every unit, to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from bwbayes.arrays import FloatArray
+from bwbayes.record import Record, read_record, write_record
+
+SUFFIXES = ("csv", "txt", "h5", "hdf5", "mat", "mat 7.3")
+
+# Powers of ten that lead from the unit to V, um and s.
+VOLTS = {"V": 0, "mV": -3, "kV": 3, "uV": -6, "µV": -6, "μV": -6}
+LENGTHS = {"um": 0, "µm": 0, "μm": 0, "nm": -3, "mm": 3, "m": 6}
+TIMES = {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}
+
+LAST_PLACE = float(np.finfo(np.float64).eps)
+
+numbers = arrays(np.float64, 12, elements=st.floats(-1e9, 1e9), unique=True).filter(
+    lambda values: bool(np.ptp(values) > 1e-6)
+)
+records = st.builds(
+    Record,
+    voltage=numbers,
+    displacement=numbers,
+    interval=st.floats(1e-6, 1e3),
+    start=st.floats(-1e3, 1e3),
+    voltage_is=st.sampled_from(["command", "output"]),
+    origin=st.text(min_size=1).filter(lambda text: text.isprintable() and bool(text.strip())),
+    truth=st.none() | numbers,
+)
+
+
+def through(record: Record, folder: Path, suffix: str) -> Record:
+    """Write a record in one format, and read it."""
+    path = folder / f"same.{suffix.split(maxsplit=1)[0]}"
+    write_record(record, path, mat_version="7.3" if suffix.endswith("7.3") else "5")
+    return read_record(path, need_displacement=record.displacement is not None)
+
+
+def assert_same(expected: Record, got: Record) -> None:
+    assert expected.sha256 == got.sha256
+    assert (expected.origin, expected.voltage_is) == (got.origin, got.voltage_is)
+    assert (expected.truth is None) == (got.truth is None)
+    if expected.truth is not None and got.truth is not None:
+        np.testing.assert_array_equal(expected.truth, got.truth)
+
+
+@settings(max_examples=50)
+@given(record=records, way=st.lists(st.sampled_from(SUFFIXES), min_size=1, max_size=6))
+def test_a_record_survives_any_way_through_the_formats(
+    tmp_path_factory: pytest.TempPathFactory, record: Record, way: list[str]
+) -> None:
+    got = record
+    for suffix in way:
+        got = through(got, tmp_path_factory.getbasetemp(), suffix)
+    assert_same(record, got)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_voltage_alone_survives(tmp_path: Path, suffix: str) -> None:
+    record = Record(np.arange(20.0), None, 0.1, origin="a plan", voltage_is="command")
+    assert_same(record, through(record, tmp_path, suffix))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("missing", [slice(3), slice(3, 8), slice(17, 20), slice(0, 20, 2)])
+def test_missing_readings_survive(tmp_path: Path, suffix: str, missing: slice) -> None:
+    displacement = np.cos(np.arange(20.0))
+    displacement[missing] = np.nan
+    record = Record(np.arange(20.0), displacement, 0.1, origin="gaps", truth=np.arange(20.0))
+    assert_same(record, through(record, tmp_path, suffix))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_part_of_a_long_record_survives_with_its_times(tmp_path: Path, suffix: str) -> None:
+    """Times far from zero carry the rounding of the whole record, and must be uniform still."""
+    voltage = np.sin(0.37 * np.arange(200_000))
+    whole = Record(voltage, 2 * voltage, 1e-3 / 3, start=-5.0)
+    part = whole.window(40.0, 60.0).decimate(7)
+    named = replace(part, origin="a part")
+    assert_same(named, through(named, tmp_path, suffix))
+
+
+def in_unit(values: FloatArray, power: int) -> FloatArray:
+    """Return values in another unit, each rounded once: dividing by 1e-3 would round twice."""
+    return values / 10.0**power if power >= 0 else values * 10.0**-power
+
+
+def store(path: Path, columns: dict[str, Any]) -> None:
+    """Store columns as others would, in the format of the suffix."""
+    if path.suffix == ".mat":
+        # MATLAB's names have no micro sign.
+        scipy.io.savemat(path, columns)
+    elif path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+    else:
+        rows = np.column_stack([*columns.values()]).tolist()
+        lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "h5", "mat"])
+@settings(max_examples=40)
+@given(
+    record=records,
+    volt=st.sampled_from(sorted(VOLTS)),
+    length=st.sampled_from(sorted(LENGTHS)),
+    second=st.sampled_from(sorted(TIMES)),
+)
+def test_a_record_in_any_units_is_the_same_record(
+    tmp_path_factory: pytest.TempPathFactory,
+    suffix: str,
+    record: Record,
+    volt: str,
+    length: str,
+    second: str,
+) -> None:
+    """To one unit in the last place, which the conversion there and back may cost."""
+    if suffix == "mat":
+        volt, length, second = (
+            unit.replace("µ", "u").replace("μ", "u") for unit in (volt, length, second)
+        )
+    assert record.displacement is not None
+    path = tmp_path_factory.getbasetemp() / f"units.{suffix}"
+    columns = {
+        f"time_{second}": in_unit(record.time, TIMES[second]),
+        f"voltage_{volt}": in_unit(record.voltage, VOLTS[volt]),
+        f"displacement_{length}": in_unit(record.displacement, LENGTHS[length]),
+    }
+    store(path, columns)
+    got = read_record(path)
+    assert got.displacement is not None
+    np.testing.assert_allclose(got.voltage, record.voltage, rtol=LAST_PLACE, atol=1e-290)
+    np.testing.assert_allclose(got.displacement, record.displacement, rtol=LAST_PLACE, atol=1e-290)
+    np.testing.assert_allclose(got.time, record.time, rtol=0, atol=2e-2 * record.interval)
+    assert record.interval == pytest.approx(got.interval, rel=2e-3)

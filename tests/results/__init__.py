@@ -1,1 +1,0 @@
-"""Tests of bwbayes.results: predictions and how they are judged."""
