@@ -62,7 +62,7 @@ OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": Fa
 # words, {stem} is the first one's name, {record} that of what is predicted.
 LEAVES = {
     "run": ("results/{stem}", "report.html summary.json bands.csv posterior.nc chain/start.npz"),
-    "resume": ("{0}", "report.html summary.json bands.csv posterior.nc chain/start.npz"),
+    "resume": ("{0}", "report.html summary.json bands.csv posterior.nc"),
     "report": ("{0}", "report.html figures/corner.png"),
     "check": ("results/{stem}-check", "check.html"),
     "init": ("", "{stem}.toml"),

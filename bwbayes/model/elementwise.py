@@ -31,6 +31,8 @@ def gone(z: Any) -> Any:
 
 def look_up(rows: Any, index: Any) -> Any:
     """Return the number at a place, a whole float, in a row, or at one in each column of rows."""
+    if rows.ndim == 1:
+        return rows[np.asarray(index).astype(np.intp)]
     models = np.arange(rows.shape[1]).reshape(-1, *(1,) * (index.ndim - 1))
     # The rows of a step are columns of its parameters: no copy is made here.
     numbers = rows.reshape(rows.shape[:2]).T

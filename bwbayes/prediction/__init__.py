@@ -1,1 +1,1 @@
-"""From a posterior to displacement bands for any voltage, their scores, and loop and step measures."""
+"""From a posterior to displacement bands, their scores, and measures of loops and steps."""

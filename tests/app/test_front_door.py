@@ -127,7 +127,8 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
     problem = resolved(path)
     record = problem.record
     assert (samples, samples) == (record.samples, record.readings)
-    assert record.interval == pytest.approx(1 / rate, rel=1e-4)
+    rounded = np.spacing(abs(start) + samples / rate)  # of the times in the file
+    assert record.interval == pytest.approx(1 / rate, rel=1e-4, abs=2 * rounded / (samples - 1))
     np.testing.assert_allclose(record.voltage, voltage, rtol=1e-8, atol=1e-9)
     fitted = np.concatenate([np.r_[w] for w in problem.posterior.only.training])
     held = [np.r_[w] for v in problem.validations.values() for w in v.windows]

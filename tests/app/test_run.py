@@ -11,6 +11,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 import xarray
@@ -173,7 +174,9 @@ def test_interrupted_command_says_how_to_go_on(
 ) -> None:
     made = small.begun(tmp_path / "a")
     watch_until(monkeypatch, "pilot", 5)
-    assert 130 == finish(made.path, workers=1, quiet=True)
+    with pytest.raises(click.exceptions.Exit) as ended:
+        finish(made.path, workers=1, quiet=True)
+    assert 130 == ended.value.exit_code
     printed = capsys.readouterr()
     assert f"interrupted; resume with `bwbayes resume {made.path}`\n" == printed.err
     assert "" == printed.out

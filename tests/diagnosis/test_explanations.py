@@ -101,6 +101,12 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     assert best.nats > LIMIT
 
 
+def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
+    found = list(effects.oscillation(scene("mains", 0, tmp_path)))
+    assert found[0].nats > LIMIT
+    assert found[0].text.endswith("(mains: 50 Hz)")
+
+
 def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(tmp_path: Path) -> None:
     assert not likely_causes(explain(scene("good", 1, tmp_path, 5.0), thorough=False))
     causes = likely_causes(explain(scene("cubic", 1, tmp_path, 5.0), thorough=True))
