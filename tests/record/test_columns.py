@@ -321,3 +321,11 @@ def test_no_column_that_does_not_rise_is_guessed_to_be_the_time(tmp_path: Path) 
         read_record(path)
     assert {"columns": {}, "units": {}} == caught.value.guess
     assert caught.value.fs is not None
+
+
+def test_the_ends_of_a_time_stamps_range_can_be_told_apart(tmp_path: Path) -> None:
+    lines = [f"{1.76e9 + k / 50:.3f},{k % 7},{k % 5}" for k in range(900)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["timestamp,u (V),pos (um)", *lines]))
+    with pytest.raises(InputError, match=r"'timestamp' \(1760000000 to 1760000018\)"):
+        read_record(path)

@@ -323,10 +323,20 @@ def _listed(series: Sequence[Series]) -> str:
     for size, _ in Counter(s.size for s in numbers).most_common():
         group = [s for s in numbers if s.size == size]
         ranges = [(s.name, *extents[s.name]) for s in group[:_MOST_LISTED]]
-        texts = [f"{name!r} ({low:.4g} to {high:.4g})" for name, low, high in ranges]
+        texts = [f"{name!r} ({_span(low, high)})" for name, low, high in ranges]
         more = ", ..." if len(group) > _MOST_LISTED else ""
         parts.append(f"{size} values each: {', '.join(texts)}{more}")
     return f"There are {'; '.join(parts)}" if parts else "There are no series of numbers"
+
+
+def _span(low: float, high: float) -> str:
+    """Write a range with digits that tell its ends apart, if they differ."""
+    digits = 4
+    while low != high and float(f"{low:.{digits}g}") == float(f"{high:.{digits}g}"):
+        digits += 1
+    # Two more: how long a record is, not only that it has a length.
+    digits += 2 * (digits > 4)
+    return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
 def _rises(series: Series) -> bool:
