@@ -1,10 +1,10 @@
 """Hysteresis a sample at a time, each model with a voltage of its own.
 
-A simulation gives all models one voltage that is known beforehand. In a closed loop, and read
-backwards, each has its own, and the next one hangs on what the last one did. Here an operator says
-what its displacement would be if the voltage went straight from where it stands to somewhere else,
-and how steep it is there. That takes a bounded time, whatever was before; operators whose memory
-grows with the voltage's past, or that are integrated, have no such step.
+A simulation gives all models one voltage that is known beforehand. In a closed loop each has its
+own, and the next one hangs on what the last one did. Here an operator says what its displacement
+would be if the voltage went straight from where it stands to somewhere else, and how steep it is.
+That takes a bounded time, whatever was before; operators whose memory grows with the voltage's
+past, or that are integrated, have no such step.
 
 A step's ``move`` is written once, for numbers and for arrays: with rows of arrays (models,) NumPy
 moves all models of a closed loop at once, compiled with numbers it moves one model after the other
@@ -60,16 +60,9 @@ class HysteresisStep(ABC):
     def demagnetized(self) -> FloatArray:
         """Return the memory of a demagnetized actuator at zero volts."""
 
-    @abstractmethod
     def remembered(self, memory: Any) -> FloatArray:
-        """Return the memory (models, any) of what the operator itself remembers."""
-
-    @abstractmethod
-    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:
-        """Return the memory (models, any) of models that start at voltages (models,), V.
-
-        In the states that the ``initial`` ones (models,) say, within a span of earlier voltages.
-        """
+        """Return the memory (models, any) of what the operator itself remembers: the same."""
+        return np.asarray(memory)
 
     @abstractmethod
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
@@ -106,10 +99,6 @@ class OneStateStep(HysteresisStep):
     def remembered(self, memory: Any) -> FloatArray:
         """Return voltage and h."""
         return self._at(memory.voltage, memory.state)
-
-    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:  # noqa: ARG002  # the state says all of the past
-        """Return voltage and h."""
-        return self._at(voltage, initial)
 
     def _at(self, voltage: float | FloatArray, state: FloatArray) -> FloatArray:
         memory = self.demagnetized()

@@ -1,13 +1,16 @@
-"""What reading many draws backwards costs, against simulating them."""
+"""What it costs to read many draws backwards, a sample at a time, against simulating them."""
 
 from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.sampled import SampledModel
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
@@ -19,10 +22,7 @@ from tests.benchmarks.cases import Effort
 from tests.benchmarks.measuring import Cell, Table, interleaved
 from tests.control import cases
 
-SAMPLES = 16_000
-
-# Draws of a posterior, and fewer samples and draws for a quick look.
-DRAWS, FEW_SAMPLES, FEW_DRAWS = 1000, 2000, 200
+SAMPLES, DRAWS = 500, 1000
 
 # Hysteresis, dynamics, gain and creep of models that are read backwards.
 INVERTED: dict[str, tuple[Operator, str, PolynomialGain | None, Creep | None]] = {
@@ -39,21 +39,28 @@ INVERTED: dict[str, tuple[Operator, str, PolynomialGain | None, Creep | None]] =
 }
 
 
+def read_backwards(model: SampledModel, displacement: FloatArray) -> FloatArray:
+    """Return the voltages (samples, models) of a displacement (samples,), um."""
+    state, voltages = model.begin(np.zeros(model.models)), []
+    for asked in displacement:
+        voltage, state = model.inverse(state, np.full(model.models, asked), cases.SPAN)
+        voltages.append(voltage)
+    return np.array(voltages)
+
+
 def inversion(effort: Effort) -> Table:
     """Measure the inverse of many draws against simulating them, on the paper's record.
 
     What is asked for is the displacement of their middle; each draw gets a voltage of its own.
     """
-    samples, draws = (SAMPLES, DRAWS) if effort.everything else (FEW_SAMPLES, FEW_DRAWS)
-    voltage = signal("identification").sample(1000.0)[1][:samples]
+    voltage = signal("identification").sample(1000.0)[1][:SAMPLES]
     rows: list[dict[str, Cell]] = []
     for name, (hysteresis, dynamics, gain, creep) in INVERTED.items():
         actuator = Actuator(dynamics, "first", 1e-3, hysteresis, gain, creep, cases.SPAN)
-        theta = cases.theta(actuator, draws, name)
+        theta = cases.theta(actuator, DRAWS, name)
         simulate = partial(actuator.displacement, theta, voltage, from_rest=True)
         asked = simulate().mean(axis=0)
-        invert = partial(inverse, actuator, theta, asked, from_rest=True)
-        # Where one takes minutes, more rounds would say no more.
+        invert = partial(read_backwards, SampledModel.of(actuator, theta), asked)
         costs = interleaved({"simulate": simulate, "invert": invert}, min(effort.rounds, 2))
         forward, backward = costs["simulate"].wall, costs["invert"].wall
         rows.append(
@@ -64,4 +71,4 @@ def inversion(effort: Effort) -> Table:
                 "ratio": backward / forward,
             }
         )
-    return Table("inversion", "Inversion", f"{samples:,} samples, {draws:,} draws", rows)
+    return Table("inversion", "Inversion", f"{SAMPLES:,} samples, {DRAWS:,} draws", rows)

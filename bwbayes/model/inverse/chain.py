@@ -1,37 +1,41 @@
 """The actuator read backwards: for a displacement over time, the voltage that gives it.
 
 The offset is taken off, creep and dynamics are undone (:mod:`bwbayes.model.inverse.dynamics`), and
-what is left, the drive, is what hysteresis and gain must make. They do so along stretches that go
-one way: the drive turns where the voltage does, so that each stretch is one search for all of its
-samples (:func:`bwbayes.model.inverse.stretch.reached`), whatever the operator.
-
-What is done to each model is done to it alone (:mod:`bwbayes.model.inverse.alone`): the models of a
-batch have voltages of their own. Where there are many, those whose hysteresis has a step go side by
-side instead, which is much faster (:mod:`bwbayes.model.inverse.together`).
+what is left, the drive, is what hysteresis and nonlinearity must make. The drive turns where the
+voltage does, so that each branch between two turns is one root search for all of its samples
+(:mod:`bwbayes.model.inverse.branch`). It asks of an operator only to simulate, one model at a time.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.actuator import Actuator, State
-from bwbayes.model.inverse.alone import One
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
+from bwbayes.model.inverse.branch import solve_branch
+from bwbayes.model.inverse.dynamics import undone
 from bwbayes.model.inverse.limits import Limits
-from bwbayes.model.inverse.together import together
 from bwbayes.model.operator import UNIT
+from bwbayes.model.reversals import monotone_stretches
 
 __all__ = ["inverse"]
+
+# Samples that are searched for together; operators that integrate follow as many.
+LONGEST = 2048
 
 
 def inverse(
     actuator: Actuator,
     theta: ArrayLike,
     displacement: ArrayLike,
-    state: State | None = None,
     *,
     from_rest: bool = False,
     limits: Limits | None = None,
@@ -46,13 +50,11 @@ def inverse(
     theta
         (models, parameters), as of :meth:`Actuator.displacement`.
     displacement
-        What is asked for, (samples,) or (models, samples), um, at the actuator's interval.
-    state
-        Where an earlier piece of a record left the models (of one voltage, with as many models);
-        by default a record starts: the dynamics are at rest at the first sample, and the
-        hysteresis is in the state that θ's initial one says.
+        What is asked for, (samples,) or (models, samples), um, at the actuator's interval. The
+        dynamics are at rest at the first sample.
     from_rest
-        The voltage comes from zero, where the actuator was at rest.
+        The voltage comes from zero, where the actuator was at rest; otherwise the hysteresis starts
+        in the state that θ's initial one says.
     limits
         Those of the amplifier; by default none.
     nearest
@@ -74,43 +76,8 @@ def inverse(
         or none within the limits, with its place and time.
     """
     models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
-    target = _checked(displacement, len(models))
-    columns = actuator.columns(models)
-    actuator.check(columns)
-    slopes = np.broadcast_to(
-        np.abs(actuator.hysteresis.gain(columns, actuator.span or UNIT)), len(models)
-    )
-    singles = []
-    for row, slope in enumerate(slopes.tolist()):
-        column = {name: values[row : row + 1] for name, values in columns.items()}
-        singles.append(One(actuator, column, from_rest, of_rows(state, slice(row, row + 1)), slope))
-    target = np.broadcast_to(target, (len(models), target.shape[1]))
-    result = np.empty(target.shape)
-    solved = together(singles, columns, state, target, result)
-    for row, single in enumerate(singles):
-        if limits is not None or not solved[row]:
-            solution = result[row] if solved[row] else None
-            result[row] = single.voltage(target[row], limits or Limits(), nearest, solution)
-    return result
-
-
-def of_rows(memory: Any, rows: slice) -> Any:
-    """Return a memory with its arrays (models, ...) cut to some models, whatever it is made of."""
-    if isinstance(memory, np.ndarray):
-        return memory[rows]
-    if isinstance(memory, tuple):
-        parts = [of_rows(member, rows) for member in memory]
-        return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
-    if hasattr(memory, "__dataclass_fields__"):
-        return type(memory)(
-            **{name: of_rows(getattr(memory, name), rows) for name in memory.__dataclass_fields__}
-        )
-    return memory
-
-
-def _checked(displacement: ArrayLike, models: int) -> FloatArray:
     target = np.atleast_2d(np.asarray(displacement, dtype=np.float64))
-    if target.ndim != 2 or target.shape[1] == 0 or len(target) not in (1, models):
+    if target.ndim != 2 or target.shape[1] == 0 or len(target) not in (1, len(models)):
         raise InputError(
             f"reference: has shape {target.shape}; give a non-empty row of samples, or one for "
             "each model"
@@ -118,4 +85,170 @@ def _checked(displacement: ArrayLike, models: int) -> FloatArray:
     if not np.isfinite(target).all():
         sample = int(np.argmin(np.isfinite(target).all(axis=0)))
         raise InputError(f"reference: not a finite number in sample {sample}; give every sample")
-    return target
+    columns = actuator.columns(models)
+    actuator.check(columns)
+    target = np.broadcast_to(target, (len(models), target.shape[1]))
+    result = np.empty(target.shape)
+    for row, samples in enumerate(target):
+        column = {name: values[row : row + 1] for name, values in columns.items()}
+        single = _Single(actuator, column, from_rest)
+        result[row] = single.voltage(samples, limits or Limits(), nearest)
+    return result
+
+
+class _Range(NamedTuple):
+    """Where the voltage may go: between low and high, V, at most ``step`` a sample."""
+
+    low: float
+    high: float
+    step: float = math.inf
+
+
+@dataclass(frozen=True)
+class _Single:
+    """One model that is read backwards."""
+
+    actuator: Actuator
+    column: Values
+    from_rest: bool
+
+    @cached_property
+    def slope(self) -> float:
+        """A typical dw/du, um/V."""
+        span = self.actuator.span or UNIT
+        return abs(float(np.ravel(self.actuator.hysteresis.gain(self.column, span))[0]))
+
+    def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
+        """Return the voltage (samples,) for a displacement."""
+        drive, interval = displacement - self.column["offset"][0], self.actuator.interval
+        span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
+        size = peak / self.slope if self.slope > 0 else 1.0
+        # Beyond so many times what a straight line would need no voltage is looked for.
+        extent = 30.0 * max(size, abs(span.low), abs(span.high))
+        if nearest:
+            low, high = max(limits.low, -extent), min(limits.high, extent)
+            return self._undo(drive, _Range(low, high, limits.rate * interval))
+        voltage = self._undo(drive, _Range(-extent, extent))
+        edges = np.abs(voltage) >= extent
+        if edges.any():
+            sample = int(np.argmax(edges))
+            raise InputError(
+                f"reference: no voltage gives {displacement[sample]:.6g} um at "
+                f"{sample * interval:.6g} s; make it smaller, or ask for the nearest command"
+            )
+        limits.require(voltage, displacement, interval)
+        return voltage
+
+    def _undo(self, displacement: FloatArray, within: _Range) -> FloatArray:
+        """Undo dynamics and creep, then hysteresis and nonlinearity.
+
+        The creep is that of the drive that was found without it, then of the one with that creep,
+        until nothing changes.
+        """
+        sections, creep = self.actuator.sections(self.column), self.actuator.creep
+        dynamics, *lags = sections.recursions
+        if creep is None:
+            return self._static(undone(dynamics, displacement), within)
+        strengths = [float(gain[0]) for gain in sections.gains[1:]]
+        drive = displacement / (1 + sum(strengths))
+        size, change = float(np.max(np.abs(displacement))), 0.0
+        for _ in range(200):
+            voltage = self._static(drive, within) if creep.growing else np.zeros_like(drive)
+            crept = creep.drive(self.column, drive[np.newaxis], voltage)
+            remainder = displacement.copy()
+            for lag, strength in zip(lags, strengths, strict=True):
+                moved = lag.run(crept - crept[:, :1], lag.at_rest())[0]
+                remainder -= strength * (crept[0, 0] + moved)
+            before, drive = drive, undone(dynamics, remainder)
+            change = float(np.max(np.abs(drive - before)))
+            if change <= 1e-14 * size:
+                return self._static(drive, within)
+            if not change < 1e3 * size:
+                break  # which does not come back
+        raise InputError(
+            f"reference: creep of {sum(strengths):.3g} of the drive cannot be undone; check the "
+            "model's creep and gain"
+        )
+
+    def _static(self, drive: FloatArray, within: _Range) -> FloatArray:
+        """Return the voltage (samples,) with which hysteresis and nonlinearity make a drive."""
+        # Steps of the drive below this part of its range are rounding: they turn nothing.
+        quantum = 1e-13 * float(np.ptp(drive))
+        if quantum > 0:
+            drive = drive[0] + quantum * np.round((drive - drive[0]) / quantum)
+        start = 0.0 if self.from_rest else self._first_voltage(float(drive[0]), within)
+        here, memory = self._along(np.array([start]), self._begin(start))
+        # A record from rest may go anywhere at its first sample.
+        result, free, behind = [] if self.from_rest else [np.array([start])], self.from_rest, False
+        joined = np.concatenate([here, drive if self.from_rest else drive[1:]])
+        for begin, last, _ in monotone_stretches(joined, LONGEST):
+            first = begin
+            while first < last:
+                # Behind the drive, go on sample by sample until it is caught up with.
+                end = first + 1 if behind else last
+                target = joined[first + 1 : end + 1]
+                segment = self._branch(target, float(here[-1]), start, memory, within)
+                fast = np.abs(np.diff(segment, prepend=start)) > within.step
+                fast[0] &= not free
+                behind = bool(fast.any())
+                if fast[0]:
+                    segment = np.array([start + math.copysign(within.step, segment[0] - start)])
+                elif behind:
+                    segment = segment[: int(np.argmax(fast))]
+                result.append(segment)
+                here, memory = self._along(segment, memory)
+                start, free, first = float(segment[-1]), False, first + segment.size
+        # A drive that stays where it starts has no branch.
+        voltage = np.concatenate([np.empty(0), *result])
+        return np.pad(voltage, (0, drive.size - voltage.size), constant_values=start)
+
+    def _branch(
+        self, target: FloatArray, here: float, start: float, memory: Any, within: _Range
+    ) -> FloatArray:
+        """Return the voltages along a branch from ``start``, where the drive is ``here``."""
+        s = math.copysign(1.0, float(target[-1]) - here)
+        # After a limit was met the drive may not be where it was asked to be.
+        rise = np.maximum(s * (target - here), 0.0)
+        room = s * ((within.high if s > 0 else within.low) - start)
+        if rise[-1] == 0 or room <= 0:
+            return np.full(target.shape, start)
+        guess = rise[-1] / self.slope if self.slope > 0 else 1.0
+        travel = solve_branch(
+            lambda travel: s * (self._along(start + s * travel, memory)[0] - here),
+            np.maximum.accumulate(rise),
+            room,
+            guess,
+            4 * math.ulp(abs(start) + guess),
+        )
+        return np.clip(start + s * travel, within.low, within.high)
+
+    def _along(self, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
+        """Return the drive (samples,) along a voltage, and the operator's memory after it."""
+        drive, after = self.actuator.hysteresis.advance(self.column, voltage, memory)
+        if self.actuator.gain is not None:
+            drive = drive + self.actuator.gain.displacement(self.column, voltage)
+        return drive[0], after
+
+    def _begin(self, voltage: float) -> Any:
+        operator, span = self.actuator.hysteresis, self.actuator.span or UNIT
+        return operator.begin(self.column, voltage, span, from_rest=self.from_rest)
+
+    def _first_voltage(self, drive: float, within: _Range) -> float:
+        """Return the voltage at which the state that θ's initial one says makes a drive."""
+
+        def excess(voltage: float) -> float:
+            return float(self._along(np.array([voltage]), self._begin(voltage))[0][0]) - drive
+
+        span = self.actuator.span or UNIT
+        center = min(max(span.middle, within.low), within.high)
+        above = excess(center)
+        s, reach = -math.copysign(1.0, above), max(span.half, 1e-9)
+        end = center
+        while s * excess(end) < 0:
+            if end in (within.low, within.high) and end != center:
+                return end
+            end = min(max(center + s * reach, within.low), within.high)
+            reach *= 2
+        if not above:
+            return center
+        return float(brentq(excess, center, end, xtol=math.ulp(abs(center) + reach)))

@@ -28,44 +28,25 @@ from bwbayes.model.linear import Recursion
 __all__ = ["undone"]
 
 
-def undone(
-    recursion: Recursion, displacement: FloatArray, state: FloatArray | None = None
-) -> FloatArray:
-    """Return the drive (samples,), um, after which one model has this displacement.
+def undone(recursion: Recursion, displacement: FloatArray) -> FloatArray:
+    """Return the drive (samples,), um, after which one model has a displacement (samples,), um.
 
-    Parameters
-    ----------
-    recursion
-        That of one model.
-    displacement
-        (samples,), um, from rest.
-    state
-        (1, taps - 1), that of the recursion before the first sample; by default a record starts
-        at rest, and its first drive is zero.
+    The model is at rest at the first sample.
     """
     numerator, denominator = recursion.numerator[0], recursion.denominator[0]
-    forced = displacement.copy()
-    if state is not None:
-        forced -= recursion.run(np.zeros((1, forced.size)), state.copy())[0]
-    if numerator[0] == 0.0 and numerator.size > 1:
-        # What the drive before the first sample, or at rest that of the first one, has settled.
-        forced[: 2 if state is None else 1] = 0.0
-        later: FloatArray = scipy.signal.lfilter(denominator, numerator[1:], forced)[1:]
-        last = later[-1:] if later.size else np.zeros(1)
-        return np.concatenate([later, last])
-    if numerator.size == denominator.size == 1:
-        return np.asarray(forced / numerator[0])
-    # Then no zero lies outside of the unit circle; to look for them takes as long as the filter.
-    if np.abs(numerator[1:]).sum() < numerator[0]:
-        return np.asarray(scipy.signal.lfilter(denominator, numerator, forced))
+    moved: FloatArray = displacement - displacement[0]
     zeros = np.roots(numerator)
-    outside = zeros[np.abs(zeros) > 1]
-    if not outside.size:
-        return np.asarray(scipy.signal.lfilter(denominator, numerator, forced))
-    drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, forced)
-    if state is None:
+    if numerator[0] == 0.0 and numerator.size > 1:
+        # The second sample has been settled by the first drive.
+        moved[:2] = 0.0
+        later = scipy.signal.lfilter(denominator, numerator[1:], moved)[1:]
+        drive: FloatArray = np.append(later, later[-1:] if later.size else 0.0)
+    elif (np.abs(zeros) <= 1).all():
+        drive = scipy.signal.lfilter(denominator, numerator, moved)
+    else:
+        drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, moved)
         drive[0] = 0.0
-    return drive
+    return np.asarray(displacement[0] + drive)
 
 
 def _looking_ahead(

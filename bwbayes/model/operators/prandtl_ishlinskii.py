@@ -278,26 +278,6 @@ class PlaysStep(HysteresisStep):
         """Return all plays at zero, (models, plays)."""
         return np.zeros_like(self.weights)
 
-    def remembered(self, memory: Any) -> FloatArray:
-        """Return where the extrema that count, and the voltage, have left the plays."""
-        ends = [
-            extremum.voltage if extremum.own is None else extremum.own
-            for extremum in memory.extrema
-        ]
-        return self._led(*ends, memory.voltage)
-
-    def begun(self, voltage: FloatArray, initial: FloatArray, span: Span) -> FloatArray:
-        """Return the plays after a drive through the span, as the operators begin."""
-        low, high = np.minimum(span.low, voltage), np.maximum(span.high, voltage)
-        return self._led(high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage)
-
-    def _led(self, *ends: float | FloatArray) -> FloatArray:
-        """Return where a voltage that goes to each of its ends leaves demagnetized plays."""
-        plays = self.demagnetized()
-        for voltage in ends:
-            plays = self.go(plays, np.broadcast_to(voltage, self.slope.shape)).memory
-        return plays
-
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d, and d + Σ w_j."""
         return self.slope, self.slope + self.weights.sum(axis=1)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
@@ -18,6 +21,7 @@ from bwbayes.model.inverse.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
+from tests.control import cases
 from tests.inference.problems import decaying_sine
 from tests.model.operators.test_every_operator import drawn, every_operator, posterior
 
@@ -66,14 +70,13 @@ def assert_returned(
     *,
     from_rest: bool = False,
     first: int = 0,
-    close: float = CLOSE,
 ) -> FloatArray:
     """Every model's voltage makes the reference again, each simulated alone."""
     voltage = inverse(actuator, theta, reference, from_rest=from_rest)
     for row, model in enumerate(theta):
         asked = np.atleast_2d(reference)[min(row, np.atleast_2d(reference).shape[0] - 1)]
-        given = actuator.displacement(model, voltage[row], from_rest=from_rest)[0]
-        assert np.max(np.abs(given - asked)[first:]) < close * np.ptp(asked)
+        back = actuator.displacement(model, voltage[row], from_rest=from_rest)[0]
+        assert np.max(np.abs(back - asked)[first:]) < CLOSE * np.ptp(asked)
     return voltage
 
 
@@ -115,9 +118,45 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
         names = of.likelihood.actuator.parameters
         theta = theta[:, [i for i, n in enumerate(names) if n in actuator.parameters]]
     calm(actuator, theta)
-    voltage = decaying_sine(120 if integrated or parts else 300)
+    voltage = decaying_sine(60 if integrated else 120 if parts else 300)
     reference = actuator.displacement(theta, voltage, from_rest=from_rest)
     assert_returned(actuator, theta, reference, from_rest=from_rest)
+
+
+# Goals, um, and samples to get there: jumps across the range, ramps, steps of next to nothing and
+# rests.
+paths = st.lists(
+    st.tuples(
+        st.one_of(
+            st.floats(-35.0, 35.0),
+            st.sampled_from([0.0, 1e-6, -1e-9, 20.0, 20.0 + 1e-7, 35.0]),
+        ),
+        st.sampled_from([1, 1, 2, 5, 12]),
+    ),
+    min_size=1,
+    max_size=7,
+)
+
+
+@pytest.mark.parametrize("name", cases.ACTUATORS)
+@settings(max_examples=5, deadline=None)
+@given(turns=paths, from_rest=st.booleans())
+@example(turns=[(1e-9, 12)], from_rest=False)  # no more than the rounding of where it starts
+def test_along_any_path(name: str, turns: list[tuple[float, int]], from_rest: bool) -> None:
+    """From jumps over all of the range to steps of 1e-9 um."""
+    actuator = replace(cases.actuator(name), dynamics="none", creep=None)
+    theta = cases.theta(actuator, 2, name)
+    ends = [0.0, *(goal for goal, _ in turns)]
+    ramps = [
+        np.linspace(a, b, samples + 1)[1:]
+        for (a, b), (_, samples) in zip(pairwise(ends), turns, strict=True)
+    ]
+    asked = np.concatenate([[0.0], *ramps])
+    for model, voltage in zip(
+        theta, inverse(actuator, theta, asked, from_rest=from_rest), strict=True
+    ):
+        back = actuator.displacement(model, voltage, from_rest=from_rest)[0]
+        np.testing.assert_allclose(back, asked, rtol=0, atol=70 * CLOSE)
 
 
 @pytest.mark.parametrize("hold", ["first", "zero"])
@@ -138,6 +177,11 @@ def test_a_spring_that_swings_slowly_is_undone(hold: Hold) -> None:
     theta = theta_of(actuator, mass=100.0, damping=300.0)
     voltage = assert_returned(actuator, theta, smooth(2000))
     assert np.max(np.abs(voltage)) < 120.0
+    with_creep = replace(actuator, creep=Creep((0.1, 1.0), reference=SPAN))
+    if hold == "first":
+        theta = theta_of(with_creep, mass=100.0, damping=300.0)
+        with pytest.raises(InputError, match=r"creep of 0\.05 of the drive cannot be undone"):
+            inverse(with_creep, theta, smooth(2000))
 
 
 def test_a_displacement_that_begins_in_motion_is_missed_at_its_beginning_alone() -> None:
@@ -200,9 +244,9 @@ def test_the_nearest_command_keeps_to_the_limits_and_is_right_elsewhere() -> Non
     )[0]
     assert np.max(clipped) == 35.0
     inside = np.abs(clipped) < 35.0
-    given = actuator.displacement(theta, clipped, from_rest=True)[0]
-    np.testing.assert_allclose(given[inside], reference[inside], atol=1e-9)
-    beyond = np.sign(clipped[~inside]) * (reference - given)[~inside]
+    back = actuator.displacement(theta, clipped, from_rest=True)[0]
+    np.testing.assert_allclose(back[inside], reference[inside], atol=1e-9)
+    beyond = np.sign(clipped[~inside]) * (reference - back)[~inside]
     assert (beyond >= -1e-9).all()
 
 
@@ -213,8 +257,8 @@ def test_the_nearest_command_is_as_fast_as_the_limits_allow() -> None:
     slow = inverse(actuator, theta, reference, from_rest=True, limits=limits, nearest=True)[0]
     steps = np.abs(np.diff(slow))
     assert np.max(steps) <= 0.8 * (1 + 1e-12)
-    given = actuator.displacement(theta, slow, from_rest=True)[0]
-    behind = np.abs(given - reference) > 1e-6
+    back = actuator.displacement(theta, slow, from_rest=True)[0]
+    behind = np.abs(back - reference) > 1e-6
     # Where it is behind, it goes as fast as it may.
     np.testing.assert_allclose(steps[behind[1:]], 0.8, rtol=1e-9)
     assert 0.05 < np.mean(behind) < 0.95
