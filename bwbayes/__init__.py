@@ -47,9 +47,9 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from bwbayes.app.fit.calls import compare, fit, open_run, resume
-    from bwbayes.app.fit.campaigns import Campaign, campaign
+    from bwbayes.app.fit.calls import campaign, compare, fit, open_run, resume
     from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.running.campaign import Campaign
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.diagnosis.record_checks import inspect
     from bwbayes.errors import InputError, InputWarning, NotConvergedError
@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from bwbayes.record.waveforms import signal
 else:
     HOMES = {
-        "app.fit.calls": ("compare", "fit", "open_run", "resume"),
-        "app.fit.campaigns": ("Campaign", "campaign"),
+        "app.fit.calls": ("campaign", "compare", "fit", "open_run", "resume"),
         "app.fit.fitted": ("Fit",),
+        "app.running.campaign": ("Campaign",),
         "app.running.predictions": ("Prediction",),
         "record.io.formats": ("read_record", "write_record"),
         "record.record": ("Record",),

@@ -16,7 +16,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from bwbayes.app.jobs.check import check
-from bwbayes.app.running.campaign_result import STATUSES, CampaignResult, Row
+from bwbayes.app.running.campaign import STATUSES, Campaign, Row
+from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.inverse.limits import Limits
@@ -94,19 +95,19 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     signals = {"sine": wave, "far": 9 * wave}
     limits = Limits(-100, 100)
     design = Design("a run", "beta", None, limits, signals, 0.01, Standing(), promises)
-    reports = {"design": design.report(), "campaign": campaign().report("batch")}
+    reports = {"design": design.report(), "campaign": campaign().report()}
     drawn = dict.fromkeys(("promises", "best", "parameters"), picture)
     for name, report in reports.items():
         paths[name].write_text(render(report, drawn), encoding="utf-8")
     return paths
 
 
-def campaign() -> CampaignResult:
+def campaign() -> Campaign:
     """Make up a campaign with a record for each way to end, and a dozen parameters."""
     known = {"unit": "um/V", "mean": 0.7, "sd": 0.01, "lower_95": 0.68, "upper_95": 0.72}
     numbers = {"parameters": {f"parameter_{number}": known for number in range(12)}}
     rows = [Row(status, "a.csv", status, "why", numbers) for status in STATUSES]
-    return CampaignResult(tuple(rows), None, "too few records")
+    return Campaign(CampaignFolder(Path("batch")), tuple(rows), "too few records")
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
+from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.campaign_folder import CampaignFolder
-from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.run import start as begin
 from bwbayes.errors import InputError, InputWarning
@@ -51,7 +51,7 @@ def begun(given: Path, path: Path, **options: bool) -> CampaignFolder:
     return start(given / "records", config, given, path, **{"pictures": False, **options})
 
 
-def ended(folder: CampaignFolder, **options: Any) -> CampaignResult:
+def ended(folder: CampaignFolder, **options: Any) -> Campaign:
     return resume(folder, small.quiet(), **{"workers": 1, **options})
 
 
@@ -220,7 +220,7 @@ def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_pa
 )
 def test_the_worst_ending_is_the_exit_status(status: int, endings: list[str]) -> None:
     rows = tuple(Row(ending, "x.csv", ending, "", {}) for ending in endings)
-    assert status == CampaignResult(rows, None).exit_status
+    assert status == Campaign(CampaignFolder(Path("x")), rows, "few").exit_status
 
 
 def test_another_config_or_folder_is_refused(given: Path, whole: Path, tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     for text in ("broken.csv:2", "1 refused", '<th scope="row">alpha</th>', "Taken for normal"):
         assert text in page
     row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
-    assert "<b>x" not in render(CampaignResult((row,), None, "few").report("x"), {})
+    assert "<b>x" not in render(Campaign(CampaignFolder(Path("x")), (row,), "few").report(), {})
 
 
 def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
+from bwbayes.app.running.campaign import Row
 from bwbayes.app.running.campaign_folder import CampaignFolder
-from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.calibration.evaluation import judge
 from bwbayes.calibration.replicates import Experiment, replicates
 from bwbayes.control.loop import LoopNoise, Stand
@@ -87,7 +87,7 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         replicate,
         judge([replicate.entry()], rng),
         many,
-        bw.Campaign(CampaignResult(rows, many), CampaignFolder(folder)),
+        bw.Campaign(CampaignFolder(folder), rows, many),
         fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
         fit.export(folder / "export"),
         followed(rng),

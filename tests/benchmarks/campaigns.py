@@ -21,7 +21,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.campaign_result import CampaignResult
+from bwbayes.app.running.campaign import Campaign
 from tests.benchmarks.cases import ROOT
 from tests.measured import keep
 
@@ -50,7 +50,7 @@ def written(folder: Path, count: int) -> None:
         bw.write_record(resolve(one, ROOT / "runs").record, folder / f"s{number:04d}.csv")
 
 
-def fitted(records: Path, out: Path, workers: int | None = None) -> tuple[CampaignResult, float]:
+def fitted(records: Path, out: Path, workers: int | None = None) -> tuple[Campaign, float]:
     """Fit the records of a folder, and return what came of it and the seconds it took."""
     begun = time.perf_counter()
     folder = start(records, config_text(CONFIG), ROOT / "runs", out, pictures=False)

@@ -132,7 +132,7 @@ def campaign(
     with resumable(f"`bwbayes campaign --resume {batch.path}`"):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
     if not quiet:
-        show_report(result.report(batch.path.name))
+        show_report(result.report())
         click.echo(f"report: {batch.page}")
     for row in result.rows:
         if row.reason:

@@ -2,11 +2,13 @@
 
 What :func:`fit` makes, ``bwbayes run`` makes too, by the same functions; :func:`open_run` reads
 what either has written, and :func:`resume` continues it. :func:`compare` tells which of
-several models to take. They load what they need when they are called.
+several models to take, and :func:`campaign` fits many records. They load what they need when they
+are called.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,10 +18,11 @@ from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.running.campaign import Campaign
     from bwbayes.comparison.compared import Comparison
     from bwbayes.record import Record
 
-__all__ = ["compare", "fit", "open_run", "resume"]
+__all__ = ["campaign", "compare", "fit", "open_run", "resume"]
 
 
 def fit(
@@ -75,15 +78,14 @@ def fit(
         has not converged.
     """
     from bwbayes.app.config.keywords import config_of
-    from bwbayes.app.fit.surroundings import Scratch, console_of, warn
+    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve
     from bwbayes.app.running import run
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.running.improving import improve_model
 
     config, records = config_of(record, keys)
-    scratch = Scratch() if folder is None else None
-    path = scratch.path / "run" if scratch is not None else Path(str(folder))
+    path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
     if improve:
         RunFolder.require_free(path, overwrite)
@@ -162,12 +164,11 @@ def compare(
     from bwbayes.app.config.keywords import config_of
     from bwbayes.app.config.models import models_of
     from bwbayes.app.fit.fitted import Fit
-    from bwbayes.app.fit.surroundings import Scratch, console_of
+    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch
     from bwbayes.app.jobs import compare as job
     from bwbayes.report.saving import refuse_existing
 
-    scratch = Scratch() if folder is None else None
-    path = scratch.path / "comparison" if scratch is not None else Path(str(folder))
+    path, scratch = folder_or_scratch(folder, "comparison")
     refuse_existing([path / "comparison.json"], overwrite=overwrite)
     compared_runs = runs[0] if len(runs) == 1 else list(runs)
     listed = compared_runs if isinstance(compared_runs, list | tuple) else [compared_runs]
@@ -199,24 +200,6 @@ def compare(
     if scratch is None:
         comparison.save(path)
     return comparison
-
-
-def _is_folder(run: Any) -> bool:
-    return isinstance(run, str | Path) and Path(run).is_dir()
-
-
-def _finished(run: Any) -> tuple[str, Fit]:
-    """Return a fit with its name, or the run in a folder with the folder's name."""
-    from bwbayes.app.fit.fitted import Fit
-
-    if isinstance(run, Fit):
-        return run.name, run
-    if not _is_folder(run):
-        raise InputError(
-            f"compare: {run if isinstance(run, str | Path) else type(run).__name__}: is "
-            "neither a fit nor the folder of a run; give a list of those alone, or records alone"
-        )
-    return Path(run).name, open_run(run)
 
 
 def open_run(folder: str | Path) -> Fit:
@@ -287,3 +270,111 @@ def resume(
     )
     warn(result.notes, 3)
     return result
+
+
+def campaign(
+    records: str | Path | Mapping[str, Record],
+    *,
+    config: str | Path | None = None,
+    folder: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    executor: Any = None,
+    pictures: bool = False,
+    progress: bool = True,
+    **keys: Any,
+) -> Campaign:
+    """Fit many records, each by itself, and say what they show together.
+
+    Parameters
+    ----------
+    records
+        The folder of their files, or records by name.
+    config
+        The config of all; or give its keys, as to :func:`bwbayes.fit`. Without either each record
+        proposes its own.
+    folder
+        Where the campaign is kept; called again with the same folder it goes on, and fits what is
+        new. By default nothing is left but the campaign.
+    overwrite
+        Replace a campaign that is in the folder already.
+    workers
+        Records side by side; by default as many as cores. The result does not depend on it.
+    executor
+        Where they are fitted, as in :func:`bwbayes.fit`.
+    pictures
+        Draw each run's figures and report too.
+    progress
+        Show how far it is.
+    keys
+        The keys of a config, as in :func:`bwbayes.fit`.
+
+    Raises
+    ------
+    InputError
+        A config that cannot be used, or a folder of something else. A record that cannot be used is
+        a row of the table.
+
+    Warns
+    -----
+    InputWarning
+        Each record that was refused, has not converged, or lies off the population.
+    """
+    from dataclasses import replace
+
+    from bwbayes.app.config.config import dump
+    from bwbayes.app.config.keywords import config_of
+    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch, warn
+    from bwbayes.app.jobs.campaign import config_text, resume, start
+
+    text, where = "", Path()
+    if config is not None:
+        if keys:
+            raise InputError(f"campaign: give either config or keys ({', '.join(keys)}), not both")
+        text, where = config_text(Path(config)), Path(config).parent
+    elif keys:
+        common, in_memory = config_of("each", keys, "campaign")
+        if in_memory:
+            raise InputError("campaign: validation: give files, which each record's run can read")
+        text = dump(common)
+    path, scratch = folder_or_scratch(folder, "campaign")
+    if isinstance(records, Mapping):
+        source = path.with_name(f"{path.name}-records")
+        _write(records, source)
+    else:
+        source = Path(records)
+    begun = start(source, text, where, path, pictures=pictures, overwrite=overwrite)
+    finished = resume(begun, console_of(progress), workers=workers, executor=executor)
+    warn(finished.notes, 3)
+    return replace(finished, _scratch=scratch)
+
+
+def _is_folder(run: Any) -> bool:
+    return isinstance(run, str | Path) and Path(run).is_dir()
+
+
+def _finished(run: Any) -> tuple[str, Fit]:
+    """Return a fit with its name, or the run in a folder with the folder's name."""
+    from bwbayes.app.fit.fitted import Fit
+
+    if isinstance(run, Fit):
+        return run.name, run
+    if not _is_folder(run):
+        raise InputError(
+            f"compare: {run if isinstance(run, str | Path) else type(run).__name__}: is "
+            "neither a fit nor the folder of a run; give a list of those alone, or records alone"
+        )
+    return Path(run).name, open_run(run)
+
+
+def _write(records: Mapping[str, Record], folder: Path) -> None:
+    """Write the records that are in memory, except those that are written already."""
+    from bwbayes.record import read_record, write_record
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, record in records.items():
+        if not re.fullmatch(r"[\w][\w .+-]*", name):
+            raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
+        path = folder / f"{name}.h5"
+        if not path.exists() or read_record(path).sha256 != record.sha256:
+            write_record(record, path)

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from bwbayes.errors import InputWarning
 
-__all__ = ["Scratch", "console_of", "warn"]
+__all__ = ["Scratch", "console_of", "folder_or_scratch", "warn"]
 
 
 class Scratch:
@@ -26,6 +26,14 @@ class Scratch:
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
         weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
+def folder_or_scratch(folder: str | Path | None, name: str) -> tuple[Path, Scratch | None]:
+    """Return a user's folder, or without one a temporary one and what keeps it there."""
+    if folder is not None:
+        return Path(folder), None
+    scratch = Scratch()
+    return scratch.path / name, scratch
 
 
 def console_of(progress: bool) -> Console:

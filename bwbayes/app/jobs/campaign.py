@@ -20,16 +20,16 @@ from rich.console import Console
 
 from bwbayes.app.config.config import checked, dump, load
 from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_in
-from bwbayes.app.running.campaign_result import CampaignResult, Row
 from bwbayes.app.running.progress import CountProgress
-from bwbayes.app.running.record_task import SPECIMEN, Ended, Task, fit_one
+from bwbayes.app.running.record_task import SPECIMEN, Ended, fit_record
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.calibration.replicates import as_done
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
-from bwbayes.population.population import FEWEST, population
+from bwbayes.population.population import FEWEST, Population, population
 from bwbayes.population.specimen import Specimen
 from bwbayes.report.saving import save
 
@@ -100,7 +100,7 @@ def resume(
     *,
     workers: int | None = None,
     executor: str | Executor | None = None,
-) -> CampaignResult:
+) -> Campaign:
     """Fit the records that are missing, and write table and page over all.
 
     Parameters
@@ -134,7 +134,7 @@ def resume(
         console.print("combining the records ...", highlight=False)
         campaign = _together(folder, files, refused)
         # Nothing in its files depends on when or how it was computed.
-        save(campaign.report(folder.path.name), folder.path, "campaign", pictures="figures")
+        save(campaign.report(), folder.path, "campaign", pictures="figures")
     return campaign
 
 
@@ -158,19 +158,10 @@ def _fit(
     backend: str | Executor | None,
 ) -> dict[str, str]:
     """Fit records side by side, note each that is done, and return the refusals by file name."""
-    config = folder.config.read_text(encoding="utf-8")
+    config, where = folder.config.read_text(encoding="utf-8"), Path(origin.where)
     tasks = [
-        Task(
-            file.stem,
-            file,
-            config,
-            Path(origin.where),
-            folder.run(file.stem).absolute(),
-            origin.pictures,
-        )
-        for file in missing
+        (file, config, where, folder.run(file.stem).absolute(), origin.pictures) for file in missing
     ]
-    names = {file.stem: file.name for file in missing}
     count = min(workers or os.cpu_count() or 1, len(tasks))
     refused: dict[str, str] = {}
     with (
@@ -181,27 +172,28 @@ def _fit(
     ):
         outcome: Ended
         together = side_by_side(pool, workers, len(tasks))
-        for outcome in as_done(pool, together, fit_one, ((task,) for task in tasks)):
+        for outcome in as_done(pool, together, fit_record, tasks):
             if outcome.refused:
-                refused[names[outcome.name]] = outcome.short
+                refused[outcome.file.name] = outcome.short
             progress("refused" if outcome.refused else outcome.short)
     return refused
 
 
 def _together(
     folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]
-) -> CampaignResult:
+) -> Campaign:
     """Read what the runs have left."""
     rows = [_row(folder, file, refused.get(file.name, "")) for file in files]
     specimens = [
         Specimen.load(row.name, folder.run(row.name) / SPECIMEN) for row in rows if row.parameters
     ]
-    if len(specimens) < FEWEST:
-        return CampaignResult(tuple(rows), None, f"a population needs {FEWEST} records or more")
-    try:
-        return CampaignResult(tuple(rows), population(specimens, generator(1, "population")))
-    except InputError as error:
-        return CampaignResult(tuple(rows), None, str(error))
+    together: Population | str = f"a population needs {FEWEST} records or more"
+    if len(specimens) >= FEWEST:
+        try:
+            together = population(specimens, generator(1, "population"))
+        except InputError as error:
+            together = str(error)
+    return Campaign(folder, tuple(rows), together)
 
 
 def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:

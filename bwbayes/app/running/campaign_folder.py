@@ -17,7 +17,7 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from bwbayes.app.running.folder import Folder
+from bwbayes.app.running.folder import FileOf, Folder
 from bwbayes.errors import InputError
 from bwbayes.record.io.formats import SUFFIXES
 
@@ -45,31 +45,13 @@ class CampaignFolder(Folder):
     """The files of one campaign, by what they are."""
 
     KIND: ClassVar[str] = "campaign"
+    BEGIN: ClassVar[str] = "bwbayes campaign RECORDS --out {path}"
+    RESUME: ClassVar[str] = "bwbayes campaign --resume {path}"
 
-    @property
-    def config(self) -> Path:
-        """The config of all records as it was given; empty if each record is to propose its own."""
-        return self.path / "campaign.toml"
-
-    @property
-    def mark(self) -> Path:
-        """Where it began."""
-        return self.path / "origin.json"
-
-    @property
-    def summary(self) -> Path:
-        """The campaign's numbers."""
-        return self.path / "campaign.json"
-
-    @property
-    def table(self) -> Path:
-        """A line for each record."""
-        return self.path / "campaign.csv"
-
-    @property
-    def page(self) -> Path:
-        """The page over all."""
-        return self.path / "campaign.html"
+    config = FileOf("campaign.toml")  # as it was given; empty if each record proposes its own
+    mark = FileOf("origin.json")
+    summary = FileOf("campaign.json")
+    page = FileOf("campaign.html")
 
     def run(self, name: str) -> Path:
         """Return the folder of a record's run."""
@@ -95,7 +77,6 @@ class CampaignFolder(Folder):
         InputError
             Something else is there, or a campaign of another config or of other records.
         """
-        folder = cls(path)
         if path.exists() and not overwrite:
             existing = cls.open(path)
             if existing.config.read_text(encoding="utf-8") != config or existing.origin() != origin:
@@ -104,26 +85,16 @@ class CampaignFolder(Folder):
                     "folder, or give `overwrite=True`"
                 )
             return existing
-        if path.exists() and any(path.iterdir()) and not folder.mark.is_file():
-            raise InputError(f"{path}: is not a campaign's folder; choose another")
+        cls.require_free(path, overwrite)
+        folder = cls(path)
         with folder.drafted() as draft:
             draft.config.write_text(config, encoding="utf-8")
             draft.mark.write_text(origin.model_dump_json(), encoding="utf-8")
         return folder
 
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the folder of a campaign that exists.
-
-        Raises
-        ------
-        InputError
-            There is no campaign.
-        """
-        folder = cls(path)
-        if not (folder.mark.is_file() and folder.config.is_file()):
-            raise InputError(f"{path}: no campaign here; give the folder of one")
-        return folder
+    def is_of_its_kind(self) -> bool:
+        """Tell a campaign's folder from any other."""
+        return self.mark.is_file() and self.config.is_file()
 
     def origin(self) -> Origin:
         """Return where it began.

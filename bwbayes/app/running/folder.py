@@ -23,7 +23,18 @@ from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.record import write_record
 
-__all__ = ["CalibrationFolder", "Folder", "RunFolder"]
+__all__ = ["CalibrationFolder", "FileOf", "Folder", "RunFolder"]
+
+
+class FileOf:
+    """A file that a folder has, or may have, as an attribute: its path."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, folder: Folder | None, _: object = None) -> Path:
+        """Return its path in a folder; of the class, that relative to any."""
+        return Path(self.name) if folder is None else folder.path / self.name
 
 
 @dataclass(frozen=True)
@@ -32,30 +43,64 @@ class Folder:
 
     path: Path
 
-    KIND: ClassVar[str] = ""
+    # What it holds, and what begins and resumes it.
+    KIND: ClassVar[str]
+    BEGIN: ClassVar[str]
+    RESUME: ClassVar[str]
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the folder as its only writer.
+    @property
+    def resuming(self) -> str:
+        """What resumes it, for messages."""
+        return f"`{self.RESUME.format(path=str(self.path))}`"
+
+    def is_of_its_kind(self) -> bool:
+        """Tell whether this is a folder that was made, and not another one."""
+        raise NotImplementedError
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Return the folder of what exists.
 
         Raises
         ------
         InputError
-            Another process holds it, or it cannot be written.
+            There is none of this kind.
         """
-        lock = FileLock(self.path / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise InputError(
-                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
-            ) from None
-        except OSError as error:
-            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
-        try:
-            yield
-        finally:
-            lock.release()
+        folder = cls(path)
+        if folder.is_of_its_kind():
+            return folder
+        where = f"{path}: no {cls.KIND} here"
+        if path.is_file():
+            raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
+        if folder.has_records():
+            raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
+        raise InputError(f"{where}; start one with `{cls.BEGIN.format(path=str(path))}`")
+
+    def has_records(self) -> bool:
+        """Tell a folder with records, as runs and calibrations have, from somebody's project."""
+        folder = RunFolder(self.path)
+        return folder.config.is_file() and any((self.path / "records").glob("*.h5"))
+
+    @classmethod
+    def require_free(cls, path: Path, overwrite: bool) -> None:
+        """Refuse a place where a new folder cannot be made.
+
+        Raises
+        ------
+        InputError
+            It exists and ``overwrite`` is not given, or it is not one of this kind.
+        """
+        if path.name == "..":
+            raise InputError(f"{path}: is not a valid folder name; choose another")
+        if path.exists():
+            if not overwrite:
+                raise InputError(
+                    f"{path}: exists; resume with {cls(path).resuming}, choose another folder, "
+                    "or give `overwrite=True`"
+                )
+            empty = path.is_dir() and not any(path.iterdir())
+            if not (empty or cls(path).is_of_its_kind()):
+                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
 
     @contextmanager
     def drafted(self) -> Iterator[Self]:
@@ -81,42 +126,66 @@ class Folder:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder as its only writer.
+
+        Raises
+        ------
+        InputError
+            Another process holds it, or it cannot be written.
+        """
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"{self.path}: another process is writing this {self.KIND}; wait for it to end"
+            ) from None
+        except OSError as error:
+            raise InputError(f"{self.path}: {error.strerror}; make the folder writable") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
 
 @dataclass(frozen=True)
 class RunFolder(Folder):
     """The files of one run, by what they are."""
 
-    # What it holds, the file that only such a folder has at its start, and what begins and resumes
-    # it.
     KIND: ClassVar[str] = "run"
-    MARK: ClassVar[str | None] = None
     BEGIN: ClassVar[str] = "bwbayes.fit(RECORD, folder={path!r})"
     RESUME: ClassVar[str] = "bwbayes.resume({path!r})"
 
-    @property
-    def resuming(self) -> str:
-        """What resumes it, for messages."""
-        return f"`{self.RESUME.format(path=str(self.path))}`"
+    config = FileOf("config.toml")  # every choice an explicit number
+    chain = FileOf("chain")  # a folder, which grows by a file a block
+    result = FileOf("result.npz")  # what was worked out of the chain
+    summary = FileOf("summary.json")  # the numbers, written last of all
+    replicates = FileOf("replicates.jsonl")  # of a calibration alone
 
-    @property
-    def config(self) -> Path:
-        """The resolved config: every choice an explicit number."""
-        return self.path / "config.toml"
+    @classmethod
+    def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
+        """Make a new folder, whole or not at all; ``mark`` goes into a calibration's file.
 
-    @property
-    def chain(self) -> Path:
-        """The folder of the chain, which grows by a file a block."""
-        return self.path / "chain"
+        Raises
+        ------
+        InputError
+            It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
+        """
+        cls.require_free(path, overwrite)
+        folder = cls(path)
+        with folder.drafted() as draft:
+            for name, record in {**problem.records, **problem.others}.items():
+                write_record(record, draft.path / f"records/{name}.h5")
+            draft.config.write_text(dump(problem.config), encoding="utf-8")
+            if mark:
+                draft.replicates.write_bytes(mark)
+        return folder
 
-    @property
-    def result(self) -> Path:
-        """What was worked out of the chain."""
-        return self.path / "result.npz"
-
-    @property
-    def summary(self) -> Path:
-        """The run's numbers."""
-        return self.path / "summary.json"
+    def is_of_its_kind(self) -> bool:
+        """Tell a run's folder from a calibration's, and from what is neither."""
+        return self.has_records() and not self.replicates.is_file()
 
     def problem(self) -> Problem:
         """Return what its config and records say."""
@@ -141,84 +210,21 @@ class RunFolder(Folder):
             raise InputError(f"{self.path}: is not finished; resume with {self.resuming}")
         return Standing.read(self.numbers())
 
-    @classmethod
-    def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
-        """Make the folder of a new run, whole or not at all; ``mark`` goes into its mark.
-
-        Raises
-        ------
-        InputError
-            It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
-        """
-        cls.require_free(path, overwrite)
-        folder = cls(path)
-        with folder.drafted() as draft:
-            for name, record in {**problem.records, **problem.others}.items():
-                write_record(record, draft.path / f"records/{name}.h5")
-            draft.config.write_text(dump(problem.config), encoding="utf-8")
-            if cls.MARK:
-                (draft.path / cls.MARK).write_bytes(mark)
-        return folder
-
-    @classmethod
-    def require_free(cls, path: Path, overwrite: bool) -> None:
-        """Refuse a place where a new run cannot be made, as :meth:`create` does."""
-        if path.name == "..":
-            raise InputError(f"{path}: is not a valid folder name; choose another")
-        if path.exists():
-            if not overwrite:
-                raise InputError(
-                    f"{path}: exists; resume with {cls(path).resuming}, choose another folder, "
-                    "or give `overwrite=True`"
-                )
-            empty = path.is_dir() and not any(path.iterdir())
-            if not (empty or cls(path)._is_of_its_kind()):
-                raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the folder of a run that exists.
-
-        Raises
-        ------
-        InputError
-            There is no run.
-        """
-        folder = cls(path)
-        if folder._is_of_its_kind():
-            return folder
-        where = f"{path}: no {cls.KIND} here"
-        if path.is_file():
-            raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
-        if folder._has_records():
-            raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
-        raise InputError(f"{where}; start one with `{cls.BEGIN.format(path=str(path))}`")
-
-    def _has_records(self) -> bool:
-        """Tell a folder that was made from one that holds a config alone."""
-        return self.config.is_file() and any((self.path / "records").glob("*.h5"))
-
-    def _is_of_its_kind(self) -> bool:
-        """Tell a run's folder from a calibration's, and from what is neither."""
-        is_calibration = (self.path / CalibrationFolder.MARK).is_file()
-        return self._has_records() and is_calibration == (self.MARK is not None)
-
 
 @dataclass(frozen=True)
 class CalibrationFolder(RunFolder):
-    """The files of one calibration; its config is that of all its replicates."""
+    """The files of one calibration; its config is that of all its replicates.
+
+    ``replicates`` says what they are replicates of, how many were requested, and then has a line
+    for each.
+    """
 
     KIND: ClassVar[str] = "calibration"
-    MARK: ClassVar[str] = "replicates.jsonl"
     BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out {path}"
     RESUME: ClassVar[str] = "bwbayes calibrate --resume {path}"
 
-    @property
-    def replicates(self) -> Path:
-        """What they are replicates of, how many were requested, and then a line for each."""
-        return self.path / self.MARK
+    summary = FileOf("calibration.json")
 
-    @property
-    def summary(self) -> Path:
-        """The calibration's numbers."""
-        return self.path / "calibration.json"
+    def is_of_its_kind(self) -> bool:
+        """Tell a calibration's folder from a run's."""
+        return self.has_records() and self.replicates.is_file()

@@ -1,8 +1,7 @@
 """One record of a campaign: fitted as ``bwbayes run`` fits it, wherever an executor likes.
 
-:func:`fit_one` is what a worker does: it makes the run's folder or goes on in it, and leaves beside
-the run's files what a population needs of it. A record that cannot be used comes back as a refusal
-of one line; it never ends the campaign.
+Beside the run's files it leaves what a population needs of the record. One that cannot be used
+comes back as a refusal of one line; it never ends the campaign.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -26,22 +25,29 @@ from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.specimen import specimen_of
 from bwbayes.report.outputs import write_summary
 
-__all__ = ["SPECIMEN", "Ended", "Task", "fit_one"]
+__all__ = ["SPECIMEN", "Ended", "fit_record"]
 
 # What a population needs of a run, in the run's folder.
 SPECIMEN = "specimen.npz"
 
 
-@dataclass(frozen=True)
-class Task:
-    """One record to fit.
+class Ended(NamedTuple):
+    """What came of a record: ``short`` says why it was refused, or that it did not converge."""
+
+    file: Path
+    short: str = ""
+    refused: bool = False
+
+
+def fit_record(file: Path, config: str, where: Path, run: Path, pictures: bool) -> Ended:
+    """Fit a record to its end, from wherever its run stands.
+
+    A run of an earlier form of the record or config is replaced.
 
     Parameters
     ----------
-    name
-        The record's name.
     file
-        Its file.
+        The record's file; its stem is the record's name.
     config
         The config of all records in TOML, of which the record's file is replaced; empty for one
         that is proposed from the record.
@@ -52,73 +58,44 @@ class Task:
     pictures
         Whether to draw figures and write the report and bands.
     """
-
-    name: str
-    file: Path
-    config: str
-    where: Path
-    run: Path
-    pictures: bool
-
-
-@dataclass(frozen=True)
-class Ended:
-    """What came of a record: ``short`` says why it was refused, or that it did not converge."""
-
-    name: str
-    short: str = ""
-    refused: bool = False
-
-
-def fit_one(task: Task) -> Ended:
-    """Fit a record to its end, from wherever its run stands.
-
-    A run of an earlier form of the record or config is replaced.
-    """
     with warnings.catch_warnings():
         # They are the run's remarks, and a hundred records of one kind say the same.
         warnings.simplefilter("ignore", InputWarning)
         try:
-            return _fitted(task)
+            record = digest(file)
+            problem = resolve(_config(file, config, where), where)
+            folder = _folder(run, problem)
+            fit = resume(folder, Console(quiet=True), workers=1, files=pictures)
+            if not pictures:
+                write_summary(folder.summary, fit.numbers)
+            if fit.converged:
+                source = generator(fit.problem.config.seed, "specimen")
+                specimen = specimen_of(file.stem, fit.problem.posterior, fit.flat_draws, source)
+                specimen.save(run / SPECIMEN)
+            (run / ENDED).write_text(ended(record, run), encoding="utf-8")
+            return Ended(file, "" if fit.converged else "not converged")
         except InputError as error:
             # Of a file in the folder of the records its name says enough.
-            return Ended(task.name, str(error).replace(f"{task.file.parent}{os.sep}", ""), True)
+            return Ended(file, str(error).replace(f"{file.parent}{os.sep}", ""), True)
         # One record must not end the others, whatever is wrong with it.
         except Exception as error:
-            return Ended(task.name, one_line(f"{type(error).__name__}: {error}"), True)
+            return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
 
 
-def _fitted(task: Task) -> Ended:
-    record = digest(task.file)
-    problem = resolve(_config(task), task.where)
-    folder = _folder(task.run, problem)
-    fit = resume(folder, Console(quiet=True), workers=1, files=task.pictures)
-    if not task.pictures:
-        write_summary(folder.summary, fit.numbers)
-    if fit.converged:
-        source = generator(fit.problem.config.seed, "specimen")
-        specimen = specimen_of(task.name, fit.problem.posterior, fit.flat_draws, source)
-        specimen.save(task.run / SPECIMEN)
-    (task.run / ENDED).write_text(ended(record, task.run), encoding="utf-8")
-    return Ended(task.name, "" if fit.converged else "not converged")
-
-
-def _config(task: Task) -> Config:
+def _config(file: Path, text: str, where: Path) -> Config:
     """Return the config of a record."""
-    if task.config:
-        config = parse(task.config, "campaign.toml")
-        config = config.with_record(task.file)
+    if text:
+        config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = propose(task.file, task.where)
+        proposal = propose(file, where)
         if proposal.pointless is not None:
-            raise InputError(f"{task.file}: {proposal.pointless.error}")
+            raise InputError(f"{file}: {proposal.pointless.error}")
         config = proposal.config
-    return config.model_copy(update={"name": task.name})
+    return config.model_copy(update={"name": file.stem})
 
 
 def _folder(path: Path, problem: Problem) -> RunFolder:
     """Return the run's folder as it stands, if it is of this problem; a new one if not."""
-    folder = RunFolder(path)
     if path.exists():
         try:
             existing = RunFolder.open(path)
@@ -129,4 +106,4 @@ def _folder(path: Path, problem: Problem) -> RunFolder:
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)
-    return folder.create(path, problem, overwrite=False)
+    return RunFolder.create(path, problem, overwrite=False)

@@ -1,0 +1,405 @@
+"""What many records came to: a row for each, their population, and both as tables and a page.
+
+All of it is a function of what the runs have left, so it is the same whenever and in however many
+pieces the campaign was done.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bwbayes.app.problem.problem import generator
+from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.predictions import Prediction, predict_another
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.population.population import Population, PopulationParameter, next_specimen
+from bwbayes.prediction.initial_state import Start
+from bwbayes.record import Record, read_record
+from bwbayes.report.figures import drawn
+from bwbayes.report.report import (
+    Banner,
+    Block,
+    Figure,
+    Kind,
+    Picture,
+    Report,
+    Section,
+    Table,
+    TableColumn,
+    Text,
+)
+from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
+from bwbayes.shown import brief, head
+
+if TYPE_CHECKING:
+    from bwbayes.app.fit.fitted import Fit
+
+__all__ = ["Campaign", "Row"]
+
+# How a record ended, in the order in which they matter, and the exit status of each.
+STATUSES = {
+    "refused": 2,
+    "not converged": 4,
+    "validation failed": 3,
+    "validation inconclusive": 5,
+    "passed": 0,
+}
+
+QUANTILES = (0.025, 0.5, 0.975)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One record of a campaign: how it ended, why, and its numbers.
+
+    ``numbers`` are those of the run's ``summary.json``, empty for a record that was refused.
+    """
+
+    __repr__ = brief
+
+    name: str
+    file: str
+    status: str
+    reason: str
+    numbers: Mapping[str, Any]
+
+    @property
+    def parameters(self) -> Mapping[str, Mapping[str, Any]]:
+        """The parameters' means and intervals by name; none without convergence."""
+        return self.numbers.get("parameters") or {}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Campaign:
+    """Records that were fitted one by one, and what they say together.
+
+    Parameters
+    ----------
+    folder
+        The campaign's folder.
+    rows
+        How each record ended.
+    together
+        What they say together: their population, or why there is none.
+    """
+
+    folder: CampaignFolder
+    rows: tuple[Row, ...]
+    together: Population | str
+    _scratch: object = field(default=None, repr=False)
+
+    @property
+    def population(self) -> Population:
+        """Population mean and spread of each parameter, and every specimen among the others.
+
+        Raises
+        ------
+        InputError
+            There is none, and why.
+        """
+        if isinstance(self.together, str):
+            raise InputError(f"campaign: no population: {self.together}")
+        return self.together
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many records ended in each way."""
+        counted = Counter(row.status for row in self.rows)
+        return {status: counted[status] for status in STATUSES}
+
+    @property
+    def exit_status(self) -> int:
+        """The status of the command: 2 if records were refused, else 4, 3, 5 or 0 as of a run."""
+        return next((s for name, s in STATUSES.items() if self.counts[name]), 0)
+
+    @property
+    def outliers(self) -> dict[str, list[str]]:
+        """The parameters in which a record lies off the population, by record."""
+        off: dict[str, list[str]] = {}
+        for name, spread in self._spreads.items():
+            for record in spread.outliers:
+                off.setdefault(record, []).append(name)
+        return off
+
+    @property
+    def short(self) -> dict[str, str]:
+        """Why records were refused, did not converge, or have bands that do not hold, by record."""
+        return {row.name: f"{row.status}: {row.reason}" for row in self.rows if row.reason}
+
+    @property
+    def notes(self) -> list[str]:
+        """What is short, and what lies off the population, a line each."""
+        notes = [f"{name}: {why}" for name, why in self.short.items()]
+        return notes + [
+            f"{n}: off the population in {', '.join(o)}" for n, o in self.outliers.items()
+        ]
+
+    @cached_property
+    def table(self) -> Any:
+        """A pandas.DataFrame with a row for each record: status, reason, means, intervals.
+
+        It is what ``campaign.csv`` holds; the columns of numbers are ``QUANTITY_what_UNIT``.
+        """
+        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
+
+        lines = []
+        for row in self.rows:
+            line: dict[str, object] = {
+                "record": row.name,
+                "file": row.file,
+                "status": row.status,
+                "reason": row.reason,
+                "outlier_in": " ".join(self.outliers.get(row.name, ())),
+                "steps": row.numbers.get("steps"),
+            }
+            estimates = self._parameters(row)
+            for name, unit in self._units.items():
+                statistics = ["mean", "sd", "lower_95", "upper_95"]
+                statistics += ["shrunk_lower_95", "shrunk_upper_95"] * (name in self._spreads)
+                for statistic in statistics:
+                    value = estimates.get(name, {}).get(statistic)
+                    line[f"{name}_{statistic}_{unit}"] = value
+            lines.append(line)
+        return pd.DataFrame(lines).astype({"steps": "Int64"}).set_index("record")
+
+    def fit(self, name: str) -> Fit:
+        """Return the fit of one record.
+
+        Raises
+        ------
+        InputError
+            It has none.
+        """
+        from bwbayes.app.fit.calls import open_run  # noqa: PLC0415  # which makes fits
+
+        return open_run(self.folder.run(name))
+
+    def predict(
+        self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float | None = None
+    ) -> Prediction:
+        """Predict a specimen that was not measured, along a record or a planned voltage.
+
+        Its parameters are drawn from the population; noise and offset are those of the campaign's
+        first record that has converged. `from_rest` and `lead_in` are as in :meth:`Fit.predict`.
+
+        Raises
+        ------
+        InputError
+            There is no population, or the record cannot be used.
+        """
+        first = self.fit(self.population.names[0])
+        problem = first.problem
+        if not isinstance(record, Record):
+            record = read_record(record, need_displacement=False)
+        source = generator(problem.config.seed, "next specimen")
+        draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
+        start = Start(from_rest, True, lead_in)
+        return predict_another(problem, draws, record, start, "next specimen")
+
+    def plot(self) -> Figure:
+        """Draw each parameter's intervals side by side, with the population.
+
+        Raises
+        ------
+        InputError
+            No record has converged.
+        """
+        if not self._units:
+            raise InputError("campaign: no record has converged, so there is nothing to draw")
+        return drawn(self._draw)
+
+    def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
+        return "\n".join([f"{len(self.rows)} records: {self._counted}", *self.notes])
+
+    def report(self) -> Report:
+        """Return how the records of a campaign ended, and what they say together."""
+        kinds: list[Kind] = [STATUS_KINDS.get(row.status, "bad") for row in self.rows]
+        worst: Kind = min(kinds, key=["bad", "note", "good"].index, default="good")
+        outliers = [f"{record}: {', '.join(names)}" for record, names in self.outliers.items()]
+        attention = [(row.name, mark(row.status), row.reason) for row in self.rows if row.reason]
+        columns = ("Record", "Status", "Reason")
+        picture = Picture(
+            "parameters",
+            "Parameters side by side",
+            "Median and 95 % interval of every record that has converged: gray, by itself; blue, "
+            "with the population for a prior; red, if it lies off the population that all others "
+            "show. Line and band: the population's middle, and where 95 % of specimens not "
+            "measured yet lie.",
+            self._draw,
+        )
+        population: Block = Text(f"No population: {self.together}.", on="both")
+        if self._spreads:
+            population = self._population_table()
+        name = self.folder.path.name
+        return Report(
+            title=f"{name}, campaign",
+            heading=f"Campaign: {name}",
+            banners=[
+                Banner(worst, f"{len(self.rows)} records", [self._counted]),
+                *[Banner("note", "Off the population", items=outliers)] * bool(outliers),
+            ],
+            blocks=[
+                *[Table("short", "Records to look at", columns, attention)] * bool(attention),
+                population,
+                *[picture] * bool(self._units),
+                Section("Records", [self._records_table()]),
+            ],
+            numbers=self._numbers(),
+            csv=self.table.to_csv(float_format="%.7g", lineterminator="\n"),
+        )
+
+    @property
+    def _spreads(self) -> Mapping[str, PopulationParameter]:
+        return {} if isinstance(self.together, str) else self.together.parameters
+
+    @property
+    def _units(self) -> dict[str, str]:
+        return {name: str(e["unit"]) for row in self.rows for name, e in row.parameters.items()}
+
+    @property
+    def _counted(self) -> str:
+        return ", ".join(f"{count} {status}" for status, count in self.counts.items() if count)
+
+    def _parameters(self, row: Row) -> dict[str, dict[str, Any]]:
+        """Return a record's estimates by parameter: by itself, and what the population says."""
+        parameters = {name: dict(estimate) for name, estimate in row.parameters.items()}
+        for name, spread in self._spreads.items():
+            among = spread.specimens.get(row.name)
+            if among is not None:
+                parameters[name] |= {
+                    "shrunk_median": among.median,
+                    "shrunk_lower_95": among.lower,
+                    "shrunk_upper_95": among.upper,
+                    "off_population_p": among.p,
+                    "outlier": among.outlier,
+                    "pareto_k": among.pareto_k,
+                    "taken_for_normal": among.normal,
+                }
+        return parameters
+
+    def _numbers(self) -> dict[str, object]:
+        """Return a campaign's numbers as ``campaign.json`` holds them."""
+        copied = ("steps", "validation", "remarks", "data_sha256")
+        records = {
+            row.name: {
+                "file": row.file,
+                "status": row.status,
+                "reason": row.reason or None,
+                "parameters": self._parameters(row) or None,
+                **{key: row.numbers.get(key) for key in copied},
+            }
+            for row in self.rows
+        }
+        alone = isinstance(self.together, str)
+        return {
+            "counts": self.counts,
+            "exit_status": self.exit_status,
+            "records": records,
+            "outliers": self.outliers,
+            "population": None if alone else self.population.summary(),
+            "no_population_because": self.together if alone else None,
+        }
+
+    def _draw(self) -> Figure:
+        from bwbayes.report.figures.campaign import (  # noqa: PLC0415  # slow to load
+            Interval,
+            ParameterPanel,
+            draw_parameters,
+        )
+
+        panels = []
+        for name, unit in self._units.items():
+            alone, shrunk, specimen = {}, {}, None
+            for row in self.rows:
+                if name in row.parameters:
+                    own = row.parameters[name]
+                    edges = own["lower_95"], own["median"], own["upper_95"]
+                    alone[row.name] = Interval(*edges)
+            if name in self._spreads:
+                spread = self._spreads[name]
+                for record, among in spread.specimens.items():
+                    edges = among.lower, among.median, among.upper
+                    shrunk[record] = Interval(*edges, among.outlier)
+                specimen = Interval(*np.quantile(spread.new, QUANTILES))
+            panels.append(ParameterPanel(label_with_unit(name, unit), alone, shrunk, specimen))
+        return draw_parameters([row.name for row in self.rows if row.parameters], panels)
+
+    def _records_table(self) -> Table:
+        """Return a row for each record: its parameters by themselves."""
+        rows, numbers = [], []
+        for row in self.rows:
+            texts = []
+            flat: dict[str, object] = {"record": row.name, "status": row.status}
+            for name in self._units:
+                own = row.parameters.get(name)
+                texts.append("" if own is None else _range(own["lower_95"], own["upper_95"]))
+                flat |= {f"{name} {key}": own[key] for key in ("mean", "sd")} if own else {}
+            rows.append((row.name, mark(row.status), *texts))
+            numbers.append(flat)
+        return Table(
+            "records",
+            "Records, 95 % intervals of each by itself",
+            ("Record", "Status", *(label_with_unit(*item) for item in self._units.items())),
+            rows,
+            records=numbers,
+            note="More is in campaign.csv and campaign.json; each record's own run is in records/.",
+        )
+
+    def _population_table(self) -> Table:
+        rows = []
+        for spread in self._spreads.values():
+            low, _, high = np.quantile(spread.new, QUANTILES)
+            normal = sum(among.normal for among in spread.specimens.values())
+            rows.append(
+                (
+                    spread.name,
+                    unit_text(spread.unit),
+                    _estimate(spread.mean),
+                    _estimate(spread.spread, percent=spread.logarithmic),
+                    _range(low, high),
+                    ", ".join(spread.outliers),
+                    f"{spread.pareto_k:.2f}",
+                    f"{normal} of {len(spread.specimens)}",
+                )
+            )
+        return Table(
+            "population",
+            "Population",
+            (
+                "Parameter",
+                "Unit",
+                "Middle",
+                "Spread",
+                "A specimen not measured yet, 95 %",
+                TableColumn("Outliers", on="screen"),
+                TableColumn("Pareto k", on="page"),
+                TableColumn("Taken for normal", on="page"),
+            ),
+            rows,
+            note="Medians, and 95 % intervals. A parameter above zero has a population that is "
+            "normal in the logarithm: its middle is the median, its spread relative, in percent. "
+            "Each parameter by itself. The records' own posteriors were reweighted; where Pareto k "
+            "is above 0.7, or few draws count, a record's likelihood was taken for normal.",
+            on="both",
+        )
+
+
+def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
+    """Write a median and a 95 % interval; a relative spread in percent."""
+    low, median, high = np.quantile(draws, QUANTILES) * (100 if percent else 1)
+    return f"{median:.3g}{' %' if percent else ''} ({_range(low, high)})"
+
+
+def _range(low: float, high: float) -> str:
+    return f"{digits(low, high - low)} to {digits(high, high - low)}"
