@@ -16,7 +16,7 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.config.models import models_of
-from bwbayes.app.fit.opening import finished
+from bwbayes.app.fit.fitted import finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.choosing import chosen_noise
+from bwbayes.app.running.explaining import chosen_noise
 from bwbayes.app.running.run import resume, start
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record

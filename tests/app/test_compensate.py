@@ -12,7 +12,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.products import compensate as command
-from bwbayes.app.fit.opening import converged
+from bwbayes.app.fit.fitted import converged
 from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.predicted import FILES, Compensation
 from bwbayes.control.references import shaped

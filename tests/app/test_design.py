@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
-from bwbayes.app.fit.opening import converged
+from bwbayes.app.fit.fitted import converged
 from bwbayes.app.jobs.design import design
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing

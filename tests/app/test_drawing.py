@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bwbayes.app.running.figure_worker import Beside, beside
+from bwbayes.app.running.figure_worker import Artist, artist_of
 from bwbayes.report.figures import drawings, interactive, picture_of, save_pictures
 from tests.app import example
 
@@ -26,8 +26,8 @@ class Broken(Executor):
 
 def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
     run = example.run()
-    with beside(2, enabled=True) as artist:
-        if artist is None:
+    with artist_of(2, apart=True) as artist:
+        if artist.pool is None:
             pytest.skip("this machine has one core")
         artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
         artist.draw(dataclasses.replace(run, scores={}))
@@ -44,7 +44,7 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died, and nothing was begun."""
-    artist, run = Beside(Broken()), example.run(converged=False)
+    artist, run = Artist(Broken()), example.run(converged=False)
     drawn = artist.pictures(run, tmp_path)
     assert artist.plots(run) == ({}, [])
     assert ["trace", "ranks"] == list(drawn)
@@ -52,7 +52,7 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
 
 
 def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
-    artist, run = Beside(Broken()), example.run()
+    artist, run = Artist(Broken()), example.run()
     artist.draw(run)
     assert list(drawings(run)) == list(artist.pictures(run, tmp_path))
     assert interactive.made(run) == artist.plots(run)

@@ -12,7 +12,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.products import export as command
-from bwbayes.app.fit.opening import converged
+from bwbayes.app.fit.fitted import converged
 from bwbayes.app.jobs.export import FILES, export
 from bwbayes.errors import InputError
 

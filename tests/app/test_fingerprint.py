@@ -4,37 +4,39 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bwbayes.app.commands.products import predict
-from bwbayes.app.config.config import dump, load, parse
-from bwbayes.app.fit.opening import finished
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.fit.fitted import finished
+from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running import assembling, cache
-from bwbayes.app.running.fingerprint import (
-    fingerprint,
-    require_same,
-    version_remarks,
-    versions,
-)
+from bwbayes.app.running.fingerprint import fingerprint, require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
 from tests.app import small
 
 
-def wider(folder: RunFolder) -> None:
-    """Make the prior of d wider, as a user would in an editor."""
-    config = load(folder.config)
-    d = config.parameters["d"]
-    assert d.prior is not None
-    sigma = float(d.prior["sigma"])
-    changed = d.model_copy(update={"prior": d.prior | {"sigma": 1.25 * sigma}})
-    parameters = config.parameters | {"d": changed}
-    folder.config.write_text(dump(config.model_copy(update={"parameters": parameters})))
+@pytest.fixture(scope="module")
+def problem(run: Path) -> Problem:
+    return RunFolder(run).problem()
+
+
+def require(problem: Problem, changed: Config) -> None:
+    """Hold a config against the chain of a problem."""
+    noted = {"data_sha256": problem.sha256, "posterior": fingerprint(problem.config)}
+    require_own(replace(problem, config=changed), Path("x"), noted)
+
+
+def with_d(config: Config, **changes: Any) -> Config:
+    d = config.parameters["d"].model_copy(update=changes)
+    return config.model_copy(update={"parameters": config.parameters | {"d": d}})
 
 
 def resumed(folder: RunFolder) -> None:
@@ -48,7 +50,11 @@ def predicted(folder: RunFolder) -> None:
 @pytest.mark.parametrize("use", [redraw, resumed, predicted])
 def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], object]) -> None:
     """It once moved the means of a finished chain: 0.693 +- 0.008 became 0.675 +- 0.010."""
-    wider(copy)
+    config = load(copy.config)
+    prior = config.parameters["d"].prior
+    assert prior is not None
+    wider = with_d(config, prior=prior | {"sigma": 1.25 * float(prior["sigma"])})
+    copy.config.write_text(dump(wider))
     with pytest.raises(InputError) as caught:
         use(copy)
     text = str(caught.value)
@@ -67,27 +73,47 @@ def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], obj
         ("block = 25", "block = 30", "sampling.block"),
     ],
 )
-def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key: str) -> None:
-    text = (run / "config.toml").read_text()
-    if old not in text:  # the stand's hold
-        old, new = new, old
-    assert old in text
-    changed = parse(text.replace(old, new), "")
-    with pytest.raises(InputError, match=f"x: {key} was .* when the chain was sampled, is "):
-        require_same(fingerprint(load(run / "config.toml")), changed, Path("x"))
-
-
-@pytest.mark.parametrize("use", [redraw, resumed])
-def test_chain_without_a_fingerprint_is_refused(
-    copy: RunFolder, use: Callable[[RunFolder], object]
+def test_what_changes_the_posterior_is_named(
+    problem: Problem, old: str, new: str, key: str
 ) -> None:
+    text = dump(problem.config)
+    assert old in text
+    with pytest.raises(InputError, match=f"x: {key} was .* when the chain was sampled, is "):
+        require(problem, parse(text.replace(old, new), ""))
+
+
+def test_a_bound_and_all_else_that_differs_are_named(problem: Problem) -> None:
+    config = problem.config
+    white = {"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
+    for changed, said in (
+        (with_d(config, lower=0.5), r"parameters.d.lower was not set when .* is 0\.5; undo"),
+        (config.model_copy(update=white), r"seed was 3 .*, is 5 \(also model.noise\); undo"),
+    ):
+        with pytest.raises(InputError, match=said):
+            require(problem, changed)
+
+
+def test_what_leaves_the_posterior_may_change(problem: Problem) -> None:
+    sampling = {"ess": 9.0, "steps": 7, "pilot_steps": 9, "engine": "auto"}
+    changes = {
+        "name": "other",
+        "sampling": problem.config.sampling.model_copy(update=sampling),
+        "validation": {},
+        "truth": {},
+    }
+    relabeled = with_d(problem.config, label="D", description="gain")
+    require(problem, relabeled.model_copy(update=changes))
+
+
+def test_chain_without_a_fingerprint_is_refused(copy: RunFolder) -> None:
     with np.load(copy.chain / "start.npz") as file:
         arrays = dict(file)
     text = json.loads(str(arrays["text"]))
     del text["attributes"]["posterior"]
     np.savez(copy.chain / "start.npz", allow_pickle=False, **arrays | {"text": json.dumps(text)})
-    with pytest.raises(InputError, match=r"does not say which priors .* start a new run"):
-        use(copy)
+    for use in (redraw, resumed):
+        with pytest.raises(InputError, match=r"does not say which priors .* start a new run"):
+            use(copy)
 
 
 def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,31 +129,3 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     remarks = finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
-
-
-def test_a_bound_and_all_else_that_differs_are_named(run: Path) -> None:
-    config = load(run / "config.toml")
-    d = config.parameters["d"].model_copy(update={"lower": 0.5})
-    bounded = config.model_copy(update={"parameters": config.parameters | {"d": d}})
-    white = {"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
-    for changed, said in (
-        (bounded, r"parameters.d.lower was not set when .* is 0\.5; undo"),
-        (config.model_copy(update=white), r"seed was 3 .*, is 5 \(also model.noise\); undo"),
-    ):
-        with pytest.raises(InputError, match=said):
-            require_same(fingerprint(config), changed, Path("x"))
-
-
-def test_what_leaves_the_posterior_may_change(run: Path) -> None:
-    config = load(run / "config.toml")
-    sampling = {"ess": 9.0, "steps": 7, "pilot_steps": 9, "engine": "auto"}
-    d = config.parameters["d"].model_copy(update={"label": "D", "description": "gain"})
-    changes = {
-        "name": "other",
-        "sampling": config.sampling.model_copy(update=sampling),
-        "validation": {},
-        "truth": {},
-        "parameters": config.parameters | {"d": d},
-    }
-    require_same(fingerprint(config), config.model_copy(update=changes), Path("x"))
-    require_same(fingerprint(config), resolve(config, run).config, Path("x"))

@@ -11,7 +11,7 @@ from rich.console import Console
 
 import bwbayes as bw
 from bwbayes.app.config.config import Config, RecordConfig
-from bwbayes.app.running.improving import improve_model
+from bwbayes.app.running.explaining import improve_model
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import write_record
 from tests.diagnosis.plants import plant

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from bwbayes.app.fit.opening import finished
+from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.model.distributions import Distribution

@@ -18,7 +18,7 @@ import xarray
 from rich.console import Console
 
 from bwbayes.app.commands.ending import finish
-from bwbayes.app.fit.opening import finished
+from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.run import redraw, resume

@@ -13,7 +13,6 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.ending import finish
 from bwbayes.app.config.config import load
-from bwbayes.app.running import run as module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
@@ -96,7 +95,7 @@ def test_larger_budget_converges_to_what_it_would_have_been(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "draw_pictures", lambda _: {})
+    monkeypatch.setattr("bwbayes.app.running.figure_worker.drawings", lambda _: {})
     shutil.copytree(cut_short[0].path, tmp_path / "small")
     made = RunFolder.open(tmp_path / "small")
     result = resume(made, small.quiet(), workers=1, steps=20_000)

@@ -97,8 +97,8 @@ def run(
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
+    from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.improving import improve_model
     from bwbayes.app.running.run import start
     from bwbayes.report.priors import priors_table
     from bwbayes.report.report import Report, remarks_banner

@@ -48,7 +48,7 @@ def predict(
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
-    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.predict import predict as predict_record
     from bwbayes.app.jobs.predict import write_prediction
     from bwbayes.diagnosis.standing import Standing
@@ -111,7 +111,7 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.compensate import compensate as invert
 
     if (shape is None) == (reference is None):
@@ -148,7 +148,7 @@ def design(
 
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
-    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.design import design as rank
     from bwbayes.record import Record, write_record
     from bwbayes.report.saving import refuse_existing, save
@@ -180,7 +180,7 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 
     Example: bwbayes export results/ring_bender --rate 1000
     """
-    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.export import FILES
     from bwbayes.app.jobs.export import export as write
 
@@ -211,7 +211,7 @@ def track(folder: Path, out: Path | None, overwrite: bool, quiet: bool, **option
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.fit.opening import converged
+    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.track import track as simulate
     from bwbayes.report.saving import refuse_existing, save
 

@@ -81,8 +81,8 @@ def fit(
     from bwbayes.app.fit.surroundings import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve
     from bwbayes.app.running import run
+    from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.improving import improve_model
 
     config, records = config_of(record, keys)
     path, scratch = folder_or_scratch(folder, "run")
@@ -210,7 +210,7 @@ def open_run(folder: str | Path) -> Fit:
     InputError
         No such run, or it has no draws yet.
     """
-    from bwbayes.app.fit.opening import finished
+    from bwbayes.app.fit.fitted import finished
     from bwbayes.app.running.folder import RunFolder
 
     return finished(RunFolder.open(Path(folder)))

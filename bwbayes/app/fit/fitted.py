@@ -13,6 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
+import numpy as np
+
 from bwbayes.app.fit.surroundings import Scratch, console_of, warn
 from bwbayes.app.jobs.at_work import at_work
 from bwbayes.app.jobs.compensate import compensate as compensate_fit
@@ -23,14 +25,15 @@ from bwbayes.app.jobs.predict import prediction_notes
 from bwbayes.app.jobs.track import track as track_fit
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.assembling import assemble, load_result
-from bwbayes.app.running.fingerprint import version_remarks, versions
+from bwbayes.app.running.figure_worker import Artist
+from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import Prediction, residuals_along
+from bwbayes.app.running.predictions import Prediction
 from bwbayes.app.running.workers import executor
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.diagnosis.validation import Verdict
-from bwbayes.errors import NotConvergedError
+from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.inference.engine import Engine
 from bwbayes.prediction.loops import Loops
 from bwbayes.report.outputs import posterior_tree
@@ -50,7 +53,7 @@ if TYPE_CHECKING:
     from bwbayes.app.fit.plots import Plots
     from bwbayes.comparison.compared import Comparison
 
-__all__ = ["Fit"]
+__all__ = ["Fit", "converged", "finished"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -215,7 +218,9 @@ class Fit:
         """
         scores, verdicts = self._converged().scores, self.result.verdicts
         return {
-            bands.name: Prediction.of(bands, scores.get(bands.name), verdicts.get(bands.name))
+            bands.name: Prediction(
+                **vars(bands), scores=scores.get(bands.name), verdict=verdicts.get(bands.name)
+            )
             for bands in self.result.bands
         }
 
@@ -226,7 +231,18 @@ class Fit:
         nan where nothing was predicted or read. Of several records this raises an InputError: take
         ``fit.bands[NAME].residuals``.
         """
-        return residuals_along(self.problem, self.bands)
+        import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
+
+        if len(self.problem.records) > 1:
+            raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
+        record = self.problem.record
+        values = np.full(record.samples, np.nan)
+        for name, windows in self.problem.windows(*self.problem.records).items():
+            span = slice(windows[0].start, windows[-1].stop)
+            residuals = self.bands[name].residuals
+            values[span] = np.where(np.isfinite(residuals), residuals, values[span])
+        coords = {"time": ("time", record.time, {"units": "s"})}
+        return xr.DataArray(values, coords, "time", "residual", {"units": "um"})
 
     @property
     def loops(self) -> Loops | None:
@@ -304,7 +320,7 @@ class Fit:
         copied = RunFolder.create(Path(folder), self.problem, overwrite)
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
-            run.write_files(self, copied)
+            run.write_files(self, copied, Artist())
         return copied.path
 
     def require_converged(self) -> None:
@@ -348,3 +364,35 @@ class Fit:
     def report(self) -> Report:
         """Return what the page of the run says."""
         return run_report(self.result, self.numbers)
+
+
+def finished(folder: RunFolder) -> Fit:
+    """Return the fit that a run's folder holds, as far as its chain goes: nothing is worked out.
+
+    Raises
+    ------
+    InputError
+        The chain is missing, damaged or still in its pilot.
+    """
+    problem = folder.problem()
+    chain = ChainFile.read(folder.chain)
+    require_own(problem, folder.chain, chain.attributes())
+    if chain.blocks("sampling") == 0:
+        raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
+    return Fit(problem, chain, folder, folder.numbers().get("wall_s", 0.0))
+
+
+def converged(path: Path) -> Fit:
+    """Return the fit in a folder, if it is finished and has converged.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        No such run, or it is not finished.
+    """
+    folder = RunFolder.open(path)
+    fit = finished(folder)
+    fit.require_converged()
+    return fit.knowing(standing=folder.standing())

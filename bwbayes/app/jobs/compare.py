@@ -21,7 +21,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, ModelConfig, dump
 from bwbayes.app.config.models import slug
-from bwbayes.app.fit.opening import finished
+from bwbayes.app.fit.fitted import finished
 from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.model import actuator_of, in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve

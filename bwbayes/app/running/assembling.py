@@ -12,17 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
+from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.cache import load, save, state_of
 from bwbayes.app.running.explaining import explained, lines
-from bwbayes.app.running.figure_worker import Beside
+from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import version_remarks, versions
 from bwbayes.app.running.predictions import judged, predictions, scoring
-from bwbayes.app.running.run_details import facts_of, stepped
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
-from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.information import learned
 from bwbayes.diagnosis.predictive_checks import replicated
 from bwbayes.diagnosis.validation import Background
@@ -31,34 +30,18 @@ from bwbayes.prediction.prediction import thinned
 from bwbayes.prediction.scores import score
 from bwbayes.prediction.steps import measure_steps
 from bwbayes.report.result import Result
-from bwbayes.sampling.chain import draws, log_densities
+from bwbayes.sampling.chain import PHASES, draws, log_densities
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
 
 __all__ = ["assemble", "load_result", "save_result"]
-
-# What of a result takes time, and neither the chain nor the config holds.
-WORKED_OUT = (
-    "outcome",
-    "bands",
-    "scores",
-    "verdicts",
-    "innovations",
-    "loops",
-    "steps",
-    "agreement",
-    "explanations",
-    "learned",
-    "replicated",
-    "remarks",
-)
 
 
 def assemble(
     problem: Problem,
     chain: ChainFile,
     outcome: Outcome,
-    artist: Beside | None = None,
+    artist: Artist | None = None,
     watch: Callable[[str, float], None] = lambda *_: None,
 ) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions.
@@ -66,95 +49,83 @@ def assemble(
     ``artist`` is given each part of it as soon as there is something to draw; ``watch`` is called
     with the name of a step and the share of it that is done.
     """
-    posterior = problem.posterior
+    posterior, seed, records = problem.posterior, problem.config.seed, problem.records
+    artist = artist or Artist()
     result = _drawn(problem, chain, outcome)
-    sampled = result.draws
-    flat = sampled.reshape(-1, sampled.shape[-1])
-    remarks: list[Finding | str] = [
+    flat = result.flat_draws
+    _, alone, first_draws = next(posterior.each(flat))
+    columns = alone.table.columns(alone.prior.theta(first_draws))
+    remarks = [
         *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
-        *conflict.conflicts(posterior.prior, flat, problem.defaults),
-        *identifiability.undetermined(posterior, chain.point),
+        *map(str, conflict.conflicts(posterior.prior, flat, problem.defaults)),
+        *map(str, identifiability.undetermined(posterior, chain.point)),
+        *map(str, alone.only.actuator.hysteresis.remarks(columns, alone.names)),
     ]
-    _, alone, first_draws = next(posterior.each(flat))
-    columns = alone.table.columns(alone.prior.theta(first_draws))
-    remarks += alone.only.actuator.hysteresis.remarks(columns, alone.names)
-    result = replace(result, remarks=tuple(map(str, remarks)))
-    if artist is not None:
-        artist.draw(result)
+    result = replace(result, remarks=tuple(remarks))
+    artist.draw(result)
     if not outcome.converged:
         return result
-    chosen = thinned(flat, generator(problem.config.seed, "draws"))
-    steps = measure_steps(posterior, chosen, stepped(problem))
+    several = len(records) > 1
+    chosen = thinned(flat, generator(seed, "draws"))
+    steps = measure_steps(posterior, chosen, {**(records if several else {}), **problem.others})
     bands = predictions(problem, flat, partial(watch, "predictions"))
-    if artist is not None:
-        artist.draw(replace(result, bands=bands, steps=steps))
-    best = flat[int(np.argmax(result.log_density))]
+    result = replace(result, bands=bands, steps=steps)
+    artist.draw(result)
+    best = flat[[int(np.argmax(result.log_density))]]
     series = {
-        name: innovations.innovations(alone, theta[0], problem.records[name].start)
-        for name, alone, theta in posterior.each(best[np.newaxis])
+        name: innovations.innovations(alone, theta[0], records[name].start)
+        for name, alone, theta in posterior.each(best)
     }
-    begin = {name: record.start for name, record in problem.records.items()}
+    departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
     compared = agreement.agreements(
-        posterior, chain.point, generator(problem.config.seed, "agreement"), begin
+        posterior,
+        chain.point,
+        generator(seed, "agreement"),
+        {name: record.start for name, record in records.items()},
     )
-    several = len(problem.records) > 1
-    odd = {name: innovations.departures(whitened) for name, whitened in series.items()}
     background = Background.of(posterior, flat)
-    failed = any(
-        verdict.holds is False for verdict in judged(problem, bands, background, {}).values()
-    )
-    places = posterior.prior.unconstrain(best[np.newaxis])
-    places = np.concatenate([places, chain.point.optima])
+    failed = any(v.holds is False for v in judged(problem, bands, background, {}).values())
+    modes = np.concatenate([posterior.prior.unconstrain(best), chain.point.optima])
     explanations = {
         name: explained(
             problem,
             name,
-            places,
+            modes,
             partial(watch, f"explanations of {name}" if several else "explanations"),
-            thorough=failed or bool(odd[name]),
+            thorough=failed or bool(departures[name]),
         )
-        for name in problem.records
+        for name in records
     }
     verdicts = judged(problem, bands, background, explanations)
-    source = generator(problem.config.seed, "checks")
+    remarks += map(str, agreement.disagreements(compared))
+    for said in (
+        departures,
+        {name: lines(likely_causes(causes)) for name, causes in explanations.items()},
+    ):
+        for name, texts in said.items():
+            remarks += [f"{name}: {text}" if several else str(text) for text in texts]
+    remarks += [f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes]
+    source = generator(seed, "checks")
     return replace(
         result,
-        bands=bands,
         scores={
-            predicted.name: score(
-                predicted, scoring(problem.config.seed, predicted), background.extent
-            )
-            for predicted in bands
-            if predicted.name in verdicts
+            band.name: score(band, scoring(seed, band), background.extent)
+            for band in bands
+            if band.name in verdicts
         },
         verdicts=verdicts,
         innovations=series,
         loops=measure_loops(posterior, chosen),
-        steps=steps,
         agreement=compared,
         explanations=explanations,
-        learned=learned(posterior.prior, sampled, result.log_density, source),
+        learned=learned(posterior.prior, result.draws, result.log_density, source),
         replicated={
             dataset.name: replicated(posterior, chosen, source, dataset.name)
             for dataset in posterior.datasets
         },
-        remarks=(
-            *result.remarks,
-            *map(str, agreement.disagreements(compared)),
-            *(
-                f"{name}: {finding}" if several else str(finding)
-                for name, departures in odd.items()
-                for finding in departures
-            ),
-            *(
-                f"{name}: {line}" if several else line
-                for name, candidates in explanations.items()
-                for line in lines(likely_causes(candidates))
-            ),
-            *(f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes),
-        ),
+        remarks=tuple(remarks),
     )
 
 
@@ -167,14 +138,44 @@ def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         draws=draws(problem.posterior, chain),
         log_density=log_densities(chain),
         moves=chain.moves("sampling"),
-        facts=facts_of(problem, chain),
+        facts=_facts(problem, chain),
         truth=problem.config.truth,
     )
 
 
+def _facts(problem: Problem, chain: ChainFile) -> dict[str, str]:
+    """Return what was run, for people: one line each, by subject."""
+    facts = {}
+    for name, record in problem.records.items():
+        which = "" if len(problem.records) == 1 else f" {name}"
+        facts[f"record{which}"] = (
+            f"{record.origin}: {record.samples} samples every {record.interval:g} s"
+        )
+        facts[f"fitted{which}"] = ", ".join(
+            f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
+            for w in problem.posterior.alone(name).only.training
+        )
+    steps = ", ".join(f"{chain.steps(phase)} steps of {phase}" for phase in PHASES)
+    accepted = {
+        phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
+        for phase in PHASES
+    }
+    return {
+        **facts,
+        "model": in_words(problem.config.model),
+        "noise": problem.config.model.noise,
+        "sampling": (
+            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; {steps}"
+        ),
+        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
+        "engine": problem.posterior.engine,
+    }
+
+
 def save_result(path: Path, problem: Problem, chain: ChainFile, result: Result) -> None:
-    """Keep what was worked out of a chain."""
-    values = {name: getattr(result, name) for name in WORKED_OUT}
+    """Keep what takes time of a result: all that neither the chain nor the config holds."""
+    drawn = ("name", "parameters", "draws", "log_density", "moves", "facts", "truth")
+    values = {name: value for name, value in vars(result).items() if name not in drawn}
     save(path, state_of(problem, chain), values)
 
 

@@ -1,18 +1,36 @@
-"""What explains a problem's readings better than its model does, and how that is shown."""
+"""What explains a problem's readings better than its model does, how that is shown, and used.
+
+:func:`chosen_noise` takes the noise that a record has evidence for: each is fitted from the mode of
+the rough one, and taken if its evidence leads by odds of twenty to one: the rough discrepancy
+claims least, because it has white noise as a limit, and corners that a smooth one has not.
+
+:func:`improve_model` gives a model the parts for which its record has evidence. Each round fits the
+model, explains its readings better in every way there is, and takes the part of the model that
+leads, if it is worth more than chance. None is added while the fit follows what the actuator did
+not do: no part of a model mends a transient.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
-from bwbayes.app.problem.problem import Problem, generator
+import numpy as np
+from rich.console import Console
+
+from bwbayes.app.config.config import Config
+from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.explanations import explain
+from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
+from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.errors import InputError
+from bwbayes.inference import map_estimate
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.noise import NOISES
+from bwbayes.record import Record
 
-__all__ = ["explained", "lines"]
-
-# Explanations that are shown.
-SHOWN = 5
+__all__ = ["chosen_noise", "explained", "improve_model", "lines"]
 
 
 def explained(
@@ -52,8 +70,82 @@ def explained(
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
-    """Write the explanations that are worth anything, a line each, the best first."""
-    for explanation in explanations[:SHOWN]:
+    """Write those of the best five explanations that are worth anything, a line each."""
+    for explanation in explanations[:5]:
         if explanation.nats > 0:
             text = f"{explanation.text} ({explanation.worth})"
             yield f"explained better by: {text}. Fix: {explanation.fix}."
+
+
+def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
+    """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
+
+    Parameters
+    ----------
+    problem
+        Its posterior has the rough discrepancy; of several records that stays.
+    point
+        Where that posterior is.
+    """
+    usual = "discrepancy"
+    if len(problem.records) > 1:
+        return usual, f"noise: {usual}, which is not chosen by evidence for several records"
+    posterior = problem.posterior
+    rough = climb(posterior, point.optima)
+    worth = {usual: rough.log_evidence}
+    for noise in NOISES.keys() - worth:
+        other = problem.reconfigured({"noise": noise}, {})
+        named = dict(zip(posterior.names, point.optima.T, strict=True))
+        # What only the other noise has starts at its prior's median.
+        nothing = np.zeros(len(point.optima))
+        places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
+        worth[noise] = climb(other, places, least=rough.log_density).log_evidence
+    best = max(worth, key=lambda noise: worth[noise])
+    if worth[best] < worth[usual] + TIED:
+        best = usual
+    against = ", ".join(
+        f"{worth[best] - worth[noise]:+.3g} nats against {noise}"
+        for noise in NOISES
+        if noise != best
+    )
+    return best, f"noise: {best} ({against})"
+
+
+def improve_model(
+    config: Config, folder: Path, console: Console, records: Mapping[str, Record] | None = None
+) -> Config:
+    """Return a config with all parts of the model that pay.
+
+    Parameters
+    ----------
+    config, folder, records
+        As :func:`~bwbayes.app.problem.problem.resolve` takes them; one record is fitted.
+    console
+        Where progress goes.
+
+    Raises
+    ------
+    InputError
+        The config cannot be used, or several records are fitted.
+    """
+    if len(config.records) > 1:
+        raise InputError("improve: is for one training record; improve a fit of one of them first")
+    notes: list[str] = []
+    while True:
+        problem = resolve(config, folder, records)
+        (name,) = problem.records
+        console.print("searching for missing parts of the model ...", highlight=False)
+        point = map_estimate.fit(problem.posterior, generator(config.seed, "point fit"))
+        found = explained(problem, name, point.optima, thorough=True)
+        parts = likely_causes([cause for cause in found if cause.changes])
+        if followed_causes(found) or not parts:
+            break
+        explanation = parts[0]
+        notes.append(f"model improved: {explanation.text} ({explanation.worth}); {explanation.fix}")
+        console.print(
+            f"added: {explanation.text} ({explanation.worth})", highlight=False, soft_wrap=True
+        )
+        config = problem.changed(config, explanation.changes, explanation.parameters)
+    record = config.records[name]
+    noted = record.model_copy(update={"remarks": [*(record.remarks or []), *notes]})
+    return config.model_copy(update={"record": noted}) if notes else config

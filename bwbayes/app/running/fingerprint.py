@@ -22,7 +22,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 
-__all__ = ["fingerprint", "require_its_own", "require_same", "version_remarks", "versions"]
+__all__ = ["fingerprint", "require_own", "version_remarks", "versions"]
 
 # Keys of a config that a chain does not depend on; of tables, everything in them. The record is
 # compared by its readings, not by its file's name.
@@ -35,40 +35,35 @@ FREE_TO_CHANGE = re.compile(
 def fingerprint(config: Config) -> str:
     """Return what a chain notes of a resolved config: its keys and values, as JSON."""
     values = dict(_flat(config.model_dump(exclude_none=True)))
-    kept = {key: value for key, value in values.items() if not FREE_TO_CHANGE.fullmatch(key)}
-    return json.dumps({"coordinates": COORDINATES, **kept})
+    noted = {key: value for key, value in values.items() if not FREE_TO_CHANGE.fullmatch(key)}
+    return json.dumps({"coordinates": COORDINATES, **noted})
 
 
-def require_its_own(path: Path, problem: Problem, noted: Mapping[str, str | int]) -> None:
-    """Refuse a chain, of these attributes, of another posterior than the folder's config says."""
-    if noted.get("data_sha256") != problem.sha256:
-        raise InputError(f"{path}: belongs to another record; undo the edit or start a new run")
-    require_same(noted.get("posterior"), problem.config, path)
-
-
-def require_same(noted: object, config: Config, chain: Path) -> None:
-    """Refuse a config that describes another posterior than a chain was sampled from.
+def require_own(problem: Problem, chain: Path, attributes: Mapping[str, str | int]) -> None:
+    """Refuse a chain of another posterior than a folder's config describes.
 
     Parameters
     ----------
-    noted
-        The chain's fingerprint; None if it has none.
-    config
-        The run's config as it is now, resolved.
+    problem
+        What config and records say now.
     chain
         The chain's file, for the error.
+    attributes
+        What the chain notes: the readings' digest, and its fingerprint.
 
     Raises
     ------
     InputError
         They differ, and the text says in what; or the chain has no fingerprint.
     """
-    if noted is None:
+    if attributes.get("data_sha256") != problem.sha256:
+        raise InputError(f"{chain}: belongs to another record; undo the edit or start a new run")
+    if "posterior" not in attributes:
         raise InputError(
             f"{chain}: does not say which priors and settings it was sampled with; start a new run"
         )
-    before: dict[str, object] = json.loads(str(noted))
-    now: dict[str, object] = json.loads(fingerprint(config))
+    before: dict[str, object] = json.loads(str(attributes["posterior"]))
+    now: dict[str, object] = json.loads(fingerprint(problem.config))
     differing = [key for key in before | now if before.get(key) != now.get(key)]
     if differing:
         first, *others = differing
@@ -82,7 +77,7 @@ def require_same(noted: object, config: Config, chain: Path) -> None:
 def versions(engine: Engine = "numpy") -> dict[str, str]:
     """Return the versions of what computed a result."""
     packages = ["bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py"]
-    packages += ["numba"] if engine == "numba" else []
+    packages += ["numba"] * (engine == "numba")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
@@ -94,9 +89,7 @@ def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:
         for name in now
         if before.get(name, now[name]) != now[name]
     ]
-    if not changed:
-        return ()
-    return (f"the chain was begun with other versions: {'; '.join(changed)}",)
+    return (f"the chain was begun with other versions: {'; '.join(changed)}",) if changed else ()
 
 
 def _flat(table: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:

@@ -199,16 +199,14 @@ class RunFolder(Folder):
         return numbers
 
     def standing(self) -> Standing:
-        """Return whether the bands of the run hold.
+        """Return whether the bands of the run hold, which is finished."""
+        self.require_finished()
+        return Standing.read(self.numbers())
 
-        Raises
-        ------
-        InputError
-            The run is not finished.
-        """
+    def require_finished(self) -> None:
+        """Raise an InputError if the run is not finished."""
         if not self.summary.is_file():
             raise InputError(f"{self.path}: is not finished; resume with {self.resuming}")
-        return Standing.read(self.numbers())
 
 
 @dataclass(frozen=True)

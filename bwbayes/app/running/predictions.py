@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -43,10 +43,15 @@ from bwbayes.report.run import prediction_report
 from bwbayes.report.screen import as_text
 from bwbayes.shown import head
 
-if TYPE_CHECKING:
-    import xarray
-
-__all__ = ["Prediction", "judged", "predict_another", "predictions", "scoring"]
+__all__ = [
+    "Prediction",
+    "judged",
+    "predict_after",
+    "predict_another",
+    "predictions",
+    "scoring",
+    "training_record",
+]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,18 +66,6 @@ class Prediction(Bands):
     scores: Scores | None = None
     verdict: Verdict | None = None
     remarks: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        bands: Bands,
-        scores: Scores | None = None,
-        verdict: Verdict | None = None,
-        remarks: tuple[str, ...] = (),
-    ) -> Self:
-        """Return bands together with what is known of them."""
-        values = {item.name: getattr(bands, item.name) for item in fields(Bands)}
-        return cls(**values, scores=scores, verdict=verdict, remarks=remarks)
 
     @property
     def holds(self) -> bool | None:
@@ -129,10 +122,11 @@ class Prediction(Bands):
     @property
     def _title(self) -> str:
         width = float(np.mean(self.upper["sensor", 95] - self.lower["sensor", 95]))
+        first, last = (
+            clock(time, self.interval) for time in (self.time[0], self.time[-1] + self.interval)
+        )
         return (
-            f"prediction {self.name}: {self.time.size} samples from "
-            f"{clock(self.time[0], self.interval)} to "
-            f"{clock(self.time[-1] + self.interval, self.interval)} s; "
+            f"prediction {self.name}: {self.time.size} samples from {first} to {last} s; "
             f"the 95 % sensor band is {width:.3g} um wide"
         )
 
@@ -174,14 +168,13 @@ def predict_another(
     posterior, seed = problem.posterior, problem.config.seed
     beyond = beyond_training(posterior, record.voltage, record.interval)
     chosen = thinned(flat, generator(seed, "draws"))
-    source = generator(seed, f"predict {record.sha256}")
     of = training_record(problem, of)
-    alone, own_draws = _reaching(problem, chosen, of, record, beyond)
-    bands = predict_record(alone, own_draws, record, start, source, name, window)
+    bands = _of_another(problem, chosen, of, beyond, record, start, name, window)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, scoring(seed, bands), background.extent)
-    return Prediction.of(bands, scores, verdict, tuple(finding.note for finding in beyond))
+    remarks = tuple(finding.note for finding in beyond)
+    return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
 
 
 def predict_after(
@@ -203,48 +196,7 @@ def predict_after(
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     alone, own_draws = _reaching(problem, chosen, of, longer, beyond)
     bands = forecast(alone, own_draws, record, voltage, source, name)
-    return Prediction.of(bands, remarks=tuple(finding.note for finding in beyond))
-
-
-def _reaching(
-    problem: Problem, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
-) -> tuple[Posterior, FloatArray]:
-    """Return posterior and draws of a training record, to predict another record.
-
-    They have creep where that is slower or longer than what was fitted, so that the band grows with
-    what the training did not show.
-    """
-    posterior = problem.posterior
-    if any(finding.kind in ("slow", "duration") for finding in beyond):
-        source = generator(problem.config.seed, f"creep {record.sha256}")
-        posterior, draws = with_creep(posterior, draws, record.duration, source)
-    return posterior.alone(of), posterior.its(draws, of)
-
-
-def residuals_along(problem: Problem, bands: Mapping[str, Prediction]) -> xarray.DataArray:
-    """Return readings less the mean of the bands along the training record, (time,), um.
-
-    nan where nothing was predicted, and where there is no reading. Those of several records are
-    those of their bands: ``fit.bands["step_10"].residuals``.
-
-    Raises
-    ------
-    InputError
-        Several records were fitted.
-    """
-    import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
-
-    if len(problem.records) > 1:
-        raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
-    values = np.full(problem.record.samples, np.nan)
-    for name, windows in problem.windows(*problem.records).items():
-        span = slice(windows[0].start, windows[-1].stop)
-        residuals = bands[name].residuals
-        values[span] = np.where(np.isfinite(residuals), residuals, values[span])
-    time = ("time", problem.record.time, {"units": "s"})
-    return xr.DataArray(
-        values, coords={"time": time}, dims="time", name="residual", attrs={"units": "um"}
-    )
+    return Prediction(**vars(bands), remarks=tuple(finding.note for finding in beyond))
 
 
 def training_record(problem: Problem, name: str | None) -> str:
@@ -275,8 +227,7 @@ def predictions(
     posterior, seed = problem.posterior, problem.config.seed
     chosen = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
-    records = [*problem.records.values(), *problem.others.values()]
-    total = sum(record.samples for record in records)
+    total = sum(r.samples for r in (*problem.records.values(), *problem.others.values()))
     done = 0
 
     def more(samples: int) -> None:
@@ -291,17 +242,44 @@ def predictions(
             # By content: the same record under another name gets the same bands.
             source = generator(seed, f"predict {record.sha256}")
             bands += predict_windows(alone, own_draws, record, windows, source, more)
-    for name, other in problem.validations.items():
-        if other.record is not None:
-            source = generator(seed, f"predict {other.record.sha256}")
+    for name, held_out in problem.validations.items():
+        if held_out.record is not None:
+            other = held_out.record, held_out.start, name, held_out.judged
             beyond = problem.extrapolations(name)
-            alone, own_draws = _reaching(problem, chosen, other.of, other.record, beyond)
-            bands.append(
-                predict_record(
-                    alone, own_draws, other.record, other.start, source, name, other.judged, more
-                )
-            )
+            bands.append(_of_another(problem, chosen, held_out.of, beyond, *other, more))
     return tuple(bands)
+
+
+def _of_another(
+    problem: Problem,
+    draws: FloatArray,
+    of: str,
+    beyond: Iterable[Finding],
+    record: Record,
+    start: Start,
+    name: str,
+    window: tuple[float, float] | None,
+    more: Callable[[int], None] = lambda _: None,
+) -> Bands:
+    """Return the bands of a record that was not fitted, from the draws of one that was."""
+    alone, own_draws = _reaching(problem, draws, of, record, beyond)
+    source = generator(problem.config.seed, f"predict {record.sha256}")
+    return predict_record(alone, own_draws, record, start, source, name, window, more)
+
+
+def _reaching(
+    problem: Problem, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
+) -> tuple[Posterior, FloatArray]:
+    """Return posterior and draws of a training record, to predict another record.
+
+    They have creep where that is slower or longer than what was fitted, so that the band grows with
+    what the training did not show.
+    """
+    posterior = problem.posterior
+    if any(finding.kind in ("slow", "duration") for finding in beyond):
+        source = generator(problem.config.seed, f"creep {record.sha256}")
+        posterior, draws = with_creep(posterior, draws, record.duration, source)
+    return posterior.alone(of), posterior.its(draws, of)
 
 
 def judged(
@@ -317,8 +295,7 @@ def judged(
     records = {window: name for name in problem.records for window in problem.windows(name)}
     verdicts = {}
     for predicted in bands:
-        fitted = predicted.training
-        explained = explanations.get(records[predicted.name], ()) if fitted else ()
+        explained = explanations.get(records[predicted.name], ()) if predicted.training else ()
         beyond = problem.extrapolations(predicted.name)
         verdict = assess(predicted, background, explanations=explained, beyond=beyond)
         if verdict is not None:

@@ -11,22 +11,20 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import Fit
-from bwbayes.app.fit.opening import finished
+from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.assembling import assemble, save_result
-from bwbayes.app.running.choosing import chosen_noise
-from bwbayes.app.running.figure_worker import Beside, beside
-from bwbayes.app.running.fingerprint import fingerprint, require_its_own, versions
+from bwbayes.app.running.explaining import chosen_noise
+from bwbayes.app.running.figure_worker import Artist, artist_of
+from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.app.running.workers import executor, one_thread
@@ -34,12 +32,9 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.map_estimate import PointFit
-from bwbayes.report.figures import save_pictures
 from bwbayes.report.outputs import write_bands, write_posterior, write_summary
 from bwbayes.report.page import render
-from bwbayes.report.saving import draw_pictures
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 
@@ -79,10 +74,7 @@ def draw(folder: RunFolder) -> Fit:
         The folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem, chain = _chain(folder, Console(quiet=True))
-        with executor(1, problem.posterior.engine) as pool:
-            outcome = sample(problem.posterior, problem.plan, chain, pool)
-        return Fit(problem, chain, folder).knowing(outcome=outcome)
+        return _drawn(folder, Console(quiet=True), workers=1)
 
 
 def resume(
@@ -132,25 +124,21 @@ def resume(
     """
     start_time = time.monotonic()
     # First of all: it goes on from this process as it is now.
-    with beside(workers, enabled=background and files) as artist, folder.locked(), one_thread():
+    with artist_of(workers, apart=background and files) as artist, folder.locked(), one_thread():
         targets = {"ess": ess, "steps": steps, "engine": engine}
-        _retarget(folder, {name: value for name, value in targets.items() if value is not None})
+        targets = {name: value for name, value in targets.items() if value is not None}
+        if targets:
+            config = load(folder.config)
+            sampling = config.sampling.model_copy(update=targets)
+            _rewrite(folder, config.model_copy(update={"sampling": sampling}))
         if show is not None:
             show(folder.problem())
-        problem, chain = _chain(folder, console, engine)
-        with (
-            executor(workers, problem.posterior.engine, backend) as pool,
-            Progress(console, problem.plan) as progress,
-        ):
-            # It is written last, as the sign that all is done; now there is more to do.
-            folder.summary.unlink(missing_ok=True)
-            outcome = sample(problem.posterior, problem.plan, chain, pool, progress)
-        console.print(_effort(problem, chain, outcome), highlight=False)
+        fit = _drawn(folder, console, workers, engine, backend)
         console.print("computing predictions ...", highlight=False)
         with StepProgress(console) as watch:
-            result = assemble(problem, chain, outcome, artist, watch)
-        fit = Fit(problem, chain, folder, time.monotonic() - start_time).knowing(
-            outcome=outcome, result=result, standing=result.standing
+            result = assemble(fit.problem, fit.chain, fit.outcome, artist, watch)
+        fit = fit.knowing(
+            result=result, standing=result.standing, seconds=time.monotonic() - start_time
         )
         if answer is not None:
             answer(fit)
@@ -169,11 +157,36 @@ def redraw(folder: RunFolder) -> Fit:
         The run has no draws yet, or another process is writing it.
     """
     with folder.locked(), one_thread():
-        if not folder.summary.is_file():
-            raise InputError(f"{folder.path}: is not finished; resume with {folder.resuming}")
+        folder.require_finished()
         fit = finished(folder)
-        write_files(fit, folder)
+        write_files(fit, folder, Artist())
     return fit
+
+
+def _drawn(
+    folder: RunFolder,
+    console: Console,
+    workers: int | None,
+    engine: Engine | None = None,
+    backend: str | Executor | None = None,
+) -> Fit:
+    """Sample a run to its end, from wherever it stands."""
+    problem, chain = _chain(folder, console, engine)
+    plan = problem.plan
+    with (
+        executor(workers, problem.posterior.engine, backend) as pool,
+        Progress(console, plan) as progress,
+    ):
+        # It is written last, as the sign that all is done; now there is more to do.
+        folder.summary.unlink(missing_ok=True)
+        outcome = sample(problem.posterior, plan, chain, pool, progress)
+    models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
+    fewest = float(np.min([outcome.check.ess_bulk, outcome.check.ess_tail]))
+    console.print(
+        f"sampled {models} models, {models / fewest:.1f} for each of {fewest:.0f} effective draws",
+        highlight=False,
+    )
+    return Fit(problem, chain, folder).knowing(outcome=outcome)
 
 
 def _chain(
@@ -183,7 +196,7 @@ def _chain(
     problem = folder.problem()
     if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
         return _begun(folder, problem, console)
-    chain = ChainFile.resume(folder.chain, partial(require_its_own, folder.chain, problem))
+    chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))
     first_engine, now = chain.attributes()["engine"], problem.posterior.engine
     if first_engine != now:
         if requested is None:
@@ -198,18 +211,19 @@ def _chain(
 def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Problem, ChainFile]:
     """Start a chain with a point fit, and with the noise that it shows."""
     console.print("computing the MAP estimate ...", highlight=False)
-    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
-    if problem.config.model.noise == "auto":
+    config = problem.config
+    point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
+    if config.model.noise == "auto":
         noise, why = chosen_noise(problem, point)
         console.print(why, highlight=False, soft_wrap=True)
-        if noise != problem.config.model.noise_until_chosen:
-            _rewrite(folder, problem.changed(problem.config, {"noise": noise}, {}))
+        if noise == config.model.noise_until_chosen:
+            model = config.model.model_copy(update={"noise": noise})
+            _rewrite(folder, config.model_copy(update={"model": model}))
             problem = folder.problem()
-            point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
         else:
-            model = problem.config.model.model_copy(update={"noise": noise})
-            _rewrite(folder, problem.config.model_copy(update={"model": model}))
+            _rewrite(folder, problem.changed(config, {"noise": noise}, {}))
             problem = folder.problem()
+            point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
     posterior, config = problem.posterior, problem.config
     attributes: dict[str, str | int] = {
         "config": dump(config),
@@ -226,25 +240,6 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
     return problem, chain
 
 
-def _effort(problem: Problem, chain: ChainFile, outcome: Outcome) -> str:
-    """Say how many models all effective draws took, those of the phases before them included."""
-    steps = sum(chain.steps(phase) for phase in PHASES)
-    models = steps * problem.plan.ensembles * problem.plan.walkers
-    fewest = float(np.min([outcome.check.ess_bulk, outcome.check.ess_tail]))
-    return (
-        f"sampled {models} models, {models / fewest:.1f} for each of {fewest:.0f} effective draws"
-    )
-
-
-def _retarget(folder: RunFolder, targets: Mapping[str, object]) -> None:
-    """Write new targets of the sampling, if there are any, into the folder's config."""
-    if not targets:
-        return
-    config = load(folder.config)
-    sampling = config.sampling.model_copy(update=targets)
-    _rewrite(folder, config.model_copy(update={"sampling": sampling}))
-
-
 def _rewrite(folder: RunFolder, config: Config) -> None:
     """Write another config into a run's folder."""
     text = dump(config)
@@ -254,26 +249,18 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
     draft.replace(folder.config)
 
 
-def write_files(fit: Fit, folder: RunFolder, artist: Beside | None = None) -> None:
+def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done."""
     fit = fit.knowing(folder=folder)
-    result, numbers = fit.result, fit.numbers
+    result, numbers, bands = fit.result, fit.numbers, folder.path / "bands.csv"
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
-    if artist is not None:
-        artist.draw(result)
-    records = fit.problem.records
-    write_posterior(folder.path / "posterior.nc", result, fit.log_likelihood, records)
-    (folder.path / "bands.csv").unlink(missing_ok=True)
+    artist.draw(result)
+    write_posterior(folder.path / "posterior.nc", result, fit.log_likelihood, fit.problem.records)
+    bands.unlink(missing_ok=True)
     if result.bands:
-        write_bands(folder.path / "bands.csv", result.bands)
-    if artist is None:
-        from bwbayes.report.figures import interactive  # noqa: PLC0415  # bokeh is slow to load
-
-        pictures, plots = draw_pictures(fit.report()), interactive.made(result)
-        save_pictures(pictures, figures)
-    else:
-        pictures, plots = artist.pictures(result, figures), artist.plots(result)
+        write_bands(bands, result.bands)
+    pictures, plots = artist.pictures(result, figures), artist.plots(result)
     save_result(folder.result, fit.problem, fit.chain, result)
     page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
