@@ -134,7 +134,7 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     residual = readings.values - posterior.simulate(theta, readings.rows)
     parameters = record.table.noise(theta)
     noise, interval = posterior.likelihood.spaced, record.actuator.interval
-    white, _ = noise.whiten(parameters, residual[:, np.newaxis], readings.skipped)
+    white, _ = posterior.likelihood.whiten(parameters, residual[:, np.newaxis])
     return Innovations(
         begin + interval * readings.rows.astype(np.float64),
         white[0, 0],

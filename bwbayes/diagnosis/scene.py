@@ -188,9 +188,8 @@ class Scene:
         record, readings = self.posterior.only, self.posterior.only.readings
         residual = readings.values - self.posterior.simulate(self.fit.theta, readings.rows)[0]
         noise = record.table.noise(self.fit.theta)
-        white: FloatArray = self.posterior.likelihood.spaced.whiten(
-            noise, residual[np.newaxis, np.newaxis], readings.skipped
-        )[0][0, 0]
+        series = residual[np.newaxis, np.newaxis]
+        white: FloatArray = self.posterior.likelihood.whiten(noise, series)[0][0, 0]
         return white
 
     def clock(self, time: float) -> str:

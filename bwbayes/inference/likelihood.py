@@ -231,7 +231,7 @@ class Likelihood:
 
         Beside them the log determinant (models,) of the noise's covariance.
         """
-        readings, spaced = self.readings, self.spaced
+        readings = self.readings
         model, noise = self.table.actuator(theta), self.table.noise(theta)
         if displacement is None:
             displacement = self._simulated(model)[:, readings.where]
@@ -241,7 +241,18 @@ class Likelihood:
         series[:, 0] = readings.values - displacement
         series[:, 1 : 1 + responses.shape[1], :audible] = responses
         series[:, 1 + responses.shape[1] :] = shapes
-        return spaced.whiten(noise, series, readings.skipped)
+        return self.whiten(noise, series)
+
+    def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.
+
+        ``noise`` is (models, parameters of the noise).
+        """
+        if self.engine == "numba" and self.noise.states:
+            from bwbayes.inference import compiled  # noqa: PLC0415  # as in `moments`
+
+            return compiled.whiten(self.spaced, noise, series, self.readings.skipped)
+        return self.spaced.whiten(noise, series, self.readings.skipped)
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""

@@ -6,6 +6,9 @@ exponential of its equation of motion, and eighty digits.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+from collections.abc import Iterator
 from dataclasses import replace
 from decimal import Decimal, localcontext
 from itertools import product
@@ -69,6 +72,17 @@ def parameters(sensor: float, time: float, quality: float | None) -> FloatArray:
     return np.array([sensor, 1.3, time, *([] if quality is None else [quality])])
 
 
+def whitened(
+    noise: Noise, theta: FloatArray, series: FloatArray, skipped: FloatArray
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Whiten series with each engine that there is."""
+    yield noise.whiten(theta, series, skipped)
+    if importlib.util.find_spec("numba"):
+        yield importlib.import_module("bwbayes.inference.compiled").whiten(
+            noise, theta, series, skipped
+        )
+
+
 @given(
     st.integers(0, 2**32 - 1),
     st.floats(1e-3, 3.0),
@@ -86,11 +100,10 @@ def test_whitening_is_that_of_a_dense_covariance(
     factor = np.linalg.cholesky(dense(theta, rows, INTERVAL))
     expected = generator.standard_normal((2, rows.size))
     skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
-    (white,), (log_determinant,) = noise_of(theta).whiten(
-        theta[np.newaxis], (expected @ factor.T)[np.newaxis], skipped
-    )
-    np.testing.assert_allclose(white, expected, atol=1e-8)
-    np.testing.assert_allclose(log_determinant, 2 * np.sum(np.log(np.diag(factor))), atol=1e-8)
+    given_to = theta[np.newaxis], (expected @ factor.T)[np.newaxis], skipped
+    for (white,), (log_determinant,) in whitened(noise_of(theta), *given_to):
+        np.testing.assert_allclose(white, expected, atol=1e-8)
+        np.testing.assert_allclose(log_determinant, 2 * np.sum(np.log(np.diag(factor))), atol=1e-8)
 
 
 def test_twin_a_gap_that_is_taken_for_one_step_is_found() -> None:
@@ -109,9 +122,26 @@ def test_a_filter_that_has_settled_goes_on_as_one_that_has_not(quality: float | 
     expected = np.random.default_rng(1).standard_normal(rows.size)
     skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
     one = theta[np.newaxis], (factor @ expected)[np.newaxis, np.newaxis], skipped
-    white, log_determinant = noise_of(theta).whiten(*one)
-    np.testing.assert_allclose(white[0, 0], expected, atol=1e-8)
-    assert abs(log_determinant[0] - 2 * np.sum(np.log(np.diag(factor)))) < 1e-8 * rows.size
+    for white, log_determinant in whitened(noise_of(theta), *one):
+        np.testing.assert_allclose(white[0, 0], expected, atol=1e-8)
+        assert abs(log_determinant[0] - 2 * np.sum(np.log(np.diag(factor)))) < 1e-8 * rows.size
+
+
+def test_models_by_more_than_a_group_are_whitened_as_each_alone() -> None:
+    """Of 45 models, with gaps and several series; the compiled filter takes 32 side by side."""
+    generator = np.random.default_rng(2)
+    theta = np.exp(generator.normal([-2, 0, -1, -1], 0.5, (45, 4)))
+    series = generator.standard_normal((45, 3, 200))
+    skipped = np.where(generator.random(200) < 0.05, generator.integers(1, 9, 200), 0).astype(float)
+    noise = SmoothNoise(INTERVAL)
+    alone = [
+        noise.whiten(row[np.newaxis], one[np.newaxis], skipped)
+        for row, one in zip(theta, series, strict=True)
+    ]
+    expected, logs = (np.concatenate(parts) for parts in zip(*alone, strict=True))
+    for white, log_determinant in whitened(noise, theta, series, skipped):
+        np.testing.assert_allclose(white, expected, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(log_determinant, logs, rtol=1e-12)
 
 
 @pytest.mark.parametrize("quality", [None, 0.02, 0.5, 3.0])

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.compiled import kernels, lanes
+from bwbayes.inference.compiled import kernels, lanes, whitening
 from bwbayes.inference.compiled.motion import physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
 from bwbayes.inference.noise import Noise
@@ -21,7 +21,7 @@ from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 
-__all__ = ["moments"]
+__all__ = ["moments", "whiten"]
 
 # Elements (models x samples) of the drive that is worked out beforehand, at a time.
 LARGEST = 1 << 23
@@ -58,17 +58,11 @@ def moments(
     """
     table = ParameterTable(actuator, noise)
     column, parameters = table.columns(theta), table.noise(theta)
-    missing, gaps = np.unique(np.append(skipped, (-1.0, 0.0)), return_inverse=True)
-    usual = noise.step(parameters)
-    sensor, process = (sd**2 for sd in reversed(noise.marginal_sd(parameters)))
-    steps = np.array([noise.step(parameters, number).T for number in missing[2:].tolist()])
-    steps = steps.reshape(-1, len(theta), lanes.STEP)
-    # What is None is left out when it is compiled.
-    second = True if noise.states > 1 else None
+    usual, process, sensor, second, gaps, steps = _filtering(noise, parameters, skipped)
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
-    record, together = (voltage, displacement, gaps[:-2] - 1), shared(actuator, voltage)
+    record, together = (voltage, displacement, gaps), shared(actuator, voltage)
     for rows, stage in _staged(actuator, column, theta, voltage, from_rest=from_rest):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
@@ -93,6 +87,36 @@ def moments(
             products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
     typical = np.count_nonzero(skipped >= 0) * np.log(usual[3] + sensor)
     return products, typical + sums[lanes.LOG_DETERMINANT]
+
+
+def whiten(
+    noise: Noise, theta: FloatArray, series: FloatArray, skipped: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what :meth:`~bwbayes.inference.state_space.Noise.whiten` does, of a noise with states.
+
+    Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um,
+    and the readings (readings,) missing before each.
+    """
+    usual, process, sensor, second, gaps, steps = _filtering(noise, theta, skipped)
+    rows = np.ascontiguousarray(usual.T)
+    return whitening.whitened(rows, process, sensor, second, gaps, steps, series)
+
+
+def _filtering(
+    noise: Noise, theta: FloatArray, skipped: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, bool | None, IntArray, FloatArray]:
+    """Return the filter's usual step (rows, models), variances of discrepancy and sensor (models,).
+
+    Then whether there is a second state, what is None being left out when it is compiled; which of
+    the gaps is just before each reading, 0 for none and −1 where there is no reading; and the step
+    over each gap (gaps, models, rows).
+    """
+    missing, gaps = np.unique(np.append(skipped, (-1.0, 0.0)), return_inverse=True)
+    process, sensor = (sd**2 for sd in noise.marginal_sd(theta))
+    steps = np.array([noise.step(theta, number).T for number in missing[2:].tolist()])
+    steps = steps.reshape(-1, len(theta), lanes.STEP)
+    second = True if noise.states > 1 else None
+    return noise.step(theta), process, sensor, second, gaps[:-2] - 1, steps
 
 
 def _staged(

@@ -29,7 +29,7 @@ from bwbayes.inference.compiled.lanes import (
 # fmt: on
 # isort: on
 
-__all__ = ["follow", "gather", "is_settled", "is_tracked", "skip", "take", "take_logs"]
+__all__ = ["advance", "follow", "gather", "is_settled", "is_tracked", "skip", "take", "take_logs"]
 
 # A covariance that changes by less of itself over a reading has settled.
 SETTLED = 2e-15
@@ -176,7 +176,7 @@ def is_settled(state: FloatArray) -> bool:
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def take(state: FloatArray, second: bool | None, series: int) -> None:
     """Take a reading of each series, and go on to the next."""
-    _gain(state, second)
+    advance(state, second)
     pair = PRODUCTS
     for k in range(series):
         at = k * LANES
@@ -197,7 +197,7 @@ def take(state: FloatArray, second: bool | None, series: int) -> None:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _gain(state: FloatArray, second: bool | None) -> None:
+def advance(state: FloatArray, second: bool | None) -> None:
     """Take the covariance to the next reading, with the gain of this one on the way."""
     for i in range(LANES):
         p, sensor = state[COVARIANCE + i], state[SENSOR + i]
