@@ -19,17 +19,12 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
-from bwbayes.record.io.checks import VoltageIs, checked, require_voltage_is
-from bwbayes.record.io.columns import QUANTITIES, Naming
-from bwbayes.record.io.grid import clock
-from bwbayes.record.io.memory import array_source, frame_source, frozen_vector, in_seconds
-from bwbayes.record.io.table import table_of
+from bwbayes.record.io.columns import QUANTITIES, Naming, select
+from bwbayes.record.io.grid import VoltageIs, clock, record_fields, require_voltage_is
+from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.shown import brief
 
 __all__ = ["Record", "Split", "Window"]
-
-# Of a sample: what rounding may do to a time.
-ROUNDING = 1e-6
 
 Window = tuple[float, float]
 """A stretch of time in s: start <= time < stop."""
@@ -101,7 +96,7 @@ class Record:
         for name in ("voltage", "displacement", "truth"):
             values = getattr(self, name)
             if values is not None:
-                object.__setattr__(self, name, frozen_vector(name, values, samples))
+                object.__setattr__(self, name, _frozen(name, values, samples))
         if not (math.isfinite(self.interval) and self.interval > 0):
             raise InputError(f"interval: {self.interval} s is not a positive time; give it in s")
         if not math.isfinite(self.start):
@@ -160,30 +155,17 @@ class Record:
         >>> record.interval, round(float(record.displacement.max()), 3)
         (0.001, 0.7)
         """
-        units = units or {}
         if (time is None) == (interval is None) or (time is not None and start is not None):
             raise InputError(f"{origin}: give either interval (and start), in s, or time, a vector")
-        if time is None and "time" in units:
+        if time is None and "time" in (units or {}):
             raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
-        # The record makes arrays of what it gets, or says that it cannot.
-        arguments: Any = {"voltage": voltage, "displacement": displacement}
-        arguments |= {"interval": 1.0 if interval is None else interval, "start": start or 0.0}
-        record = cls(**arguments, voltage_is=voltage_is, origin=origin)
-        times = None
-        if time is not None:
-            times = frozen_vector("time", in_seconds(np.asarray(time)), record.samples)
-        arrays = {
-            "time": record.time if times is None else times,
-            "voltage": record.voltage,
-            "displacement": record.displacement,
-        }
-        notes = {"origin": record.origin}
-        if times is None:
-            notes["interval_s"] = repr(record.interval)
-        need = displacement is not None
-        needed = QUANTITIES if need else ("time", "voltage")
-        table = table_of(array_source(origin, arrays, units, notes), Naming(units=units), needed)
-        return cls(**checked(table, voltage_is=record.voltage_is, need_displacement=need))
+        if interval is not None and not 0 < interval < np.inf:
+            raise InputError(f"{origin}: interval: {interval} s is not a positive time")
+        arrays = {"time": time, "voltage": voltage, "displacement": displacement}
+        source = array_source(origin, arrays, interval, start or 0.0)
+        common = {"time": "s", "voltage": "V", "displacement": "um"}
+        naming = Naming(units=common | dict(units or {}))
+        return cls._of(source, naming, voltage_is, displacement is not None)
 
     @classmethod
     def from_pandas(
@@ -230,11 +212,15 @@ class Record:
         names = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in names.items() if name is not None}
         naming = Naming(columns, units or {}, fs)
-        # Without a displacement it is a planned voltage; which it is, only what is said can tell.
-        needed = QUANTITIES if displacement is not None else ("time", "voltage")
-        table = table_of(frame_source(frame, origin), naming, needed)
-        need = displacement is not None
-        return cls(**checked(table, voltage_is=voltage_is, need_displacement=need))
+        return cls._of(frame_source(frame, origin), naming, voltage_is, displacement is not None)
+
+    @classmethod
+    def _of(
+        cls, source: Source, naming: Naming, voltage_is: VoltageIs, need_displacement: bool
+    ) -> Self:
+        needed = QUANTITIES if need_displacement else ("time", "voltage")
+        table = select(source, naming, needed)
+        return cls(**record_fields(table, require_voltage_is(voltage_is), need_displacement))
 
     @property
     def samples(self) -> int:
@@ -290,8 +276,8 @@ class Record:
             If the window is empty or reaches outside the record; the text names the record's span.
         """
         # Whole samples from the record's start, rounded half down: border - interval/2 <= time.
-        first = math.ceil(_offset(self, start) - 0.5)
-        last = math.ceil(_offset(self, stop) - 0.5)
+        borders = np.ceil(self._offsets([start, stop]) - 0.5)
+        first, last = (int(border) for border in borders)
         if first < 0 or last > self.samples:
             problem = "reaches outside the record"
         elif first >= last:
@@ -339,8 +325,9 @@ class Record:
         for start, stop in windows:
             # Refuses what is outside, or ends before it begins.
             self.window_slice(start, max(stop, start + self.interval) if start < stop else stop)
-            edges = _offset(self, start) + ROUNDING, _offset(self, stop) - ROUNDING
-            left_out[max(math.floor(edges[0]), 0) : math.ceil(edges[1])] = True
+            first, last = self._offsets([start, stop])
+            rounding = 1e-6  # of a sample
+            left_out[max(math.floor(first + rounding), 0) : math.ceil(last - rounding)] = True
         return self.without(left_out)
 
     def decimate(self, factor: int) -> Record:
@@ -391,10 +378,34 @@ class Record:
             start=self.start + self.interval * samples.start,
         )
 
+    def _offsets(self, times: Sequence[float]) -> FloatArray:
+        """Return the samples from the start to times, s, cut off where they are outside anyway."""
+        offsets = (np.asarray(times, dtype=np.float64) - self.start) / self.interval
+        if np.isnan(offsets).any():
+            raise InputError(f"window: {times} s: not times; give them in s")
+        return np.clip(offsets, -2.0, self.samples + 2.0)
 
-def _offset(record: Record, time: float) -> float:
-    """Return the samples from the start to `time`, cut off where it is outside anyway."""
-    offset = (time - record.start) / record.interval
-    if math.isnan(offset):
-        raise InputError(f"window: {time} s is not a time; give it in s")
-    return min(max(offset, -2.0), record.samples + 2.0)
+
+def _frozen(name: str, values: ArrayLike, samples: int) -> FloatArray:
+    """Return a vector of so many finite numbers that cannot be written to.
+
+    A displacement may be missing (nan) in all places but one.
+    """
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not numbers ({error}); give real numbers") from error
+    if vector.ndim != 1 or vector.size == 0:
+        raise InputError(f"{name}: shape {vector.shape} is not a vector; give (samples,)")
+    if vector.size != samples:
+        raise InputError(f"{name}: {vector.size} samples, voltage has {samples}; give the same")
+    missing = np.isnan(vector) & (name == "displacement")
+    if missing.all():
+        raise InputError(f"{name}: holds no reading; give at least one")
+    vector[missing] = np.nan  # one nan for all, as there are many and a digest tells them apart
+    finite = np.isfinite(vector) | missing
+    if not finite.all():
+        sample = int(np.argmin(finite))
+        raise InputError(f"{name}: {vector[sample]} at sample {sample}; give finite numbers")
+    vector.setflags(write=False)
+    return vector

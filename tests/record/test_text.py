@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,6 @@ HEADER = "time_s,voltage_V,displacement_um"
 ROWS = [f"{i * 0.005:.3f},{np.sin(i):.4f},{20 * np.cos(1.3 * i):.4f}" for i in range(30)]
 LINES = [HEADER, *ROWS]
 GOOD = "\n".join(LINES) + "\n"
-
-Lines = list[str]
 
 
 def read(folder: Path, content: str | bytes) -> Record:
@@ -31,21 +28,19 @@ def fault(folder: Path, content: str | bytes) -> str:
         read(folder, content)
     text = str(caught.value)
     assert len(text.splitlines()) == 1
-    assert "; " in text or "did you mean" in text
+    assert "; " in text
     return text.removeprefix(f"{folder}/")
 
 
 def cell(line: int, column: int, text: str) -> str:
     """Return the good file with another text in one cell (line 2 is the first sample's)."""
-    lines = list(LINES)
-    cells = lines[line - 1].split(",")
+    cells = LINES[line - 1].split(",")
     cells[column] = text
-    lines[line - 1] = ",".join(cells)
-    return "\n".join(lines) + "\n"
+    return lines(*LINES[: line - 1], ",".join(cells), *LINES[line:])
 
 
-def edited(edit: Callable[[Lines], Lines]) -> str:
-    return "\n".join(edit(list(LINES))) + "\n"
+def lines(*texts: str) -> str:
+    return "\n".join(texts) + "\n"
 
 
 def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None:
@@ -53,12 +48,8 @@ def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None
     numbers = np.array([[float(x) for x in row.split(",")] for row in ROWS])
     np.testing.assert_array_equal(numbers[:, 1], record.voltage)
     np.testing.assert_array_equal(numbers[:, 2], record.displacement)
-    assert (0.005, 0.0, "output", "record.csv") == (
-        record.interval,
-        record.start,
-        record.voltage_is,
-        record.origin,
-    )
+    assert (0.005, 0.0, "output") == (record.interval, record.start, record.voltage_is)
+    assert "record.csv" == record.origin
 
 
 HARMLESS = {
@@ -74,23 +65,20 @@ HARMLESS = {
     "blanks": GOOD.replace(",", " ").encode(),
     "blanks and indented": GOOD.replace(",", "  ").replace("\n", "\n  ").rstrip(" ").encode(),
     "bars": GOOD.replace(",", "|").encode(),
-    "semicolons below": "\n".join([HEADER] + [row.replace(",", ";") for row in ROWS]).encode(),
+    "semicolons below": lines(HEADER, *(row.replace(",", ";") for row in ROWS)).encode(),
     "header in a comment": ("# " + GOOD).encode(),
     "utf-16": GOOD.encode("utf-16"),
     "utf-16-le": GOOD.encode("utf-16-le"),
     "utf-16-be": GOOD.encode("utf-16-be"),
     "cp1252": GOOD.replace("_um", "_µm").encode("cp1252"),
-    "cp1252 and other names": GOOD.replace("_um", " [µm]")
-    .replace("time_s", "Zeit / s")
-    .encode("cp1252"),
+    "other names": GOOD.replace("_um", " [µm]").replace("time_s", "Zeit / s").encode("cp1252"),
     "units in a line": GOOD.replace(HEADER, "time,voltage,displacement\n(s),(V),(um)\n").encode(),
     "units in words": GOOD.replace(
         HEADER, "time,voltage,displacement\nsecond,Volt,micron"
     ).encode(),
-    "micro": GOOD.replace("_um", "_µm").encode(),
     "mu": GOOD.replace("_um", "_\u03bcm").encode(),
     "case": GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
-    "order": "\n".join(",".join(line.split(",")[::-1]) for line in LINES).encode(),
+    "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
     "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
 }
 
@@ -106,28 +94,17 @@ def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path:
     assert "output" == read_record(tmp_path / "record.csv", voltage_is="output").voltage_is
 
 
-def test_a_planned_voltage_is_accepted_only_when_asked_for(tmp_path: Path) -> None:
-    planned = "\n".join(line.rpartition(",")[0] for line in LINES)
-    assert "record.csv:1: no column for the displacement; add it" in fault(tmp_path, planned)
-    assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
-
-
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("abc", "'abc' is not a number"),
-        ("1.5V", "'1.5V' is not a number"),
-        ("0x10", "'0x10' is not a number"),
-        ("1_000", "'1_000' is not a number"),
-        ("1;5", "'1;5' is not a number"),
+        *((text, f"{text!r} is not a number") for text in ("abc", "1.5V", "0x10", "1_000", "1;5")),
         ("inf", "inf is not a finite number"),
         ("-Infinity", "-inf is not a finite number"),
         ("1e999", "inf is not a finite number"),
         ("1e12", "1e+12 is absurdly large"),
     ],
 )
-@pytest.mark.parametrize("line", [2, 17, 31])
-@pytest.mark.parametrize("column", [1, 2])
+@pytest.mark.parametrize(("line", "column"), [(2, 1), (17, 2), (31, 1)])
 def test_a_bad_cell_is_named_by_line_and_column(
     tmp_path: Path, text: str, problem: str, line: int, column: int
 ) -> None:
@@ -135,174 +112,118 @@ def test_a_bad_cell_is_named_by_line_and_column(
     assert fault(tmp_path, cell(line, column, text)).startswith(where + problem)
 
 
-@pytest.mark.parametrize("column", [0, 1])
 @pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN", "#N/A"])
-def test_a_time_and_a_voltage_are_needed_at_every_sample(
-    tmp_path: Path, column: int, text: str
+def test_an_empty_cell_is_a_missing_reading_but_no_time_or_voltage(
+    tmp_path: Path, text: str
 ) -> None:
-    where = f"record.csv:17: {HEADER.split(',')[column]}: "
-    problem = "no number (empty or nan); give one at every sample (only a displacement may be miss"
-    assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
-
-
-@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN"])
-@pytest.mark.parametrize("line", [2, 17, 31])
-def test_an_empty_cell_in_the_displacement_is_a_missing_reading(
-    tmp_path: Path, line: int, text: str
-) -> None:
-    whole, record = read(tmp_path, GOOD), read(tmp_path, cell(line, 2, text))
-    assert record.displacement is not None
-    assert [line - 2] == np.flatnonzero(np.isnan(record.displacement)).tolist()
+    whole, record = read(tmp_path, GOOD), read(tmp_path, cell(17, 2, text))
+    assert [15] == np.flatnonzero(~record.has_reading).tolist()
     np.testing.assert_array_equal(whole.voltage, record.voltage)
-    assert record.readings == whole.readings - 1
-
-
-def without_readings(rows: int) -> str:
-    return "\n".join(
-        [HEADER, *ROWS[: 30 - rows], *(f"{i * 0.005:.3f},1," for i in range(30 - rows, 30))]
-    )
+    for column in (0, 1):
+        where = f"record.csv:17: {HEADER.split(',')[column]}: "
+        problem = "no number (empty or nan); give one at every sample (only a displacement may be"
+        assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 
 
 def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> None:
-    text = fault(tmp_path, without_readings(21) + "\n")
+    empty = [row.rpartition(",")[0] + "," for row in ROWS]
+    text = fault(tmp_path, lines(HEADER, *ROWS[:9], *empty[9:]))
     assert text.startswith("record.csv: displacement_um: too few readings: 9; give at least 10")
-    assert "too few readings: 0" in fault(
-        tmp_path, "\n".join([HEADER, *(r.rpartition(",")[0] + "," for r in ROWS)]) + "\n"
-    )
+    assert "too few readings: 0" in fault(tmp_path, lines(HEADER, *empty))
+    assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
+    without = lines(*(line.rpartition(",")[0] for line in LINES))
+    assert "record.csv:1: no column for the displacement; add it" in fault(tmp_path, without)
     assert read_record(tmp_path / "record.csv", need_displacement=False).displacement is None
 
 
 def test_columns_of_other_quantities_are_ignored_with_a_remark(tmp_path: Path) -> None:
-    lines = ["note," + HEADER + ",temp_C,", *(f"a.b,{row},21.5," for row in ROWS)]
-    path = tmp_path / "record.csv"
-    path.write_text("\n".join(lines))
+    text = lines("note," + HEADER + ",temp_C,", *(f"a.b,{row},21.5," for row in ROWS))
     with pytest.warns(InputWarning, match=r"record.csv:1: ignored columns: note, temp_C, column 6"):
-        record = read_record(path)
+        record = read(tmp_path, text)
     assert record.sha256 == read(tmp_path, GOOD).sha256
 
 
-def with_gaps() -> str:
-    return "# voltage: command\n" + edited(lambda x: [*x[:9], *x[12:20], *x[21:]])
-
-
-def test_a_command_is_held_where_samples_are_missing(tmp_path: Path) -> None:
+def test_a_command_is_held_where_samples_are_missing_and_an_output_refused(tmp_path: Path) -> None:
     whole = read(tmp_path, GOOD)
-    (tmp_path / "record.csv").write_text(with_gaps())
+    gaps = lines("# voltage: command", *LINES[:9], *LINES[12:20], *LINES[21:])
     with pytest.warns(InputWarning, match=r"csv:11: time_s: 4 samples are missing, .* in 2 gaps"):
-        record = read_record(tmp_path / "record.csv")
+        record = read(tmp_path, gaps)
     missing = [8, 9, 10, 19]
     assert missing == np.flatnonzero(~record.has_reading).tolist()
     assert (record.samples, record.interval) == (whole.samples, whole.interval)
     expected = whole.voltage.copy()
     expected[missing] = whole.voltage[[7, 7, 7, 18]]
     np.testing.assert_array_equal(expected, record.voltage)
-
-
-def test_a_gap_in_an_output_says_what_to_do(tmp_path: Path) -> None:
-    (tmp_path / "record.csv").write_text(with_gaps())
-    with pytest.raises(InputError, match="about 3 missing; give the voltage there") as caught:
+    with pytest.raises(InputError, match=r"about 3 missing; give the voltage there .* = .command."):
         read_record(tmp_path / "record.csv", voltage_is="output")
-    assert 'voltage_is = "command"' in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("late", "problem"),
-    [
-        (0.0025, "not a whole number of"),
-        (0.0013, "not a whole number of"),
-        (1e9, "makes the record too"),
-    ],
+    ("late", "problem"), [(0.0025, "not a whole number of"), (1e9, "makes the record too long")]
 )
-def test_a_gap_that_is_no_whole_number_of_intervals_is_refused(
-    tmp_path: Path, late: float, problem: str
-) -> None:
+def test_a_gap_that_cannot_be_held_is_refused(tmp_path: Path, late: float, problem: str) -> None:
     rows = [f"{i * 0.005 + (0.01 + late) * (i > 9):.4f},{i},{i}" for i in range(40)]
-    text = fault(tmp_path, "# voltage: command\n" + "\n".join([HEADER, *rows]) + "\n")
-    assert problem in text
+    assert problem in fault(tmp_path, lines("# voltage: command", HEADER, *rows))
 
 
-FAULTS: list[tuple[str, str | bytes, str]] = [
-    (
-        "missing field",
-        cell(9, 1, "1").replace(",1,", ","),
-        "record.csv:9: missing field, 2 fields for 3 columns; complete the line",
+FAULTS: dict[str, tuple[str | bytes, str]] = {
+    "missing field": (lines(*LINES[:8], "0.1,2", *LINES[9:]), ":9: 2 fields for 3 columns; compl"),
+    "extra field": (
+        cell(9, 2, "1.5,2.5"),
+        ":9: 4 fields for 3 columns; remove '2.5', or write 1.5",
     ),
-    ("extra field", cell(9, 2, "1.5,2.5"), "record.csv:9: extra field '2.5', 4 fields for"),
-    ("decimal comma", cell(9, 1, "1,5"), "record.csv:9: decimal comma or extra field"),
-    (
-        "all decimal commas",
-        "\n".join([HEADER] + [row.replace(".", ",") for row in ROWS]),
-        "record.csv:2: decimal commas, 6 fields for 3 columns; separate them by semicolons",
+    "decimal comma": (cell(9, 1, "1,5"), ":9: 4 fields for 3 columns; remove '"),
+    "all decimal commas": (
+        lines(HEADER, *(row.replace(".", ",") for row in ROWS)),
+        ":2: decimal commas, 6 fields for 3 columns; separate them by semicolons",
     ),
-    ("empty line", edited(lambda x: [*x[:8], "", *x[8:]]), "record.csv:9: empty line"),
-    ("comment below", edited(lambda x: [*x[:8], "# x", *x[8:]]), "record.csv:9: comment"),
-    (
-        "time goes back",
-        edited(lambda x: [*x[:8], x[5], *x[9:]]),
-        "record.csv:9: time_s: time goes back from 0.030 s to 0.020 s",
+    "empty line": (lines(*LINES[:8], "", *LINES[8:]), ":9: 0 fields for 3 columns"),
+    "comment below": (lines(*LINES[:8], "# x", *LINES[8:]), ":9: 1 fields for 3 columns"),
+    "time goes back": (
+        lines(*LINES[:8], LINES[5], *LINES[9:]),
+        ":9: time_s: time goes back from 0.030 s to 0.020 s",
     ),
-    ("repeated", edited(lambda x: x[:8] + x[7:]), "record.csv:9: time_s: 0.030 s is repeated"),
-    (
-        "gap",
-        edited(lambda x: x[:8] + x[12:]),
-        "record.csv:9: time_s: gap of 0.025 s after 0.030 s, about 4 missing",
+    "repeated": (lines(*LINES[:8], *LINES[7:]), ":9: time_s: 0.030 s is repeated"),
+    "gap": (
+        lines(*LINES[:8], *LINES[12:]),
+        ":9: time_s: gap of 0.025 s after 0.03 s, about 4 missing",
     ),
-    (
-        "irregular by the last decimal",
+    "irregular by the last decimal": (
         cell(9, 0, "0.036"),
-        "record.csv:9: time_s: irregular sampling: 0.006 s",
+        ":9: time_s: irregular sampling: 0.006 s",
     ),
-    (
-        "header missing",
-        "\n".join(ROWS),
-        "record.csv: which column is the time, which the voltage, which the displacement? There "
-        "are 30 values each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.8"
-        "8 to 20); say columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
+    "header missing": (
+        lines(*ROWS),
+        ": which column is the time, which the voltage, which the displacement? There are 30 values"
+        " each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.88 to 20); say "
+        "columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
     ),
-    (
-        "column without unit",
-        GOOD.replace("voltage_V", "voltage"),
-        "record.csv:1: which unit has 'voltage' ",
+    "no unit": (GOOD.replace("voltage_V", "voltage"), ":1: which unit has 'voltage' "),
+    "no times": (
+        lines(*(line.partition(",")[2] for line in LINES)),
+        ":1: what is the sampling rate, Hz (no column can be the time)? There",
     ),
-    (
-        "unit unknown",
-        GOOD.replace("voltage_V", "voltage_v"),
-        "record.csv:1: which unit has 'voltage_v' (voltage)? There are",
+    "empty file": ("", ": the file is empty"),
+    "header alone": (HEADER, ": no columns of numbers in it"),
+    "few samples": (lines(*LINES[:6]), ": too short, samples: 5"),
+    "cut in a field": (GOOD[:-3], ":31: the last line is cut off"),
+    "NUL": (cell(9, 1, "\0"), ":9: voltage_V: "),
+    "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), ": neither text nor HDF5"),
+    "a workbook": (b"PK\3\4" + bytes(range(256)), ": a workbook or an archive; export it"),
+    "constant voltage": (
+        lines(HEADER, *(f"{i / 100},1.5,{i}" for i in range(20))),
+        ": voltage_V: constant at 1.5",
     ),
-    (
-        "column missing",
-        "\n".join(line.partition(",")[2] for line in LINES),
-        "record.csv:1: what is the sampling rate, Hz (no column can be the time)? There",
-    ),
-    ("empty file", "", "record.csv: the file is empty"),
-    ("header alone", HEADER, "record.csv: no columns of numbers in it"),
-    ("few samples", "\n".join(LINES[:6]), "record.csv: too short, samples: 5"),
-    ("cut in a field", GOOD[:-3], "record.csv:31: the last line is cut off"),
-    ("NUL", cell(9, 1, "\0"), "record.csv:9: voltage_V: "),
-    ("a picture", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "record.csv: neither text nor HDF5"),
-    (
-        "a workbook",
-        b"PK\3\4" + bytes(range(256)),
-        "record.csv: a workbook or an archive; export it",
-    ),
-    (
-        "constant voltage",
-        "\n".join([HEADER] + [f"{i / 100},1.5,{i}" for i in range(20)]),
-        "record.csv: voltage_V: constant at 1.5",
-    ),
-    ("voltage is what", "# voltage: comand\n" + GOOD, "record.csv: voltage_is: 'comand'"),
-    ("wrong interval", "# interval_s: 0.004\n" + GOOD, "record.csv: interval_s '0.004'"),
-]
+    "voltage is what": ("# voltage: comand\n" + GOOD, ": voltage_is: 'comand'"),
+    "wrong interval": ("# interval_s: 0.004\n" + GOOD, ": interval_s '0.004'"),
+}
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"), [case[1:] for case in FAULTS], ids=[case[0] for case in FAULTS]
-)
+@pytest.mark.parametrize(("content", "expected"), FAULTS.values(), ids=FAULTS)
 def test_each_fault_is_one_line_with_its_place(
     tmp_path: Path, content: str | bytes, expected: str
 ) -> None:
-    text = fault(tmp_path, content)
-    assert expected == text[: len(expected)]
+    assert fault(tmp_path, content).startswith(f"record.csv{expected}")
 
 
 @pytest.mark.parametrize(
@@ -310,13 +231,11 @@ def test_each_fault_is_one_line_with_its_place(
     [
         ("none.csv", "does not exist"),
         ("", "is a directory"),
-        ("folder.csv", "is a directory"),
         ("record.xyz", "the file is empty"),
         ("bad\0name.csv", "does not exist"),
     ],
 )
 def test_files_that_cannot_be_opened_say_why(tmp_path: Path, name: str, problem: str) -> None:
-    (tmp_path / "folder.csv").mkdir()
     (tmp_path / "record.xyz").touch()
     with pytest.raises(InputError, match=problem):
         read_record(tmp_path / name)
@@ -325,22 +244,20 @@ def test_files_that_cannot_be_opened_say_why(tmp_path: Path, name: str, problem:
 @pytest.mark.parametrize(("rate", "decimals"), [(1024.0, 4), (3.0, 1), (300.0, 3), (44100.0, 6)])
 def test_times_rounded_in_print_are_uniform(tmp_path: Path, rate: float, decimals: int) -> None:
     rows = [f"{12.5 + i / rate:.{decimals}f},{i},{i}" for i in range(3000)]
-    record = read(tmp_path, "\n".join([HEADER, *rows]))
+    record = read(tmp_path, lines(HEADER, *rows))
     assert record.interval == pytest.approx(1 / rate, abs=10.0**-decimals / 2999)
 
 
-def test_a_truth_on_other_times_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "record.truth.csv").write_text(GOOD.replace("\n0.000,", "\n-0.005,0,1\n0.000,"))
-    assert "record.truth.csv: time_s: not the times of the record" in fault(tmp_path, GOOD)
-
-
-def test_writing_a_record_without_truth_removes_the_old_one(tmp_path: Path) -> None:
+def test_the_truth_beside_a_text_is_that_of_its_record(tmp_path: Path) -> None:
     path = tmp_path / "record.csv"
     record = read(tmp_path, GOOD)
     write_record(Record(record.voltage, record.displacement, 0.1, truth=record.voltage), path)
     assert read_record(path).truth is not None
     write_record(record, path)
     assert read_record(path).truth is None
+    (tmp_path / "record.truth.csv").write_text(GOOD.replace("\n0.000,", "\n-0.005,0,1\n0.000,"))
+    with pytest.raises(InputError, match=r"record.truth.csv: time_s: not the times of the record"):
+        read_record(path)
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(

@@ -26,11 +26,9 @@ from bwbayes.errors import InputWarning
 from bwbayes.model.registry import DYNAMICS
 from bwbayes.model.reversals import rate
 from bwbayes.record import Record
-from bwbayes.record.io.checks import checked
-from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.columns import ColumnTable, Naming
 from bwbayes.record.io.formats import read_table
-from bwbayes.record.io.grid import decimals_of
-from bwbayes.record.io.table import FileTable
+from bwbayes.record.io.grid import decimals_of, record_fields
 
 __all__ = ["ConfigProposal", "propose"]
 
@@ -77,14 +75,14 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         table = read_table(path, naming)
-        record = Record(**checked(table))
+        record = Record(**record_fields(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
     findings = tuple(_with_sign(finding, path, table) for finding in inspect(record))
     text = _text(path, where, table.naming, record, findings)
     return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
 
 
-def _with_sign(finding: Finding, path: Path, table: FileTable) -> Finding:
+def _with_sign(finding: Finding, path: Path, table: ColumnTable) -> Finding:
     """Return a finding; of a reversed sign with the command that turns it without a new file."""
     if finding.kind != "reversed sign":
         return finding

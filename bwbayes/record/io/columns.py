@@ -1,10 +1,9 @@
-"""Which columns of a file hold time, voltage and displacement, and in which units.
+"""Which series of a file are time, voltage and displacement, and in which units.
 
-Every reader turns its file into series of numbers; :func:`choose` takes those that are meant. The
-package's own names carry quantity and unit (``voltage_mV``); other names are recognized by their
-word (``t [ms]``, ``pos``), or else by their unit, where they can mean nothing else; a
+The package's own names carry quantity and unit (``voltage_mV``); other names are recognized by
+their word (``t [ms]``, ``pos``), or else by their unit, where they can mean nothing else; a
 :class:`Naming` settles the rest. What is still open is one :class:`ColumnsError`: all of it, with
-the series that there are.
+the series that there are and a guess.
 """
 
 from __future__ import annotations
@@ -14,51 +13,33 @@ import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
-from bwbayes.record.io.series import Series, Source, real_numbers
+from bwbayes.record.io.series import Series, Source
 
-__all__ = [
-    "COMMON_NAMES",
-    "QUANTITIES",
-    "Naming",
-    "choose",
-    "is_own",
-    "power_of",
-    "unit_in",
-]
+__all__ = ["QUANTITIES", "ColumnTable", "FileColumn", "Naming", "power_of", "select", "unit_in"]
 
 QUANTITIES = ("time", "voltage", "displacement")
-COMMON_NAMES = {
-    "time": "time_s",
-    "voltage": "voltage_V",
-    "displacement": "displacement_um",
-    "truth": "truth_um",
-}
 
 # Units: a prefix's power of ten and a base unit, and the power that leads from it to s, V or um.
 _PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
 _BASES = {"time": ("s", 0), "voltage": ("V", 0), "displacement": ("m", 6), "truth": ("m", 6)}
-# A rate to correct, Hz.
-_COMMON_FS = 1000.0
 _COMMON_UNITS = {
     "time": ("s", "ms", "us"),
     "voltage": ("V", "mV", "kV"),
     "displacement": ("um", "nm", "mm", "m"),
 }
-# Units that are written out.
-_WRITTEN_PREFIXES = {"": "", "pico": "p", "nano": "n", "micro": "u", "milli": "m", "kilo": "k"}
-_WRITTEN_UNITS = {
-    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("volt", "volts"), "V"),
-    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
-}
-
+_WRITTEN_OUT = re.compile(
+    r"(pico|nano|micro|milli|kilo|)(?:(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?))",
+    re.IGNORECASE,
+)
 # What other people call the quantities, in lower case and without a unit.
-WORDS = {
+_WORDS = {
     "time": ("t", "time", "timestamp", "sec", "seconds", "zeit", "x_value", "elapsed time"),
     "voltage": ("u", "v", "volt", "volts", "voltage", "drive", "command", "input", "spannung"),
     "displacement": (
@@ -66,9 +47,6 @@ WORDS = {
         *("sensor", "output", "weg", "auslenkung"),
     ),
 }
-
-# Series that a message lists, and that are looked at for it.
-_MOST_LISTED, _MOST_LOADED = 12, 40
 
 
 @dataclass(frozen=True)
@@ -120,16 +98,169 @@ class Naming:
             raise InputError("fs: takes the place of the time column; give one of the two")
 
 
+@dataclass(frozen=True)
+class FileColumn:
+    """One column as it stands in a file; a minus before its unit turns the sign."""
+
+    name: str
+    values: NDArray[Any]
+    unit: str
+
+    def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
+        """Return values in this column's unit in the package's."""
+        power = power_of(self.unit.removeprefix("-"), quantity) or 0
+        # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
+        scaled = values * 10.0**power if power >= 0 else values / 10.0**-power
+        return -scaled if self.unit.startswith("-") else scaled
+
+
+@dataclass(frozen=True)
+class ColumnTable:
+    """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
+
+    ``notes`` is what the file says in words. ``naming`` finds the same columns again; the times
+    are those of its rate, or of the source, where there is no column of them.
+    """
+
+    source: Source
+    columns: Mapping[str, FileColumn]
+    notes: Mapping[str, str]
+    naming: Naming
+
+    def error(self, problem: str, quantity: str = "", sample: int | None = None) -> InputError:
+        """Return the error ``file:line: column: problem``; sample and quantity may be left out."""
+        where, first_line = str(self.source.path), self.source.first_line
+        if sample is not None:
+            where += f":sample {sample}" if first_line is None else f":{first_line + sample}"
+        if quantity:
+            name = self.columns[quantity].name if quantity in self.columns else quantity
+            where += f": {name}"
+        return InputError(f"{where}: {problem}")
+
+
+def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
+    """Return the columns of a file that are time, voltage, displacement and truth.
+
+    Raises
+    ------
+    ColumnsError
+        A column that is needed and not known, or one whose unit is not.
+    InputError
+        A column that is named and not there, or whose values are not real numbers.
+
+    Warns
+    -----
+    InputWarning
+        If a column is recognized by nothing but its unit, or columns of a text are ignored.
+    """
+    chosen = {q: _named(source, name, q) for q, name in naming.columns.items()}
+    by_unit = _recognize(source, chosen, naming)
+    has_rate = naming.fs is not None or source.interval is not None
+    missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
+    units = {q: naming.units.get(q) or _stated(series, q) for q, series in chosen.items()}
+    unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
+    if missing or unknown:
+        raise _columns_error(source, naming, chosen, missing, unknown)
+    path, line = source.path, source.first_line
+    if by_unit:
+        reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
+        _warn(f"{path}: taken by its unit: {reasons}; if not, say `columns`")
+    columns = {
+        quantity: FileColumn(chosen[quantity].name, chosen[quantity].numbers(path), unit)
+        for quantity, unit in units.items()
+        if unit
+    }
+    names = {q: column.name for q, column in columns.items()}
+    others = [s.name for s in source.series if s.name not in names.values()]
+    if others and line is not None:
+        shown = ", ".join(others[:10]) + ", ..." * (len(others) > 10)
+        _warn(f"{path}:{max(line - 1, 1)}: ignored columns: {shown}")
+    foreign = {
+        q: name for q, name in names.items() if q in QUANTITIES and _likeness(name, "", q) != 0
+    }
+    used = Naming({**foreign, **naming.columns}, naming.units, naming.fs)
+    group = next(iter(chosen.values())).group
+    notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
+    return ColumnTable(source, columns, notes, used)
+
+
+def _warn(remark: str) -> None:
+    warnings.warn(one_line(remark), InputWarning, stacklevel=5)
+
+
+def _named(source: Source, name: str, quantity: str) -> Series:
+    """Return the series that a naming means: by its path, the end of its path, or its number."""
+    exact = [s for s in source.series if s.name == name.strip()]
+    matches = exact or [s for s in source.series if s.label == name.strip()]
+    if not matches and name.strip().isdecimal():
+        matches = list(source.series[int(name) - 1 : int(name)]) if int(name) else []
+    if len(matches) == 1:
+        return matches[0]
+    problem = "several columns" if matches else "no column"
+    raise InputError(
+        f"{source.path}: {problem} {name!r} for the {quantity}; choose one of "
+        f"{_listed(matches or source.series, _ranges(matches or source.series))}"
+    )
+
+
+def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> list[str]:
+    """Add the series that can be meant by one quantity alone; return those known by their unit."""
+    settled = {*chosen, *(["time"] if naming.fs is not None else [])}
+    long = [s for s in source.series if s.size > 1] or source.series
+    by_unit = []
+    for likeness in range(3):
+        for quantity in (*QUANTITIES, "truth"):
+            names = [series.name for series in chosen.values()]
+            candidates = [
+                s
+                for s in long
+                if s.name not in names and _likeness(s.label, s.unit, quantity) == likeness
+            ]
+            if quantity in settled or not candidates:
+                continue
+            settled.add(quantity)
+            candidates = _beside(candidates, chosen)
+            if len(candidates) == 1:  # several leave it open, whatever their units are
+                chosen[quantity] = candidates[0]
+                if likeness == 2 and quantity != "time":  # of seconds there is no doubt
+                    by_unit.append(quantity)
+    return by_unit
+
+
+def _likeness(label: str, unit: str, quantity: str) -> int | None:
+    """Tell if a name means a quantity: 0 as the package's own, 1 by its word, 2 by its unit."""
+    word, _, ending = label.strip().rpartition("_")
+    if word.lower() == quantity and power_of(ending, quantity) is not None:
+        return 0
+    if quantity == "truth" or _likeness(label, "", "truth") == 0:
+        return None
+    stated = {q: _unit_of(label, unit, q) for q in QUANTITIES}
+    if any(stated.values()) and stated[quantity] is None:
+        return None
+    ending = unit_in(label, quantity) or ""
+    bare = re.sub(rf"[\s_/.\-\[(]*{re.escape(ending)}[\])\s]*$", "", label) if ending else label
+    if bare.strip().lower() in _WORDS[quantity] or word.lower() == quantity:
+        return 1
+    return 2 if stated[quantity] else None
+
+
+def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
+    """Keep the series that stand beside those that are chosen, and are as long, if any do."""
+    first = next(iter(chosen.values()), None)
+    for key in ("group", "size") if first else ():
+        alike = [s for s in candidates if getattr(s, key) == getattr(first, key)]
+        candidates = alike or candidates
+    return candidates
+
+
 def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
+    written = _WRITTEN_OUT.fullmatch(unit)
+    if written:
+        prefix, *bases = written.groups()
+        base = "sVm"[[*map(bool, bases[:3])].index(True)] if not bases[3] else "um"
+        unit = {"micro": "u", "kilo": "k"}.get(prefix.lower(), prefix[:1].lower()) + base
     base, shift = _BASES[quantity]
-    for written, prefix in _WRITTEN_PREFIXES.items():
-        base_name = unit.lower().removeprefix(written)
-        if unit.lower().startswith(written) and base_name in _WRITTEN_UNITS:
-            unit = prefix + _WRITTEN_UNITS[base_name]
-            break
-    if unit.lower() in ("micron", "microns"):
-        unit = "um"
     if not unit.endswith(base) or unit.removesuffix(base) not in _PREFIXES:
         return None
     return _PREFIXES[unit.removesuffix(base)] + shift
@@ -147,186 +278,95 @@ def unit_in(name: str, quantity: str) -> str | None:
     return unit if power_of(unit, quantity) is not None else None
 
 
-def choose(
-    source: Source, naming: Naming, needed: Collection[str] = QUANTITIES
-) -> dict[str, tuple[Series, str]]:
-    """Return the series of each quantity, and its unit.
-
-    Raises
-    ------
-    ColumnsError
-        A column that is needed and not known, or one whose unit is not.
-    InputError
-        A column that is named and not there.
-
-    Warns
-    -----
-    InputWarning
-        If a column is recognized by nothing but its unit.
-    """
-    chosen = {q: _named(source, name, q) for q, name in naming.columns.items()}
-    clocked = naming.fs is not None or source.interval is not None
-    settled = {*chosen, *(["time"] if naming.fs is not None else [])}
-    long = [s for s in source.series if s.size > 1] or source.series
-    by_unit = []
-    for rank in (_by_own_name, _by_word, _by_unit):
-        for quantity in (*QUANTITIES, "truth"):
-            chosen_names = [series.name for series in chosen.values()]
-            fitting = [s for s in long if s.name not in chosen_names and rank(s, quantity)]
-            if quantity in settled or not fitting:
-                continue
-            settled.add(quantity)
-            fitting = _alike(fitting, chosen)
-            if len(fitting) == 1:  # several leave it open, whatever their units are
-                chosen[quantity] = fitting[0]
-                # Of seconds there is no doubt.
-                by_unit += [quantity] if rank is _by_unit and quantity != "time" else []
-    columns = [q for q in needed if q not in chosen and not (q == "time" and clocked)]
-    units = {q: _unit(s, q, naming) for q, s in chosen.items()}
-    unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
-    if columns or unknown:
-        raise _open(source, naming, chosen, columns, unknown)
-    if by_unit:
-        reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
-        remark = f"{source.path}: taken by its unit: {reasons}; if not, say `columns`"
-        warnings.warn(one_line(remark), InputWarning, stacklevel=3)
-    return {quantity: (chosen[quantity], unit) for quantity, unit in units.items() if unit}
-
-
-def _named(source: Source, name: str, quantity: str) -> Series:
-    """Return the series that a naming means."""
-    exact = [s for s in source.series if s.name == name.strip()]
-    ending = [s for s in source.series if s.label == name.strip()]
-    for matches in (exact, ending):
-        if len(matches) == 1:
-            return matches[0]
-    number = int(name) if name.strip().isdecimal() else 0
-    if 1 <= number <= len(source.series) and not exact and not ending:
-        return source.series[number - 1]
-    problem = "several columns" if exact or ending else "no column"
-    raise InputError(
-        f"{source.path}: {problem} {name!r} for the {quantity}; choose one of "
-        f"{_listed(exact or ending or source.series)}"
-    )
-
-
-def is_own(name: str, quantity: str) -> bool:
-    """Tell whether a name is the package's own for a quantity, as ``voltage_mV`` is."""
-    word, _, unit = name.strip().rpartition("_")
-    return word.lower() == quantity and power_of(unit, quantity) is not None
-
-
-def _by_own_name(series: Series, quantity: str) -> bool:
-    return is_own(series.label, quantity)
-
-
-def _by_word(series: Series, quantity: str) -> bool:
-    """Tell whether a series is called as a quantity is, and has no other quantity's unit."""
-    if quantity == "truth" or _is_truth(series):
-        return False
-    name = series.label.strip()
-    units = {q: _stated(series, q) for q in QUANTITIES}
-    if any(units.values()) and units[quantity] is None:
-        return False
-    unit = unit_in(name, quantity)
-    bare = name if unit is None else re.sub(rf"[\s_/.\-\[(]*{re.escape(unit)}[\])\s]*$", "", name)
-    return bare.strip().lower() in WORDS[quantity] or name.lower().rpartition("_")[0] == quantity
-
-
-def _by_unit(series: Series, quantity: str) -> bool:
-    """Tell whether a series has a unit of a quantity."""
-    return not _is_truth(series) and quantity != "truth" and _stated(series, quantity) is not None
-
-
-def _is_truth(series: Series) -> bool:
-    return is_own(series.label, "truth")
+def _unit_of(label: str, unit: str, quantity: str) -> str | None:
+    """Return the unit that a file states for a series, if it is one of the quantity."""
+    return unit if power_of(unit, quantity) is not None else unit_in(label, quantity)
 
 
 def _stated(series: Series, quantity: str) -> str | None:
-    """Return the unit that a file states for a series, if it is one of the quantity."""
-    if series.unit and power_of(series.unit, quantity) is not None:
-        return series.unit
-    return unit_in(series.label, quantity)
+    return _unit_of(series.label, series.unit, quantity)
 
 
-def _unit(series: Series, quantity: str, naming: Naming) -> str | None:
-    return naming.units.get(quantity) or _stated(series, quantity)
-
-
-def _alike(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
-    """Keep the series that stand beside those that are chosen, and are as long, if any do."""
-    for key in ("group", "size"):
-        values = [getattr(series, key) for series in chosen.values() if series.name]
-        fitting = [s for s in candidates if values and getattr(s, key) == values[0]]
-        candidates = fitting or candidates
-    return candidates
-
-
-def _open(
+def _columns_error(
     source: Source,
     naming: Naming,
     chosen: Mapping[str, Series],
-    columns: Sequence[str],
+    missing: Sequence[str],
     unknown: Sequence[str],
-) -> ColumnsError:
+) -> InputError:
     """Return the error that names all that is open, and guesses it."""
     where = str(source.path)
     if source.first_line is not None and source.first_line > 1:
         where += f":{source.first_line - 1}"
     if all(series.size == 1 for series in source.series):
-        raise InputError(f"{where}: no column has more than one number; give a row for each sample")
-    if np.isnan([_extent(series) for series in source.series[:_MOST_LOADED]]).all():
-        raise InputError(f"{where}: no column holds only numbers; export it as CSV")
-    chosen_names = [series.name for series in chosen.values()]
-    sizes = {series.size for series in chosen.values()}
-    candidates = [
-        s for s in source.series if s.name not in chosen_names and s.size in (sizes or {s.size})
-    ]
-    moving = [s for s in candidates[:_MOST_LOADED] if np.ptp(_extent(s)) > 0]
-    candidates = _alike(moving or candidates, chosen)
-    guess_columns, guess_units = dict(naming.columns), dict(naming.units)
-    clocks = [s for s in candidates[:_MOST_LOADED] if _rises(s)]
-    timeless = "time" in columns and not clocks
-    if timeless:
-        columns = [quantity for quantity in columns if quantity != "time"]
-    for quantity in unknown:
-        guess_units[quantity] = _COMMON_UNITS[quantity][0]
-    for quantity in columns:
-        pool = clocks if quantity == "time" else candidates
-        fitting = [s for s in pool if _stated(s, quantity)] or pool
-        if fitting:
-            # One without a name goes by its number.
-            guess_columns[quantity] = fitting[0].name.removeprefix("column ")
-            candidates = [s for s in candidates if s.name != fitting[0].name]
-        if not fitting or _unit(fitting[0], quantity, naming) is None:
-            guess_units.setdefault(quantity, _COMMON_UNITS[quantity][0])
-    lost = [q for q in columns if q not in guess_columns]
-    listing = _listed(source.series)
-    if lost:
-        raise InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {listing}")
-    questions = [f"which column is the {', which the '.join(columns)}"] if columns else []
-    if unknown:
-        questions.append(
-            f"which unit has {', which '.join(f'{chosen[q].name!r} ({q})' for q in unknown)}"
+        return InputError(
+            f"{where}: no column has more than one number; give a row for each sample"
         )
+    ranges = _ranges(source.series)
+    if not ranges:
+        return InputError(f"{where}: no column holds only numbers; export it as CSV")
+    others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
+    if chosen:
+        others = [s for s in others if s.size in {c.size for c in chosen.values()}]
+    moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
+    candidates = _beside(moving or others, chosen)
+    clocks = [s for s in candidates if s.name in ranges and _rises(s)]
+    timeless = "time" in missing and not clocks
+    missing = [q for q in missing if not (q == "time" and timeless)]
+    columns = dict(naming.columns)
+    units = {q: _COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
+    for quantity in missing:
+        pool = clocks if quantity == "time" else candidates
+        pool = [s for s in pool if _stated(s, quantity)] or pool
+        if not pool:
+            continue
+        columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
+        candidates = [s for s in candidates if s is not pool[0]]
+        if _stated(pool[0], quantity) is None:
+            units.setdefault(quantity, _COMMON_UNITS[quantity][0])
+    listing = _listed(source.series, ranges)
+    lost = [q for q in missing if q not in columns]
+    if lost:
+        return InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {listing}")
+    questions = [f"which column is the {', which the '.join(missing)}"] if missing else []
+    if unknown:
+        names = ", which ".join(f"{chosen[q].name!r} ({q})" for q in unknown)
+        questions.append(f"which unit has {names}")
     if timeless:
         questions.append("what is the sampling rate, Hz (no column can be the time)")
     problem = f"{where}: {', and '.join(questions)}? {listing}"
-    return ColumnsError(problem, guess_columns, guess_units, fs=_COMMON_FS if timeless else None)
+    return ColumnsError(problem, columns, units, fs=1000.0 if timeless else None)
 
 
-def _listed(series: Sequence[Series]) -> str:
+def _finite(series: Series) -> FloatArray:
+    """Return the finite numbers of a series; none of one that has something else."""
+    try:
+        values = series.numbers("").astype(np.float64)
+    except InputError:
+        return np.empty(0)
+    return values[np.isfinite(values)] + 0.0
+
+
+def _rises(series: Series) -> bool:
+    values = _finite(series)
+    return values.size == series.size and bool(np.all(np.diff(values) > 0))
+
+
+def _ranges(series: Sequence[Series]) -> dict[str, tuple[float, float]]:
+    """Return the least and the largest number of each series of numbers, of the first forty."""
+    values = {s.name: _finite(s) for s in series[:40]}
+    return {name: (v.min(), v.max()) for name, v in values.items() if v.size}
+
+
+def _listed(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) -> str:
     """List series of equal length with their ranges, the most usual length first."""
-    extents = {s.name: _extent(s) for s in series[:_MOST_LOADED]}
-    numbers = [s for s in series if np.isfinite(extents.get(s.name, (np.nan,))).all()]
-    parts = []
+    numbers = [s for s in series if s.name in ranges]
+    listed = []
     for size, _ in Counter(s.size for s in numbers).most_common():
-        group = [s for s in numbers if s.size == size]
-        ranges = [(s.name, *extents[s.name]) for s in group[:_MOST_LISTED]]
-        texts = [f"{name!r} ({_span(low, high)})" for name, low, high in ranges]
-        more = ", ..." if len(group) > _MOST_LISTED else ""
-        parts.append(f"{size} values each: {', '.join(texts)}{more}")
-    return f"There are {'; '.join(parts)}" if parts else "There are no series of numbers"
+        names = [s.name for s in numbers if s.size == size]
+        texts = [f"{name!r} ({_span(*ranges[name])})" for name in names[:12]]
+        listed.append(f"{size} values each: {', '.join(texts)}{', ...' * (len(names) > 12)}")
+    return f"There are {'; '.join(listed)}" if listed else "There are no series of numbers"
 
 
 def _span(low: float, high: float) -> str:
@@ -337,24 +377,3 @@ def _span(low: float, high: float) -> str:
     # Two more: how long a record is, not only that it has a length.
     digits += 2 * (digits > 4)
     return f"{low:.{digits}g} to {high:.{digits}g}"
-
-
-def _rises(series: Series) -> bool:
-    """Tell whether a series may be the time."""
-    values = _finite(series)
-    return values.size == series.size and bool(np.all(np.diff(values) > 0))
-
-
-def _extent(series: Series) -> tuple[float, float]:
-    """Return the least and the largest number of a series; nan if it has none."""
-    values = _finite(series)
-    return (values.min(), values.max()) if values.size else (np.nan, np.nan)
-
-
-def _finite(series: Series) -> FloatArray:
-    """Return the finite numbers of a series; none of one that has something else."""
-    try:
-        values = real_numbers(series, series.name).astype(np.float64)
-    except InputError:
-        return np.empty(0)
-    return values[np.isfinite(values)] + 0.0

@@ -9,30 +9,27 @@ binary formats.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, InputWarning
-from bwbayes.record.io.checks import VoltageIs, checked, checked_reference, require_voltage_is
-from bwbayes.record.io.columns import QUANTITIES, Naming
-from bwbayes.record.io.hdf5 import is_hdf5, read_hdf5, write_hdf5
+from bwbayes.errors import InputError
+from bwbayes.record.io.columns import QUANTITIES, ColumnTable, Naming, select
+from bwbayes.record.io.grid import VoltageIs, record_fields, reference_fields, require_voltage_is
+from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.record.io.memory import array_source
-from bwbayes.record.io.series import Source
-from bwbayes.record.io.table import FileTable, table_of
+from bwbayes.record.io.series import Source, array_source, damaged
 from bwbayes.record.record import Record
 
 __all__ = [
     "SUFFIXES",
     "read_record",
     "read_reference",
-    "read_source",
     "read_table",
     "require_readable",
     "write_record",
@@ -93,11 +90,18 @@ def read_record(
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
     table = read_table(path, Naming(columns or {}, units or {}, fs), needed)
-    record = Record(**checked(table, voltage_is=voltage_is, need_displacement=need_displacement))
+    record = Record(**record_fields(table, voltage_is, need_displacement))
     truth_path = _truth_path(path)
-    if path.suffix.lower() in _TEXT and truth_path.exists():
-        return _with_truth(record, truth_path)
-    return record
+    if path.suffix.lower() not in _TEXT or not truth_path.exists():
+        return record
+    truth = Record(**record_fields(read_table(truth_path, Naming())))
+    same = truth.samples == record.samples and np.allclose(
+        truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
+    )
+    if not same:
+        problem = "time_s: not the times of the record; remove or replace the file"
+        raise InputError(f"{truth_path}: {problem}")
+    return replace(record, truth=truth.displacement)
 
 
 def read_reference(path: str | Path) -> tuple[FloatArray, float]:
@@ -111,10 +115,10 @@ def read_reference(path: str | Path) -> tuple[FloatArray, float]:
     InputError
         For every problem, in one line, as of :func:`read_record`.
     """
-    return checked_reference(read_table(Path(path), Naming(), ("time", "displacement")))
+    return reference_fields(read_table(Path(path), Naming(), ("time", "displacement")))
 
 
-def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> FileTable:
+def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
     """Read the columns of a file that count, with the naming that they were recognized by.
 
     Raises
@@ -122,43 +126,44 @@ def read_table(path: str | Path, naming: Naming, needed: Collection[str] = QUANT
     InputError
         The file cannot be read, or a column that is needed is not known.
     """
-    return table_of(read_source(Path(path)), naming, needed)
+    return select(_read_source(path), naming, needed)
 
 
-def read_source(path: Path) -> Source:
-    """Read what a file holds.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read.
-    """
+def _read_source(path: Path) -> Source:
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; give the file in it")
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; check the path")
+    if not path.is_file():
+        raise InputError(f"{path}: is not a regular file; give one")
     try:
-        if path.is_dir():
-            raise InputError(f"{path}: is a directory; give the file in it")
-        if not path.exists():
-            raise InputError(f"{path}: does not exist; check the path")
-        if not path.is_file():
-            raise InputError(f"{path}: is not a regular file; give one")
-        with path.open("rb") as file:  # a file without permission says so in every format
+        with path.open("rb") as file:
             begin = file.read(8)
-        if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
-            return read_mat(path)
-        if is_hdf5(path):
-            return read_hdf5(path)
-        if begin.startswith(b"TDSm"):
-            return read_tdms(path)
-        if begin.startswith(b"PK") or begin.startswith(b"\xd0\xcf\x11\xe0"):
-            raise InputError(f"{path}: a workbook or an archive; export it as CSV")
-        if path.suffix.lower() in _BINARY:
-            raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
-        from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
-
-        return read_text(path)
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
+    if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+        raise InputError(f"{path}: a workbook or an archive; export it as CSV")
+    try:
+        return _reader(path, begin)(path)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a library raises of a damaged file
+        raise damaged(path, error) from error
+
+
+def _reader(path: Path, begin: bytes) -> Callable[[Path], Source]:
+    """Return what reads a file that begins with these bytes."""
+    if h5py.is_hdf5(path):
+        return read_hdf5
+    if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+        return read_mat
+    if begin.startswith(b"TDSm"):
+        return read_tdms
+    if path.suffix.lower() in _BINARY:
+        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+    from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+
+    return read_text
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:
@@ -200,32 +205,14 @@ def require_readable(record: Record, where: str) -> None:
     InputError
         As for a file that is called ``where``.
     """
-    arrays = {
-        "time": record.time,
-        "voltage": record.voltage,
-        "displacement": record.displacement,
-        "truth": record.truth,
-    }
-    source = array_source(where, arrays, {}, {"interval_s": repr(record.interval)})
+    source = array_source(where, record_arrays(record), notes={"interval_s": repr(record.interval)})
     need = record.displacement is not None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        table = table_of(source, Naming(), QUANTITIES if need else ("time", "voltage"))
-        checked(table, need_displacement=need)
+    needed = QUANTITIES if need else ("time", "voltage")
+    record_fields(select(source, Naming(), needed), need_displacement=need)
 
 
 def _truth_path(path: Path) -> Path:
     return path.with_suffix(f".truth{path.suffix}")
-
-
-def _with_truth(record: Record, path: Path) -> Record:
-    truth = Record(**checked(read_table(path, Naming())))
-    same = truth.samples == record.samples and np.allclose(
-        truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
-    )
-    if not same:
-        raise InputError(f"{path}: time_s: not the times of the record; remove or replace the file")
-    return replace(record, truth=truth.displacement)
 
 
 def _write_whole(path: Path, write: Callable[[Path], None]) -> None:

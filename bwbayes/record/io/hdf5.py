@@ -2,8 +2,8 @@
 
 Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
 says a dataset's unit, columns of a table or matrix are series of their own, ``table.u`` and
-``log[2]``. The attributes ``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``
-may stand beside the datasets, and a simulated record has the dataset ``truth_um``.
+``log[2]``. Beside the datasets may stand ``voltage_is``, ``origin``, ``interval_s`` and
+``time_offset_s``, as attributes or, in MATLAB's files of version 7.3, as variables.
 """
 
 from __future__ import annotations
@@ -19,54 +19,19 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.record.io.series import Series, Source, damaged, vectors
+from bwbayes.record.io.series import NOTES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
-__all__ = ["is_hdf5", "read_hdf5", "record_arrays", "write_hdf5"]
-
-# Marks in an HDF5 file: its beginning, a heap of names, a collection of texts; and the number that
-# ends a list of free blocks.
-_SIGNATURE, _HEAP, _COLLECTION = b"\x89HDF\r\n\x1a\n", b"HEAP", b"GCOL\1\0\0\0"
-_NO_BLOCK = 1
-
-_NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
-_UNITS = ("unit", "units", "Unit", "Units")
-
-
-def is_hdf5(path: Path) -> bool:
-    """Tell whether a file is an HDF5 file."""
-    return bool(h5py.is_hdf5(path))
+__all__ = ["read_hdf5", "record_arrays", "write_hdf5"]
 
 
 def read_hdf5(path: Path) -> Source:
-    """Return the series of numbers in an HDF5 file.
-
-    Raises
-    ------
-    InputError
-        The file is damaged.
-    """
-    try:
-        check_lists(path)
-        with h5py.File(path, "r") as file:
-            series: list[Series] = []
-            notes = {}
-            for group in _groups(file, set()):
-                name = group.name.strip("/")
-                prefix = f"{name}/" if name else ""
-                notes[prefix] = {k: _text(group.attrs[k]) for k in _NOTES if k in group.attrs}
-                for leaf, dataset in _datasets(group):
-                    unit = next((_text(dataset.attrs[k]) for k in _UNITS if k in dataset.attrs), "")
-                    load = partial(_loaded, path, dataset.name)
-                    series += vectors(prefix, leaf, dataset.shape, dataset.dtype, load, unit)
-            return Source(path, tuple(series), notes)
-    except Exception as error:
-        raise damaged(path, error) from error
-
-
-def _loaded(path: Path, name: str) -> Any:
+    """Return the series of numbers in an HDF5 file, whatever error it raises if it is damaged."""
+    _check_lists(path)
+    notes: dict[str, dict[str, str]] = {}
     with h5py.File(path, "r") as file:
-        return file[name][()]
+        series = tuple(_series(path, file, notes, set()))
+    return Source(path, series, notes)
 
 
 def write_hdf5(record: Record, path: Path) -> None:
@@ -87,7 +52,7 @@ def write_hdf5(record: Record, path: Path) -> None:
 
 
 def record_arrays(record: Record) -> dict[str, Any]:
-    """Return the arrays of a record by the names that they have in binary files."""
+    """Return the arrays of a record by the names that they have in files."""
     arrays = {
         "time_s": record.time,
         "voltage_V": record.voltage,
@@ -97,66 +62,65 @@ def record_arrays(record: Record) -> dict[str, Any]:
     return {name: values for name, values in arrays.items() if values is not None}
 
 
-def _groups(group: Any, passed: set[int]) -> Iterator[Any]:
-    """Yield a group and all below it, each once, but for MATLAB's own."""
-    address = h5py.h5o.get_info(group.id).addr
-    if address in passed:
-        return
-    passed.add(address)
-    yield group
-    for name in _linked(group):
-        if not name.startswith("#") and isinstance(group[name], h5py.Group):
-            yield from _groups(group[name], passed)
-
-
-def _datasets(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield names and datasets of a group whose numbers are in this very file.
+def _series(
+    path: Path, group: Any, notes: dict[str, dict[str, str]], passed: set[int]
+) -> Iterator[Series]:
+    """Yield the series of a group and of those below it, each once; collect their notes.
 
     Links to other files, and numbers stored in other files, are passed over unopened: a stranger's
-    file could name any file or device of this machine. So are MATLAB's texts and empty arrays.
+    file could name any file or device of this machine. So is what MATLAB keeps for itself (``#``).
     """
-    for name in _linked(group):
-        dataset = group[name]
-        if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+    passed.add(h5py.h5o.get_info(group.id).addr)
+    prefix = group.name.strip("/") + "/" * (group.name != "/")
+    notes[prefix] = {key: note(group.attrs[key]) for key in NOTES if key in group.attrs}
+    links = [name for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
+    objects = {name: group[name] for name in links if not name.startswith("#")}
+    for name, found in objects.items():
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
             continue
-        if dataset.attrs.get("MATLAB_class") != b"char" and "MATLAB_empty" not in dataset.attrs:
-            yield name, dataset
+        is_text = found.attrs.get("MATLAB_class") == b"char"
+        if "MATLAB_empty" in found.attrs or found.shape is None:
+            continue
+        if name in NOTES and is_text:
+            codes = np.asarray(found[()], dtype="<u2")
+            notes[prefix][name] = codes.tobytes().decode("utf-16-le", errors="replace")
+        elif name in NOTES and name.endswith("_s") and found.size and found.dtype.kind in "iuf":
+            notes[prefix][name] = note(found[()])
+        elif not is_text:
+            unit = next((note(v) for k, v in found.attrs.items() if k.lower()[:4] == "unit"), "")
+            load = partial(_loaded, path, found.name)
+            yield from vectors(prefix, name, found.shape, found.dtype, load, unit)
+    for found in objects.values():
+        if isinstance(found, h5py.Group) and h5py.h5o.get_info(found.id).addr not in passed:
+            yield from _series(path, found, notes, passed)
 
 
-def _linked(group: Any) -> list[str]:
-    """Return the names in a group that stand for objects in the same file."""
-    links = ((str(name), group.get(name, getlink=True)) for name in group)
-    return [name for name, link in links if isinstance(link, h5py.HardLink)]
+def _loaded(path: Path, name: str) -> Any:
+    with h5py.File(path, "r") as file:
+        return file[name][()]
 
 
-def check_lists(path: Path) -> None:
+def _check_lists(path: Path) -> None:
     """Raise a ValueError if HDF5 2.0 would follow a damaged list in the file for ever.
 
     There are two kinds: the free blocks of a heap of names, which may run in a circle and take all
     memory, and the texts in a collection, of which one may have no length.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        base = data.find(_SIGNATURE)
-        endless = any(_runs_in_a_circle(data, base, at) for at in _places(data, _HEAP)) or any(
-            _stands_still(data, at) for at in _places(data, _COLLECTION)
-        )
-    if endless:
-        raise ValueError("a list in it has no end")
+        base = data.find(b"\x89HDF\r\n\x1a\n")
+        for mark, is_endless in ((b"HEAP", _is_circle), (b"GCOL\1\0\0\0", _stands_still)):
+            at = data.find(mark)
+            while 0 <= at <= len(data) - 32:
+                if is_endless(data, base, at):
+                    raise ValueError("a list in it has no end")
+                at = data.find(mark, at + 1)
 
 
-def _places(data: mmap.mmap, mark: bytes) -> Iterator[int]:
-    """Yield where a structure with this mark and 32 bytes at least may begin."""
-    at = data.find(mark)
-    while 0 <= at <= len(data) - 32:
-        yield at
-        at = data.find(mark, at + 1)
-
-
-def _runs_in_a_circle(data: mmap.mmap, base: int, heap: int) -> bool:
-    # Behind the heap's own size: its first free block, and where its blocks are.
+def _is_circle(data: mmap.mmap, base: int, heap: int) -> bool:
+    # Behind the heap's own size: its first free block, and where its blocks are; 1 ends the list.
     block, address = struct.unpack_from("<QQ", data, heap + 16)
     passed = set()
-    while block != _NO_BLOCK and base + address + block <= len(data) - 8:
+    while block != 1 and base + address + block <= len(data) - 8:
         if block in passed:
             return True
         passed.add(block)
@@ -164,7 +128,7 @@ def _runs_in_a_circle(data: mmap.mmap, base: int, heap: int) -> bool:
     return False
 
 
-def _stands_still(data: mmap.mmap, collection: int) -> bool:
+def _stands_still(data: mmap.mmap, _: int, collection: int) -> bool:
     (size,) = struct.unpack_from("<Q", data, collection + 8)
     at, end = collection + 16, min(collection + size, len(data))
     while at + 16 <= end:
@@ -175,10 +139,3 @@ def _stands_still(data: mmap.mmap, collection: int) -> bool:
             return True
         at += step
     return False
-
-
-def _text(value: Any) -> str:
-    if not np.size(value):
-        return ""
-    first = np.ravel(value)[0]
-    return first.decode("utf-8", errors="replace") if isinstance(first, bytes) else str(first)

@@ -8,20 +8,14 @@ text file is. ``.tdms`` files are read by npTDMS; channels are named by their gr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bwbayes.errors import InputError
-from bwbayes.record.io.series import Series, Source, damaged
+from bwbayes.record.io.series import Series, Source, in_seconds
 
 __all__ = ["is_lvm", "plain_lvm", "read_tdms"]
-
-_END = "***End_of_Header***"
 
 
 def is_lvm(text: str) -> bool:
@@ -29,18 +23,18 @@ def is_lvm(text: str) -> bool:
     return text.startswith("LabVIEW Measurement")
 
 
-def plain_lvm(path: Path, text: str) -> tuple[str, dict[str, str]]:
-    """Return a measurement's rows below one header with units, and its notes.
+def plain_lvm(path: Path, text: str) -> tuple[str, float | None]:
+    """Return a measurement's rows below one header with units, and its step, s.
 
-    Segments follow each other. The note ``dt`` is the sampling interval, s, of a file without a
-    column of times; the line numbers of the first segment stay as they are.
+    The step is that of a file without a column of times. Segments follow each other; the line
+    numbers of the first one stay as they are.
 
     Raises
     ------
     InputError
         There are no rows in it.
     """
-    head, *parts = text.split(_END)
+    head, *parts = text.split("***End_of_Header***")
     separator = "," if _keys(head, ",").get("Separator") == ["Comma"] else "\t"
     x_columns = _keys(head, separator).get("X_Columns", ["One"])[0]
     if len(parts) < 2:
@@ -52,11 +46,11 @@ def plain_lvm(path: Path, text: str) -> tuple[str, dict[str, str]]:
         if number == 0:
             lines += ["", separator.join(_with_units(names.split(separator), keys, x_columns))]
         lines += samples
+    step = None
     if x_columns == "No":  # the column of times is there, and empty
         lines = [line.partition(separator)[2] for line in lines]
-    step = keys.get("Delta_X", [""])[0].replace(",", ".")
-    notes = {"dt": step} if x_columns == "No" and step else {}
-    return "\n".join(lines) + "\n" * text.endswith("\n"), notes
+        step = float(keys["Delta_X"][0].replace(",", ".")) if keys.get("Delta_X") else None
+    return "\n".join(lines) + "\n" * text.endswith("\n"), step
 
 
 def _keys(header: str, separator: str) -> dict[str, list[str]]:
@@ -65,7 +59,7 @@ def _keys(header: str, separator: str) -> dict[str, list[str]]:
     return {row[0].strip(): [cell.strip() for cell in row[1:] if cell.strip()] for row in rows}
 
 
-def _with_units(names: list[str], keys: Mapping[str, list[str]], x_columns: str) -> list[str]:
+def _with_units(names: list[str], keys: dict[str, list[str]], x_columns: str) -> list[str]:
     """Return the names of columns with their channels' units."""
     stride = 2 if x_columns == "Multi" else 1
     units = {1 + stride * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
@@ -78,12 +72,12 @@ def _with_units(names: list[str], keys: Mapping[str, list[str]], x_columns: str)
 
 
 def read_tdms(path: Path) -> Source:
-    """Return the channels of a TDMS file.
+    """Return the channels of a TDMS file, whatever error npTDMS raises if it is damaged.
 
     Raises
     ------
     InputError
-        npTDMS is not installed, or the file is damaged.
+        npTDMS is not installed.
     """
     try:
         from nptdms import TdmsFile  # noqa: PLC0415  # an extra
@@ -91,34 +85,24 @@ def read_tdms(path: Path) -> Source:
         raise InputError(
             f"{path}: reading TDMS needs npTDMS; pip install 'bwbayes[tdms]'"
         ) from None
-    try:
-        channels = [c for group in TdmsFile.read(path).groups() for c in group.channels()]
-        steps = {c.properties.get("wf_increment") for c in channels if len(c)}
-        starts = {float(c.properties.get("wf_start_offset", 0.0)) for c in channels if len(c)}
-        series = [
-            Series(
-                f"{channel.group_name}/{channel.name}",
-                len(channel),
-                partial(_values, channel),
-                str(channel.properties.get("unit_string", "")),
-                channel.name,
-            )
-            for channel in channels
-        ]
-    except Exception as error:
-        raise damaged(path, error) from error
+
+    def load(channel: Any) -> Any:
+        return in_seconds(channel[:])
+
+    channels = [c for group in TdmsFile.read(path).groups() for c in group.channels()]
+    waves = [channel.properties for channel in channels if len(channel)]
+    steps = {wave.get("wf_increment") for wave in waves}
+    starts = {float(wave.get("wf_start_offset", 0.0)) for wave in waves}
+    series = [
+        Series(
+            f"{channel.group_name}/{channel.name}",
+            len(channel),
+            partial(load, channel),
+            str(channel.properties.get("unit_string", "")),
+            f"{channel.group_name}/",
+        )
+        for channel in channels
+    ]
     step = steps.pop() if len(steps) == 1 else None
-    return Source(
-        path,
-        tuple(series),
-        interval=float(step) if step else None,
-        start=starts.pop() if len(starts) == 1 else 0.0,
-    )
-
-
-def _values(channel: Any) -> NDArray[Any]:
-    """Return a channel's numbers; time stamps in seconds."""
-    values = np.asarray(channel[:])
-    if values.dtype.kind == "M":
-        values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-    return values
+    start = starts.pop() if len(starts) == 1 else 0.0
+    return Source(path, tuple(series), interval=float(step) if step else None, start=start)

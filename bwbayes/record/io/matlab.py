@@ -1,19 +1,18 @@
 """Records in MATLAB files: variables ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
-Version 5 (MATLAB's ``save`` with ``-v6`` or ``-v7``) goes through SciPy, version 7.3 is HDF5; the
-rare version 4 is refused. Vectors may be rows or columns; those in a struct are named by their
-path, ``log.Ux`` or ``log.Y(2).Data``, columns of a matrix ``log[2]``. ``voltage_is`` and ``origin``
-are character variables, ``interval_s`` and ``time_offset_s`` are numbers.
+Version 7.3 is HDF5. Version 5 (MATLAB's ``save`` with ``-v6`` or ``-v7``) is read here: SciPy 1.18
+takes the types of a file's elements on trust, and an unknown one ends the whole process. The rare
+version 4 is refused. Vectors may be rows or columns; those in a struct are named by their path,
+``log.Ux`` or ``log.Y(2).Data``, columns of a matrix ``log[2]``. ``voltage_is`` and ``origin`` are
+character variables, ``interval_s`` and ``time_offset_s`` are numbers.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-import warnings
 import zlib
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -24,46 +23,51 @@ import numpy as np
 import scipy
 
 from bwbayes.errors import InputError
-from bwbayes.record.io.hdf5 import read_hdf5, record_arrays
-from bwbayes.record.io.series import MAXIMUM_SAMPLES, Series, Source, damaged, vectors
+from bwbayes.record.io.hdf5 import record_arrays
+from bwbayes.record.io.series import MAXIMUM_SAMPLES, NOTES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
 __all__ = ["MatVersion", "read_mat", "write_mat"]
 
 MatVersion = Literal["5", "7.3"]
 
-_TEXTS, _NUMBERS = ("voltage_is", "origin"), ("interval_s", "time_offset_s")
-_USERBLOCK = 512  # bytes before the HDF5 part of a version 7.3 file
-
-# Codes of the version 5 format: types of elements, and classes of arrays.
-_MATRIX, _COMPRESSED = 14, 15
-_NUMBERS_AND_TEXT = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
-_COMPLEX = 0x0800
-_LARGEST_ELEMENT = 16 * MAXIMUM_SAMPLES  # bytes that a compressed element may unpack to
-_PLAIN_CODES, _NESTED_CODES = {4, *range(6, 16)}, {1, 2}
-_KINDS = {"double": "f8", "single": "f4", "char": "U1", "logical": "?"} | {
-    f"{sign}int{bits}": f"{sign[:1] or 'i'}{bits // 8}"
-    for sign in ("", "u")
-    for bits in (8, 16, 32, 64)
+# Types of elements that hold numbers or text, and of others; classes of arrays.
+_TYPES = {
+    **{1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"},
+    **{12: "i8", 13: "u8", 16: "u1", 17: "u2", 18: "u4"},
 }
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _CHAR = 1, 2, 4
+_NUMERIC = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
+_IS_LOGICAL, _IS_COMPLEX = 0x0200, 0x0800
+_LARGEST = 16 * MAXIMUM_SAMPLES  # bytes that compressed elements may unpack to
 
 
 def read_mat(path: Path) -> Source:
-    """Return the series of numbers in a MATLAB file, version 5 or 7.3.
+    """Return the series of a MATLAB file of version 5, whatever error it raises if it is damaged.
 
     Raises
     ------
     InputError
-        It is of another version, or is damaged.
+        It is of another version.
     """
-    if h5py.is_hdf5(path):
-        return replace(read_hdf5(path), notes={"": _notes_7_3(path)})
-    try:
-        return _read_5(path)
-    except InputError:
-        raise
-    except Exception as error:
-        raise damaged(path, error) from error
+    data = path.read_bytes()
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
+    notes: dict[str, str] = {}
+    series: list[Series] = []
+    room = _LARGEST
+    for kind, body in _elements(data[128:], order, padded=False):
+        matrix = body
+        if kind == _COMPRESSED:
+            unpacked = zlib.decompressobj().decompress(body, room)
+            room -= len(unpacked)
+            ((kind, matrix),) = _elements(unpacked, order)  # noqa: PLW2901
+        if kind != _MATRIX:
+            raise ValueError(f"unknown element {kind}")
+        series += _series("", matrix, order, notes)
+    return Source(path, tuple(series), {"": notes})
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
@@ -78,83 +82,63 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
         _write_7_3(path, arrays, texts)
 
 
-def _read_5(path: Path) -> Source:
-    if scipy.io.matlab.matfile_version(path, appendmat=False)[0] != 1:
-        raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
-    _check_elements(path.read_bytes())
-    with warnings.catch_warnings():
-        # SciPy warns of a variable that it cannot read or that comes twice; here that is an error.
-        warnings.simplefilter("error", scipy.io.matlab.MatReadWarning)
-        variables = scipy.io.whosmat(path, appendmat=False)
+def _series(
+    path: str, matrix: bytes, order: str, notes: dict[str, str] | None = None
+) -> Iterator[Series]:
+    """Yield the series in a variable, an element of a cell array, or a field of a struct.
 
-        def load(name: str) -> Any:
-            return scipy.io.loadmat(path, appendmat=False, variable_names=[name])[name]
-
-        series: list[Series] = []
-        notes = {}
-        for name, shape, kind in variables:
-            if name in (*_TEXTS, *_NUMBERS) and math.prod(shape) > 0:
-                notes[name] = _first(load(name))
-            elif kind in ("struct", "cell"):
-                series += _walked(name, load(name))
-            elif kind in _KINDS:
-                series += vectors("", name, shape, np.dtype(_KINDS[kind]), partial(load, name))
-    return Source(path, tuple(series), {"": notes})
-
-
-def _walked(path: str, value: Any) -> Iterator[Series]:
-    """Yield the series of numbers in a struct or a cell array."""
-    if not isinstance(value, np.ndarray):
-        return
-    if not value.dtype.hasobject:
-        group, _, leaf = path.rpartition(".")
-        group += "." * bool(group)
-        yield from vectors(group, leaf, value.shape, value.dtype, lambda: value)
-        return
-    for number, element in enumerate(value.ravel(order="F"), start=1):
-        element_path = f"{path}({number})" if value.size > 1 else path
-        if value.dtype.names is None:
-            yield from _walked(element_path, element)
-        else:
-            for name in value.dtype.names:
-                yield from _walked(f"{element_path}.{name}", element[name])
-
-
-def _check_elements(data: bytes) -> None:
-    """Raise a ValueError unless all arrays consist of the elements that belong to them.
-
-    SciPy 1.18 takes the types of elements on trust, and an unknown one ends the whole process.
+    Notes are collected where there are some. Objects and sparse matrices are passed over.
     """
-    order = {b"IM": "<", b"MI": ">"}[data[126:128]]
-    for kind, body in _elements(data[128:], order, padded=False):
-        if kind == _COMPRESSED:
-            unpacked = zlib.decompressobj().decompress(body, _LARGEST_ELEMENT)
-            ((kind, body),) = _elements(unpacked, order)  # noqa: PLW2901
-        if kind != _MATRIX:
-            raise ValueError(f"unknown element {kind}")
-        _check_matrix(body, order)
+    flags, *inner = _elements(matrix, order)
+    word = struct.unpack_from(f"{order}I", flags[1])[0]
+    kind = word & 0xFF
+    if kind not in {_CELL, _STRUCT, _CHAR, *_NUMERIC}:
+        return
+    shape = _values(inner[0], order).tolist()
+    path = path or inner[1][1].decode("latin-1")
+    content = inner[2:]
+    if kind == _CHAR:
+        if notes is not None and path in NOTES and content and content[0][1]:
+            codes = _values(content[0], order)
+            encoding = "utf-8" if codes.itemsize == 1 else f"utf-{8 * codes.itemsize}-le"
+            text = codes.astype(f"<u{codes.itemsize}").tobytes().decode(encoding, errors="replace")
+            notes[path] = text
+    elif kind in _NUMERIC:
+        is_complex = bool(word & _IS_COMPLEX)
+        dtype = np.dtype("?" if word & _IS_LOGICAL else "c16" if is_complex else _NUMERIC[kind])
+        if len(content) != 1 + is_complex:
+            raise ValueError("parts of an array are missing")
+        load = partial(_array, content[0], order, shape, dtype)
+        if notes is not None and path in NOTES and math.prod(shape) > 0:
+            notes[path] = note(load())
+        else:
+            group, dot, leaf = path.rpartition(".")
+            yield from vectors(group + dot, leaf, shape, dtype, load)
+    else:
+        fields = [""]
+        if kind == _STRUCT:
+            (width,), names = _values(content[0], order), content[1][1]
+            fields = [
+                "." + names[at : at + width].partition(b"\0")[0].decode("latin-1")
+                for at in range(0, len(names), width)
+            ]
+        matrices = [body for kind, body in content if kind == _MATRIX]
+        for number, body in enumerate(matrices):
+            index, field = divmod(number, len(fields))
+            index_text = f"({index + 1})" if math.prod(shape) > 1 else ""
+            if body:  # else an empty array
+                yield from _series(f"{path}{index_text}{fields[field]}", body, order)
 
 
-def _check_matrix(body: bytes, order: str, *, nested: bool = False) -> None:
-    inner = list(_elements(body, order))
-    if not inner:  # an empty array in a struct
-        return
-    (flags,) = struct.unpack_from(f"{order}I", inner[0][1])
-    if flags & 0xFF in _NESTED_CODES:
-        contents = [content for kind, content in inner if kind == _MATRIX]
-        if math.prod(np.frombuffer(inner[1][1], f"{order}i4").tolist()) > max(len(contents), 1):
-            raise ValueError("elements of an array are missing")
-        for content in contents:
-            _check_matrix(content, order, nested=True)
-    elif flags & 0xFF not in _PLAIN_CODES:
-        if nested:  # it would be read with the struct that it is in
-            raise ValueError("an object in a struct")
-        return
-    # Flags, dimensions, name and real part; an imaginary part if the flags say so.
-    elif len(inner) != (5 if flags & _COMPLEX else 4):
-        raise ValueError("parts of an array are missing")
-    if not {kind for kind, _ in inner} - {_MATRIX} <= _NUMBERS_AND_TEXT:
-        raise ValueError("unknown type of data")
+def _array(element: tuple[int, bytes], order: str, shape: list[int], dtype: Any) -> Any:
+    return _values(element, order).astype(dtype).reshape(shape, order="F")
+
+
+def _values(element: tuple[int, bytes], order: str) -> Any:
+    kind, body = element
+    if kind not in _TYPES:
+        raise ValueError(f"unknown type of data {kind}")
+    return np.frombuffer(body, order + _TYPES[kind])
 
 
 def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
@@ -173,29 +157,9 @@ def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[in
         yield kind, data[start : start + size]
 
 
-def _first(values: Any) -> str:
-    value = np.asarray(values).ravel()[0]
-    return repr(float(value)) if np.asarray(value).dtype.kind in "iuf" else str(value)
-
-
-def _notes_7_3(path: Path) -> dict[str, str]:
-    notes = {}
-    with h5py.File(path, "r") as file:
-        for key in (*_TEXTS, *_NUMBERS):
-            if not isinstance(file.get(key, getlink=True), h5py.HardLink):
-                continue
-            values = np.asarray(file[key][()])
-            if key in _NUMBERS:
-                notes[key] = _first(values)
-            elif "MATLAB_empty" not in file[key].attrs and values.dtype.kind == "u":
-                codes = values.astype("<u2").tobytes()
-                notes[key] = codes.decode("utf-16-le", errors="replace")
-    return notes
-
-
 def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> None:
     content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
-    with h5py.File(content, "w", userblock_size=_USERBLOCK) as file:
+    with h5py.File(content, "w", userblock_size=512) as file:
         for name, values in arrays.items():
             # MATLAB counts dimensions the other way round: (1, samples) here is a column there.
             dataset = file.create_dataset(name, data=values[np.newaxis, :])

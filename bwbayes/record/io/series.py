@@ -1,7 +1,8 @@
-"""What a file holds: series of numbers, each with its path, its unit where the file states one.
+"""What a file or a table in memory holds: named series of numbers.
 
-The readers of all formats make a :class:`Source`; which of its series are time, voltage and
-displacement is the matter of :mod:`bwbayes.record.io.columns`.
+A reader of a format is a function of a path that returns a :class:`Source`; which of its series are
+time, voltage and displacement is the matter of :mod:`bwbayes.record.io.columns`. Numbers are loaded
+when they are needed, since a file may hold much else.
 """
 
 from __future__ import annotations
@@ -17,46 +18,72 @@ from numpy.typing import NDArray
 
 from bwbayes.errors import InputError
 
-__all__ = ["MAXIMUM_SAMPLES", "Series", "Source", "damaged", "real_numbers", "vectors"]
+__all__ = [
+    "MAXIMUM_SAMPLES",
+    "NOTES",
+    "Series",
+    "Source",
+    "array_source",
+    "damaged",
+    "frame_source",
+    "in_seconds",
+    "note",
+    "vectors",
+]
 
 MAXIMUM_SAMPLES = 10**8
-
-# Columns that a matrix may have; one with more is a picture, or has its samples in another order.
-_MOST_COLUMNS = 64
+# What a file may say beside its numbers.
+NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
 
 
 @dataclass(frozen=True)
 class Series:
-    """A row of numbers in a file.
+    """A row of numbers: its path in the file, which begins with its group, and how to load it.
 
-    ``name`` is its path in the file, ``leaf`` the last part of it, ``unit`` what the file states
-    beside the name; ``load`` returns its ``size`` numbers.
+    ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values.
     """
 
     name: str
     size: int
     load: Callable[[], NDArray[Any]]
     unit: str = ""
-    leaf: str = ""
+    group: str = ""
 
     @property
     def label(self) -> str:
         """The name without the path."""
-        return self.leaf or self.name
+        return self.name.removeprefix(self.group)
 
-    @property
-    def group(self) -> str:
-        """Where in the file it stands."""
-        return self.name.removesuffix(self.label)
+    def numbers(self, where: object) -> NDArray[Any]:
+        """Load the numbers, (size,), of a series in the file ``where``.
+
+        Raises
+        ------
+        InputError
+            They are not real numbers, or damaged.
+        """
+        try:
+            values = np.asarray(self.load())
+            if values.dtype.kind in "iuf" and values.shape != (self.size,):
+                raise ValueError(f"{values.size} values for {self.size}")
+        except InputError:
+            raise
+        except Exception as error:
+            raise damaged(f"{where}: {self.name}", error) from error
+        if values.dtype.kind not in "iuf":
+            kinds = {"c": "complex numbers", "b": "logical values"}
+            problem = kinds.get(values.dtype.kind, "text or another type that is not a number")
+            raise InputError(f"{where}: {self.name}: holds {problem}; store real numbers")
+        return values
 
 
 @dataclass(frozen=True)
 class Source:
     """What a file holds.
 
-    ``notes`` are what it says in words (`voltage_is`, `origin`, `interval_s`), by the group of the
-    series that they are of. ``first_line`` is the line of the first sample in a text file.
-    ``interval`` and ``start``, s, are those of a file that states them in place of a time column.
+    ``notes`` are what it says in words (`NOTES`), by the group of the series that they are of.
+    ``first_line`` is the line of the first sample in a text file. ``interval`` and ``start``, s,
+    are those of a file that states them in place of a time column.
     """
 
     path: Path
@@ -68,45 +95,56 @@ class Source:
 
 
 def vectors(
-    group: str, leaf: str, shape: Any, dtype: Any, load: Any, unit: str = ""
+    group: str, leaf: str, shape: Any, dtype: Any, load: Callable[[], Any], unit: str = ""
 ) -> Iterator[Series]:
-    """Yield the series of numbers in an array: the array, its columns, or a table's fields.
+    """Yield the series in an array: the array, its columns, or a table's fields.
 
     Parameters
     ----------
     group, leaf
         The path of the array, with a separator at its end, and its name.
     shape, dtype
-        Those of the array that ``load()`` returns; what are no numbers is passed over.
+        Those of the array that ``load()`` returns. Without a shape, too large, or with more than
+        64 columns (a picture, or samples in another order) it is passed over.
     unit
         Of its numbers, if that is stated.
     """
-    if shape is None:
+    sides = [n for n in shape or () if n != 1]
+    if shape is None or max(sides, default=1) > MAXIMUM_SAMPLES:
         return
-    long = [n for n in shape if n != 1]
     if dtype.names:
-        for field in dtype.names:
-            inner = partial(lambda load, field: load()[field], load, field)
-            yield from vectors(f"{group}{leaf}.", field, shape, dtype[field], inner, unit)
-    elif dtype.kind not in "iuf":
-        yield Series(f"{group}{leaf}", max(shape, default=1), load, unit, leaf)
-    elif max(shape, default=1) > MAXIMUM_SAMPLES:
-        return
-    elif len(long) <= 1:
-        size = int(np.prod(shape, dtype=np.int64))
-        yield Series(f"{group}{leaf}", size, lambda: np.ravel(load()), unit, leaf)
-    elif len(long) == 2 and min(long) <= _MOST_COLUMNS:
-        by_row = long[0] < long[1]
-        for i in range(min(long)):
-            name = f"{leaf}[{i + 1}]"
-            take = partial(_column, load, i, by_row)
-            yield Series(f"{group}{name}", max(long), take, unit, name)
+        for name in dtype.names:
+            inner = partial(lambda name: load()[name], name)
+            yield from vectors(f"{group}{leaf}.", name, shape, dtype[name], inner, unit)
+    elif len(sides) == 2 and min(sides) <= 64 and dtype.kind in "iuf":
+        for i in range(min(sides)):
+            column = partial(_column, load, i, sides[0] < sides[1])
+            yield Series(f"{group}{leaf}[{i + 1}]", max(sides), column, unit, group)
+    elif len(sides) <= 1 or dtype.kind not in "iuf":
+        size = int(np.prod(sides, dtype=np.int64))
+        yield Series(f"{group}{leaf}", size, lambda: np.ravel(load()), unit, group)
 
 
-def _column(load: Any, number: int, by_row: bool) -> NDArray[Any]:
+def _column(load: Callable[[], Any], number: int, by_row: bool) -> NDArray[Any]:
     matrix = np.squeeze(load())
-    column: NDArray[Any] = matrix[number] if by_row else matrix[:, number]
-    return column
+    return np.asarray(matrix[number] if by_row else matrix[:, number])
+
+
+def note(value: Any) -> str:
+    """Return what a file says in words as text, whatever type it has there."""
+    first = np.ravel(value)[0] if np.size(value) else ""
+    if isinstance(first, bytes):
+        return first.decode("utf-8", errors="replace")
+    return repr(float(first)) if np.asarray(first).dtype.kind in "iuf" else str(first)
+
+
+def in_seconds(times: Any) -> NDArray[Any]:
+    """Return dates, from 1970 on, or durations (samples,) in s; other values as they are."""
+    values: NDArray[Any] = np.asarray(times)
+    if values.dtype.kind not in "mM":
+        return values
+    zero = np.datetime64(0, "ns") if values.dtype.kind == "M" else np.timedelta64(0, "ns")
+    return np.asarray((values - zero) / np.timedelta64(1, "ns") / 1e9)
 
 
 def damaged(where: object, error: Exception) -> InputError:
@@ -115,22 +153,45 @@ def damaged(where: object, error: Exception) -> InputError:
     return InputError(f"{where}: damaged or cut off ({reason}); write it again")
 
 
-def real_numbers(series: Series, where: str) -> NDArray[Any]:
-    """Return the numbers of a series, which stands ``where``.
+def array_source(
+    origin: str,
+    arrays: Mapping[str, Any],
+    interval: float | None = None,
+    start: float = 0.0,
+    notes: Mapping[str, str] | None = None,
+) -> Source:
+    """Return arrays (samples,) by name as what a file called ``origin`` holds."""
+    series = [
+        Series(name, np.size(values), partial(_vector, values, origin, name))
+        for name, values in arrays.items()
+        if values is not None
+    ]
+    groups = {"": {"origin": origin, **(notes or {})}}
+    return Source(Path(origin), tuple(series), groups, interval=interval, start=start)
 
-    Raises
-    ------
-    InputError
-        They are not real numbers, or damaged.
+
+def frame_source(frame: Any, origin: str) -> Source:
+    """Return the columns of a pandas table, called ``origin``.
+
+    The index counts as a column if it has a name, or dates or durations.
     """
+    if frame.index.name is not None or frame.index.dtype.kind in "mM":
+        frame = frame.reset_index()
+    series = []
+    for number, (label, kind) in enumerate(frame.dtypes.items()):
+        values = frame.iloc[:, number].to_numpy()
+        unit = "s" if getattr(kind, "kind", "") in ("m", "M") else ""
+        load = partial(_vector, values, origin, str(label))
+        series.append(Series(str(label), len(frame), load, unit))
+    return Source(Path(origin), tuple(series), {"": {"origin": origin}})
+
+
+def _vector(values: Any, origin: str, name: str) -> NDArray[Any]:
+    """Return numbers, in s if they are dates or durations, or say whose they are not."""
     try:
-        values = np.asarray(series.load())
-    except InputError:
-        raise
-    except Exception as error:
-        raise damaged(where, error) from error
-    if values.dtype.kind not in "iuf":
-        kinds = {"c": "complex numbers", "b": "logical values"}
-        problem = kinds.get(values.dtype.kind, "text or another type that is not a number")
-        raise InputError(f"{where}: holds {problem}; store real numbers")
-    return values
+        vector = np.asarray(in_seconds(values), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{origin}: {name}: not numbers ({error}); convert them") from None
+    if vector.ndim != 1:
+        raise InputError(f"{origin}: {name}: shape {vector.shape} is no vector; give (samples,)")
+    return vector

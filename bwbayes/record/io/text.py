@@ -14,10 +14,9 @@ import csv
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from io import StringIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.record.io.columns import QUANTITIES, power_of
 from bwbayes.record.io.labview import is_lvm, plain_lvm
-from bwbayes.record.io.series import Series, Source
+from bwbayes.record.io.series import Series, Source, in_seconds
 from bwbayes.record.record import Record
 
 __all__ = ["read_text", "write_text"]
@@ -39,17 +38,8 @@ _NUMBER = re.compile(
     r"|[+-]?nan|[+-]?inf",
     re.IGNORECASE,
 )
-_CLOCK = re.compile(r".*\d:\d\d")
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _EXAMPLE = "time_s,voltage_V,displacement_um"
-
-# Lines that show how a file is laid out, lines of numbers that end a header, and lines above the
-# numbers that may be one.
-_PROBED, _IN_A_ROW, _ABOVE = 60, 3, 6
-
-# What text is written in that is not UTF-8, as far as its bytes can tell.
-_ENCODINGS = ["cp1252", "cp932", "gb18030", "cp1251", "utf_16_le", "utf_16_be"]
-_MICRO = re.compile(rb"\xb5[msV]")  # as Windows writes a unit in cp1252
 
 
 class _Layout(NamedTuple):
@@ -74,25 +64,24 @@ def read_text(path: Path) -> Source:
     InputWarning
         If lines above the header are skipped.
     """
-    text = _decoded(path)
-    notes: dict[str, str] = {}
+    text, interval = _decoded(path), None
     if is_lvm(text):
-        text, notes = plain_lvm(path, text)
+        text, interval = plain_lvm(path, text)
     lines = text.split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
     layout = _layout(path, lines)
     names, units, header = _header(path, lines, layout)
     above = lines[: layout.first if header is None else header]
+    notes = {}
     for line in above:
-        key, colon, value = line.strip(" #").partition(":")
+        key, colon, value = line.lstrip(" #").partition(":")
         if line.startswith("#") and colon:
             key = key.strip().lower()
             notes["voltage_is" if key == "voltage" else key] = value.strip()
-    skipped = [line for line in above if line.strip() and not line.startswith("#")]
+    skipped = sum(bool(line.strip()) and not line.startswith("#") for line in above)
     if skipped:
-        plural = "s" if len(skipped) > 1 else ""
-        remark = f"{path}:1: {len(skipped)} line{plural} above the header skipped"
+        remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     body = lines[layout.first :]
     if not text.endswith("\n") and _is_cut(body, layout.separator):
@@ -105,19 +94,12 @@ def read_text(path: Path) -> Source:
             len(body),
             partial(_numbers, path, frame[column], decimal, name, layout.first + 1),
             # Dates and times of day have no unit, and become seconds.
-            "s" if _CLOCK.match(str(frame[column].iloc[0])) else unit,
+            "s" if re.match(r".*\d:\d\d", str(frame[column].iloc[0])) else unit,
         )
         for column, (name, unit) in enumerate(zip(names, units, strict=True))
         if column < layout.fields
     ]
-    interval = notes.pop("dt", None)
-    return Source(
-        path,
-        tuple(series),
-        {"": notes},
-        layout.first + 1,
-        None if interval is None else float(interval),
-    )
+    return Source(path, tuple(series), {"": notes}, layout.first + 1, interval)
 
 
 def write_text(record: Record, path: Path) -> None:
@@ -143,25 +125,25 @@ def _decoded(path: Path) -> str:
     try:
         encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
         text = data.decode(encoding)
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
+        if "\0" in text:
+            raise UnicodeError("a zero in a text")
+    except UnicodeError:
         # The part that is not numbers tells the encoding, and stands at the beginning.
-        best = from_bytes(data[:4000], cp_isolation=_ENCODINGS).best()
-        encoding = "cp1252" if _MICRO.search(data[:4000]) else best.encoding if best else "ascii"
-        try:
-            text = data.decode(encoding)
-        except UnicodeDecodeError:
+        begin = data[:4000]
+        encodings = ["cp1252", "cp932", "gb18030", "cp1251", "utf_16_le", "utf_16_be"]
+        best = from_bytes(begin, cp_isolation=encodings).best()
+        # As Windows writes a micro sign before a unit.
+        is_windows = re.search(rb"\xb5[msV]", begin) is not None
+        encoding = "cp1252" if is_windows else best.encoding if best else "ascii"
+        text = data.decode(encoding, errors="replace")
+        if "\ufffd" in text or (encoding == "cp1252" and "\0" in text):
             raise InputError(
                 f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV"
             ) from None
-        if encoding == "cp1252" and "\0" in text:
-            raise InputError(f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV")
     return text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """Split a line."""
     if separator == " ":
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
@@ -169,108 +151,100 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def _layout(path: Path, lines: Sequence[str]) -> _Layout:
     """Find how the numbers stand in a text: most lines in its middle and at its end are such."""
-    center = len(lines) // 2
-    probed = [*lines[center : center + _PROBED], *lines[-_PROBED:]]
+    center, sample = len(lines) // 2, 60
+    probed = [*lines[center : center + sample], *lines[-sample:]]
     rows = [line for line in probed if line.strip() and not line.startswith("#")]
-    best, layout = 0.0, ("", 0, np.zeros(0, dtype=np.int64))
-    for separator in _SEPARATORS:
-        split = [_cells(line, separator) for line in rows]
-        fields = Counter(map(len, split)).most_common(1)[0][0] if split else 0
-        if fields < 2:
+    best, separator, fields = 0.0, "", 0
+    columns: list[int] = []
+    for candidate in _SEPARATORS if rows else ():
+        split = [_cells(line, candidate) for line in rows]
+        width = Counter(map(len, split)).most_common(1)[0][0]
+        if width < 2:
             continue
-        regular = [cells for cells in split if len(cells) == fields]
-        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in cells] for cells in regular])
-        share = float(numeric.mean()) * len(regular) / len(split)
-        columns = np.flatnonzero(numeric.mean(axis=0) > 0.5)
-        if share > best and columns.size:
-            best, layout = share, (separator, fields, columns)
-    separator, fields, columns = layout
-    run: list[int] = []
-    for index, line in enumerate(lines if best > 0 else []):
+        numeric = np.array(
+            [[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in split if len(row) == width]
+        )
+        share = float(numeric.sum()) / (width * len(split))
+        usual = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
+        if share > best and usual:
+            best, separator, fields, columns = share, candidate, width, usual
+    in_a_row: list[int] = []
+    for index, line in enumerate(lines if columns else []):
         if not line.strip():
             continue
         cells = _cells(line, separator)
-        numbers = [bool(_NUMBER.fullmatch(cells[c])) for c in columns if c < len(cells)]
-        run = [*run, index] if sum(numbers) > len(columns) / 2 else []
-        if len(run) == _IN_A_ROW:
+        numbers = sum(bool(_NUMBER.fullmatch(cells[c])) for c in columns if c < len(cells))
+        in_a_row = [*in_a_row, index] if numbers > len(columns) / 2 else []
+        if len(in_a_row) == 3:
             break
-    if not run:
+    if not in_a_row:
         raise InputError(f"{path}: no columns of numbers in it; write {_EXAMPLE} above such")
-    return _Layout(separator, fields, run[0])
+    return _Layout(separator, fields, in_a_row[0])
 
 
 def _header(
     path: Path, lines: Sequence[str], layout: _Layout
 ) -> tuple[list[str], list[str], int | None]:
     """Return the columns' names and units, and the index of the header's first line."""
-    rows = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
-    names, units, header = [], [""] * layout.fields, None
-    for index, line in reversed(rows[-_ABOVE:]):
-        cells = next(_split_header(line, layout), None)
-        if cells is None:
+    names: list[str] = []
+    units: list[str] = []
+    first = None
+    above = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
+    for index, line in reversed(above[-6:]):
+        cells = _split_header(line, layout)
+        if not cells:
             if layout.separator == "," and 2 * len(line.split(",")) == layout.fields:
                 raise InputError(
                     f"{path}:{layout.first + 1}: decimal commas, {layout.fields} fields for "
                     f"{layout.fields // 2} columns; separate them by semicolons, or write 1.5"
                 )
             continue
+        first = index
         bare = [cell.strip("[]() ") for cell in cells]
-        if header is None and all(_is_unit(cell) for cell in bare if cell):
-            units, header = bare, index
+        is_unit = [any(power_of(cell, q) is not None for q in QUANTITIES) for cell in bare if cell]
+        if not units and all(is_unit):
+            units = bare
             continue
-        names, header = cells, index
+        names = cells
         break
     fields = max(layout.fields, len(names))
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
     named = [name or f"column {i}" for i, name in enumerate(names, start=1)]
-    twice = {name for name, count in Counter(named).items() if count > 1}
-    named = [f"{n} (column {i})" if n in twice else n for i, n in enumerate(named, start=1)]
-    return named, units, header
+    count = Counter(named)
+    named = [f"{n} (column {i})" if count[n] > 1 else n for i, n in enumerate(named, start=1)]
+    return named, units, first
 
 
-def _split_header(line: str, layout: _Layout) -> Iterator[list[str]]:
-    """Yield the cells of a line, by any separator that gives as many as the numbers have."""
+def _split_header(line: str, layout: _Layout) -> list[str]:
+    """Return the cells of a line, by any separator that gives as many as the numbers have."""
     bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
     ways = [_cells(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
     for number, fields in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
         cells = [cell.strip().strip('"') for cell in fields]
         more = any(cells[layout.fields :]) and number > 0
-        if len(cells) < layout.fields or more or not any(cells):
-            continue
-        if not any(_NUMBER.fullmatch(cell) for cell in cells):
-            yield cells
-
-
-def _is_unit(text: str) -> bool:
-    return any(power_of(text, quantity) is not None for quantity in QUANTITIES)
+        is_name = any(cells) and not any(_NUMBER.fullmatch(cell) for cell in cells)
+        if len(cells) >= layout.fields and not more and is_name:
+            return cells
+    return []
 
 
 def _check_fields(path: Path, body: Sequence[str], layout: _Layout, names: int) -> None:
     """Refuse a line that has fewer fields than the others, or more than the header."""
     separator, fields = layout.separator, layout.fields
-    for number, line in enumerate(body, start=layout.first + 1):
-        count = len(line.split()) if separator == " " else line.count(separator) + 1
-        if count == fields:
+    for index, line in enumerate(body):
+        if (len(line.split()) if separator == " " else line.count(separator) + 1) == fields:
             continue
-        where, cells = f"{path}:{number}", _cells(line, separator)
-        if not line.strip():
-            raise InputError(f"{where}: empty line; remove it")
-        if line.startswith("#"):
-            raise InputError(f"{where}: comment among the samples; move it above the header")
-        counts = f"{len(cells)} fields for {fields} columns"
-        if len(cells) < fields:
-            if number == layout.first + len(body):
-                raise InputError(f"{where}: the last line is cut off ({counts}); remove it")
-            others = [s for s in _SEPARATORS[:-1] if s != separator and s in line]
-            advice = "separate the fields as above" if others else "complete the line or remove it"
-            raise InputError(f"{where}: missing field, {counts}; {advice}")
-        if any(cells[max(fields, names) :]):
-            halves = [a.lstrip("+-").isdecimal() and b.isdecimal() for a, b in pairwise(cells)]
-            if separator == "," and any(halves):
-                problem = f"decimal comma or extra field, {counts}; write 1.5 instead of 1,5"
-                raise InputError(f"{where}: {problem}")
-            raise InputError(f"{where}: extra field {cells[-1][:30]!r}, {counts}; remove it")
+        cells = _cells(line, separator)
+        if len(cells) >= fields and not any(cells[max(fields, names) :]):
+            continue
+        problem = f"{len(cells)} fields for {fields} columns"
+        advice = "complete the line, or remove it"
+        if len(cells) > fields:
+            advice = f"remove {cells[-1][:30]!r}, or write 1.5 where 1,5 is meant"
+        elif index == len(body) - 1:
+            problem, advice = f"the last line is cut off, {problem}", "remove it"
+        raise InputError(f"{path}:{layout.first + 1 + index}: {problem}; {advice}")
 
 
 def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
@@ -278,13 +252,17 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
     # Fortran writes 1.5D+00.
     text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
     frames = []
-    for decimal in "." if layout.separator == "," else ".,":
+    for decimal in ".," if "," in text and layout.separator != "," else ".":
+        mark = "." if decimal == "," else ","
+        has_thousands = mark != layout.separator and re.search(
+            rf"\d\{mark}\d{{3}}\{decimal}\d", text
+        )
         try:
             frame = pd.read_csv(
                 StringIO(text),
                 sep=r"\s+" if layout.separator == " " else layout.separator,
                 decimal=decimal,
-                thousands=_thousands(text, decimal, layout.separator),
+                thousands=mark if has_thousands else None,
                 header=None,
                 names=range(layout.fields),
                 usecols=range(layout.fields),
@@ -296,16 +274,7 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
         except (ValueError, OverflowError) as error:
             raise InputError(f"{path}: {one_line(str(error))[:200]}; write it again") from None
         frames.append((frame, decimal))
-        if "," not in text:
-            break
     return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
-
-
-def _thousands(text: str, decimal: str, separator: str) -> str | None:
-    """Return the mark between thousands, as in 1.234,5, if there are any."""
-    mark = "." if decimal == "," else ","
-    match = mark != separator and re.search(rf"\d\{mark}\d{{3}}\{decimal}\d", text)
-    return mark if match else None
 
 
 def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
@@ -317,35 +286,26 @@ def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) 
         A cell is none; the text names its line.
     """
     if column.dtype.kind in "iuf":
-        values: NDArray[Any] = column.to_numpy()
-        return values
+        return np.asarray(column)
     text = column.astype(str)
     numbers = pd.to_numeric(text.str.replace(decimal, "."), errors="coerce")
     wrong = np.flatnonzero(numbers.isna() & column.notna() & (text.str.lower() != "nan"))
     if not wrong.size:
         return np.asarray(numbers, dtype=np.float64)
-    moments = _moments(text) if ":" in text.iloc[0] else None
-    if moments is not None:
-        return moments
+    if ":" in text.iloc[0]:
+        for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
+            try:
+                return in_seconds(
+                    parse(text).to_numpy(f"{'mM'[parse is not pd.to_timedelta]}8[ns]")
+                )
+            except (ValueError, OverflowError):
+                continue
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     raise InputError(
         f"{path}:{first_line + wrong[0]}: {name}: {shown} is not a number; write it like 1.5, or "
         "nothing where a reading is missing"
     )
-
-
-def _moments(text: Any) -> NDArray[Any] | None:
-    """Return dates or times of day in seconds; None if they are none."""
-    for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
-        try:
-            moments = parse(text)
-        except (ValueError, OverflowError):
-            continue
-        zero = pd.Timestamp(0, tz="UTC") if hasattr(moments.iloc[0], "tz") else pd.Timedelta(0)
-        seconds: NDArray[Any] = ((moments - zero) / pd.Timedelta(1, "s")).to_numpy()
-        return seconds
-    return None
 
 
 def _is_cut(body: Sequence[str], separator: str) -> bool:
