@@ -203,10 +203,10 @@ class Compensation:
 
     def plot(self) -> Figure:
         """Draw reference, prediction and error along time."""
-        from bwbayes.report.figures import compensation, drawn  # noqa: PLC0415  # slow to load
+        from bwbayes.report.figures import control, drawn  # noqa: PLC0415  # slow to load
 
         return drawn(
-            compensation.draw_tracking, self.reference.name, self.asked, self._commands, self.limit
+            control.draw_command, self.reference.name, self.asked, self._commands, self.limit
         )
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
@@ -227,7 +227,7 @@ class Compensation:
 
     def report(self) -> Report:
         """Return the predicted error beside that of a linear command, with pictures."""
-        from bwbayes.report.figures import compensation as figures  # noqa: PLC0415  # slow to load
+        from bwbayes.report.figures import control as figures  # noqa: PLC0415  # slow to load
 
         name, target, limit = self.reference.name, self.asked, self.limit
         commands = self._commands
@@ -248,7 +248,7 @@ class Compensation:
                     "Reference and prediction",
                     "The command, the displacement that it will give with its 95 % bands, and the "
                     "error; beside it what a linear command would do.",
-                    partial(figures.draw_tracking, name, target, commands, limit),
+                    partial(figures.draw_command, name, target, commands, limit),
                 ),
                 Picture(
                     "error",
@@ -272,12 +272,9 @@ class Compensation:
         )
 
     @property
-    def _commands(self) -> dict[str, Any]:
+    def _commands(self) -> dict[str, Played]:
         """The commands as their figures take them."""
-        from bwbayes.report.figures.compensation import Command  # noqa: PLC0415  # slow to load
-
-        played = {"uncompensated": self.linear, "compensated": self.compensated}
-        return {n: Command(p.voltage, p.bands, p.rms) for n, p in played.items()}
+        return {"uncompensated": self.linear, "compensated": self.compensated}
 
     def _promise(self) -> str:
         after, before = self.compensated, self.linear

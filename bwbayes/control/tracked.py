@@ -137,7 +137,7 @@ class Tracking:
 
     def report(self) -> Report:
         """Return margins, error against frequency, errors, gains and the stand, to be shown."""
-        from bwbayes.report.figures.tracking import draw_tracking  # noqa: PLC0415
+        from bwbayes.report.figures.control import draw_tracking  # noqa: PLC0415
 
         table = self.to_pandas()
         title = "Error against frequency"

@@ -107,7 +107,7 @@ class Picture:
     title, caption
         What it shows, in a few words and at length.
     draw
-        Draws it; none if it is drawn elsewhere.
+        Draws it.
     alt
         What one would see, for those who do not; by default the title.
     """
@@ -117,7 +117,7 @@ class Picture:
     name: str
     title: str
     caption: str
-    draw: Callable[[], Figure] | None = None
+    draw: Callable[[], Figure]
     alt: str = ""
 
 

@@ -112,6 +112,11 @@ class Result:
         return self.draws.reshape(-1, self.draws.shape[-1])
 
     @property
+    def looped(self) -> list[Bands]:
+        """The bands that have a loop: a step has none."""
+        return [bands for bands in self.bands if bands.name not in self.steps]
+
+    @property
     def standing(self) -> Standing:
         """Whether all bands hold."""
         return Standing.of(self.verdicts.values())

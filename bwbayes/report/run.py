@@ -17,8 +17,8 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.report import tables
-from bwbayes.report.captions import caption
-from bwbayes.report.figures import Drawings, drawings
+from bwbayes.report.figures.pictures import Pictures
+from bwbayes.report.figures.pictures import pictures as all_pictures
 from bwbayes.report.figures.style import title
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import (
@@ -27,7 +27,6 @@ from bwbayes.report.report import (
     Facts,
     Glossary,
     Kind,
-    Picture,
     Report,
     Section,
     SideBySide,
@@ -57,7 +56,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
         and ``data_sha256`` are shown too if they are there, and without convergence ``go_on``, the
         command that goes on.
     """
-    pictures = _pictures(drawings(result))
+    pictures = all_pictures(result)
     converged = result.outcome.converged
     blocks = _answer(result, numbers, pictures) if converged else _chains(result, numbers, pictures)
     if converged:
@@ -203,9 +202,7 @@ def _held_out_first(result: Result) -> list[Bands]:
     return sorted(result.bands, key=lambda bands: bands.training)
 
 
-def _answer(
-    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
-) -> list[Block]:
+def _answer(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
     parameters: list[Block] = [
         tables.parameters_table(result, numbers),
         Text(
@@ -220,9 +217,7 @@ def _answer(
     return [*results, SideBySide([parameters, *loop])]
 
 
-def _evidence(
-    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
-) -> list[Block]:
+def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
     ordered = _held_out_first(result)
     # Of several records "innovations_NAME" is one of the innovations.
     names = [f"bands_{bands.name}" for bands in ordered]
@@ -263,16 +258,12 @@ def _moves(result: Result) -> str:
     return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
 
 
-def _chains(
-    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
-) -> list[Block]:
+def _chains(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
     sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
     return [Section("Sampling", sampling, folded=False), Text(_moves(result), on="screen")]
 
 
-def _details(
-    result: Result, numbers: Mapping[str, Any], pictures: Mapping[str, Picture]
-) -> Iterator[Section]:
+def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> Iterator[Section]:
     priors = priors_table(JointPrior(result.parameters))
     yield Section("Priors and fixed values", [replace(priors, on="page")])
     learned = tables.learned_table(result)
@@ -294,14 +285,6 @@ def _details(
         yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
     yield Section("Moves", [tables.moves_table(result)])
     yield Section("What was run", [Facts([*result.facts.items(), *_circumstances(numbers)])])
-
-
-def _pictures(drawn: Drawings) -> dict[str, Picture]:
-    pictures = {}
-    for name, draw in drawn.items():
-        words = caption(name)
-        pictures[name] = Picture(name, words.title, words.text, draw, words.alt)
-    return pictures
 
 
 def _about(result: Result) -> str:

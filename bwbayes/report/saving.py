@@ -57,7 +57,7 @@ def draw_pictures(report: Report) -> dict[str, bytes]:
     return {
         block.name: picture_of(block.draw)
         for block in report.all_blocks()
-        if isinstance(block, Picture) and block.draw is not None
+        if isinstance(block, Picture)
     }
 
 

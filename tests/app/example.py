@@ -15,7 +15,8 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.scores import Scores
-from bwbayes.report.figures import drawings, drawn, interactive
+from bwbayes.report.figures import drawn, interactive
+from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import render
 from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
@@ -154,4 +155,4 @@ def page(
 
 def figures(run: Result) -> dict[str, Figure]:
     """Draw all figures of a run, by name."""
-    return {name: drawn(draw) for name, draw in drawings(run).items()}
+    return {name: drawn(picture.draw) for name, picture in pictures(run).items()}

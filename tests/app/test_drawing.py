@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from bwbayes.app.running.figure_worker import Artist, artist_of
-from bwbayes.report.figures import drawings, interactive, picture_of, save_pictures
+from bwbayes.report.figures import interactive, picture_of, save_pictures
+from bwbayes.report.figures.pictures import pictures
 from tests.app import example
 
 
@@ -34,7 +35,7 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
         drawn = artist.pictures(run, tmp_path / "apart")
         plots = artist.plots(run)
     assert interactive.made(run) == plots
-    here = {name: picture_of(draw) for name, draw in drawings(run).items()}
+    here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
     save_pictures(here, tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
     assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
@@ -54,5 +55,5 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
 def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
     artist, run = Artist(Broken()), example.run()
     artist.draw(run)
-    assert list(drawings(run)) == list(artist.pictures(run, tmp_path))
+    assert list(pictures(run)) == list(artist.pictures(run, tmp_path))
     assert interactive.made(run) == artist.plots(run)

@@ -23,7 +23,7 @@ from bwbayes.app.running.run import resume, start
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, write_record
-from bwbayes.report.figures import drawings
+from bwbayes.report.figures.pictures import pictures
 from tests.app import small
 
 # A loop and a step at another rate than its readings', on one stand.
@@ -137,9 +137,9 @@ def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
     assert all(one["agrees"] for one in numbers["agreement"].values())
     made = bwbayes.open_run(finished.path)
     assert {"step"} <= made.result.steps.keys()
-    pictures = {path.stem for path in (finished.path / "figures").glob("*.png")}
-    assert pictures == drawings(made.result).keys()
-    assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= pictures
+    drawn = {path.stem for path in (finished.path / "figures").glob("*.png")}
+    assert drawn == pictures(made.result).keys()
+    assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= drawn
     page = (finished.path / "report.html").read_text()
     assert "Do the records agree?" in page
     assert "offset[step]" in page

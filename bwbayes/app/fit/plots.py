@@ -16,14 +16,13 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import drawn
 from bwbayes.report.figures.chain import draw_corner, draw_ranks, draw_trace
+from bwbayes.report.figures.control import draw_tracking
 from bwbayes.report.figures.coverage import draw_coverage
-from bwbayes.report.figures.innovations import draw_innovations
 from bwbayes.report.figures.loop import draw_loop
-from bwbayes.report.figures.loops import draw_loops
+from bwbayes.report.figures.measured import draw_loops
 from bwbayes.report.figures.record import record_drawings
+from bwbayes.report.figures.residuals import draw_innovations, draw_spectrum
 from bwbayes.report.figures.series import draw_bands
-from bwbayes.report.figures.spectrum import draw_spectrum
-from bwbayes.report.figures.tracking import draw_tracking
 from bwbayes.report.report import Figure
 from bwbayes.report.result import Result
 from bwbayes.shown import brief

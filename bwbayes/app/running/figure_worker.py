@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.running.workers import processes
-from bwbayes.report.figures import drawings, picture_of, prepare, save_pictures
+from bwbayes.report.figures import picture_of, prepare, save_pictures
+from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import PagePlots
 from bwbayes.report.result import Result
 
@@ -39,7 +40,7 @@ class Artist:
         if self.pool is None:
             return
         calls: dict[str, Callable[[], Any]] = {
-            name: partial(picture_of, draw) for name, draw in drawings(result).items()
+            name: partial(picture_of, picture.draw) for name, picture in pictures(result).items()
         }
         if result.bands:
             calls["plots"] = partial(_plots_of, result)
@@ -51,8 +52,8 @@ class Artist:
         """Wait until all are drawn, write them to the folder, and return PNG by name."""
         self.draw(result)
         images: dict[str, bytes] = {
-            name: self._made(name, partial(picture_of, draw))
-            for name, draw in drawings(result).items()
+            name: self._made(name, partial(picture_of, picture.draw))
+            for name, picture in pictures(result).items()
         }
         save_pictures(images, folder)
         return images

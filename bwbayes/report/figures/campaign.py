@@ -8,13 +8,9 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.report.figures.style import BAND_COLORS, COLORS, hide_unused, plain
+from bwbayes.report.figures import style
 
 __all__ = ["Interval", "ParameterPanel", "draw_parameters"]
-
-COLUMNS = 3
-
-ALONE_COLOR = "#999999"
 
 
 class Interval(NamedTuple):
@@ -45,17 +41,13 @@ def draw_parameters(records: Sequence[str], parameters: Sequence[ParameterPanel]
     Gray alone and blue with the population for a prior, the population's median and where 95 % of
     specimens not measured yet lie. Outliers are red.
     """
-    lines = -(-len(parameters) // COLUMNS)
-    figure = Figure(figsize=(11, 2.6 * lines + 0.4), layout="constrained")
-    grid = figure.subplots(lines, COLUMNS, squeeze=False)
-    panels = hide_unused(grid, len(parameters), "record")
+    figure, panels = style.panel_grid(len(parameters), 3, 2.6, "record")
     for panel, parameter in zip(panels, parameters, strict=True):
         _draw_parameter(panel, records, parameter)
-        panel.set_ylabel(plain(parameter.label))
-        panel.set_xlim(0, len(records) + 1)
+        panel.set(ylabel=style.plain(parameter.label), xlim=(0, len(records) + 1))
         # The names of more records would overlap.
         if len(records) <= 24:
-            names = [plain(name) for name in records]
+            names = [style.plain(name) for name in records]
             panel.set_xticks(range(1, len(records) + 1), names, rotation=90, fontsize=7)
     return figure
 
@@ -63,15 +55,15 @@ def draw_parameters(records: Sequence[str], parameters: Sequence[ParameterPanel]
 def _draw_parameter(panel: Axes, records: Sequence[str], parameter: ParameterPanel) -> None:
     if parameter.specimen is not None:
         low, median, high, _ = parameter.specimen
-        panel.axhspan(low, high, color=BAND_COLORS["sensor"], zorder=0)
-        panel.axhline(median, color=COLORS[0], lw=0.8, zorder=1)
+        panel.axhspan(low, high, color=style.BAND_COLORS["sensor"], zorder=0)
+        panel.axhline(median, color=style.COLORS[0], lw=0.8, zorder=1)
     for x, name in enumerate(records, start=1):
         alone, shrunk = parameter.alone.get(name), parameter.shrunk.get(name)
         if alone is not None:
-            panel.vlines(x, alone.lower, alone.upper, color=ALONE_COLOR, lw=0.8)
+            panel.vlines(x, alone.lower, alone.upper, color=style.LEAD_IN_COLOR, lw=0.8)
         if shrunk is not None:
-            color = COLORS[1] if shrunk.outlier else COLORS[0]
+            color = style.COLORS[1] if shrunk.outlier else style.COLORS[0]
             panel.vlines(x + 0.25, shrunk.lower, shrunk.upper, color=color, lw=1.4)
             panel.plot(x + 0.25, shrunk.median, "o", color=color, ms=2.5)
         elif alone is not None:
-            panel.plot(x, alone.median, ".", color=ALONE_COLOR, ms=3)
+            panel.plot(x, alone.median, ".", color=style.LEAD_IN_COLOR, ms=3)

@@ -6,34 +6,16 @@ import itertools
 
 import numpy as np
 import scipy
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 
-from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.report.figures.style import (
-    COLORS,
-    TRUTH_COLOR,
-    axis_label,
-    hide_unused,
-    share_legend,
-    starts,
-)
+from bwbayes.arrays import FloatArray
+from bwbayes.report.figures import style
 from bwbayes.report.result import Result
 
 __all__ = ["draw_corner", "draw_ranks", "draw_trace"]
 
 RANK_BINS = 20
-
-# Inches of one panel of the corner picture and of its margin for labels, and the size of its text,
-# which the page shows smaller the more panels there are.
-CORNER_PANEL = 1.25
-CORNER_MARGIN = 1.3
-CORNER_FONT = 11
-CORNER_BINS = 20
-
-# How far its labels are off its panels, in units of a panel.
-CORNER_LABEL = 0.75
 
 
 def draw_corner(result: Result) -> Figure:
@@ -44,49 +26,46 @@ def draw_corner(result: Result) -> Figure:
     import corner  # noqa: PLC0415  # it loads all of arviz, which nobody else here needs
 
     flat = result.flat_draws
-    flat = flat[starts(flat.shape[0], 5_000)]
+    flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
-    truths = [result.truth.get(p.name) for p in result.free]
+    truths = [result.truth.get(parameter.name) for parameter in result.free]
     ranges = [_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)]
-    ticks = [_inner_ticks(*limits) for limits in ranges]
-    side = CORNER_PANEL * free + CORNER_MARGIN + 0.2
+    # Inches: a panel has 1.25, the margin for the labels 1.3.
+    side = 1.25 * free + 1.5
     figure = Figure(figsize=(side, side))
-    margin, edge = CORNER_MARGIN / side, 1 - 0.2 / side
-    edges = {"left": margin, "bottom": margin, "right": edge, "top": edge}
-    grid = figure.add_gridspec(free, free, **edges, wspace=0.05, hspace=0.05)
-    for row, column in zip(*(axis.tolist() for axis in np.tril_indices(free)), strict=True):
-        panel = figure.add_subplot(grid[row, column])
-        panel.tick_params(labelsize=CORNER_FONT, labelbottom=False, labelleft=False)
-        if row == column:
-            low, high = ranges[row]
-            bins = np.linspace(low, high, CORNER_BINS + 1).tolist()
-            heights = panel.hist(flat[:, row], bins, histtype="step", color=COLORS[0])[0]
-            panel.set(xlim=ranges[row], ylim=(0, 1.1 * np.max(heights)))
-        else:
-            corner.hist2d(
-                *flat[:, [column, row]].T,
-                ax=panel,
-                bins=CORNER_BINS,
-                range=[ranges[column], ranges[row]],
-                levels=(0.5, 0.9),
-                color=COLORS[0],
-                smooth=0.8,
-                plot_density=False,
-                fill_contours=True,
-                data_kwargs={"alpha": 0.3, "ms": 1.2},
-                quiet=True,
-            )
-        panel.xaxis.set_major_locator(FixedLocator(ticks[column]))
-        panel.yaxis.set_major_locator(FixedLocator(ticks[row]) if row > column else NullLocator())
-        _mark_truth(panel, truths[column], truths[row] if row > column else None)
-        if row == free - 1:
-            panel.tick_params("x", labelbottom=True, labelrotation=90)
-            panel.set_xlabel(axis_label(result.free[column]), fontsize=CORNER_FONT + 2)
-            panel.xaxis.set_label_coords(0.5, -CORNER_LABEL)
-        if column == 0 and row > 0:
-            panel.tick_params("y", labelleft=True)
-            panel.set_ylabel(axis_label(result.free[row]), fontsize=CORNER_FONT + 2)
-            panel.yaxis.set_label_coords(-CORNER_LABEL, 0.5)
+    figure.subplots(free, free)
+    corner.corner(
+        flat,
+        fig=figure,
+        bins=20,
+        range=ranges,
+        labels=[style.axis_label(parameter) for parameter in result.free],
+        label_kwargs={"fontsize": 13},
+        levels=(0.5, 0.9),
+        color=style.COLORS[0],
+        smooth=0.8,
+        plot_density=False,
+        fill_contours=True,
+        data_kwargs={"alpha": 0.3, "ms": 1.2},
+        quiet=True,
+    )
+    low, high = 1.3 / side, 1 - 0.2 / side
+    figure.subplots_adjust(low, low, high, high, wspace=0.05, hspace=0.05)
+    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
+    for panel, (row, column) in zip(figure.axes, np.ndindex(free, free), strict=True):
+        if row < column:
+            continue
+        panel.tick_params("x", labelsize=11, labelrotation=90)
+        panel.tick_params("y", labelsize=11, labelrotation=0)
+        panel.xaxis.set_major_locator(ticks[column])
+        panel.xaxis.set_label_coords(0.5, -0.75)
+        if (truth := truths[column]) is not None:
+            panel.axvline(truth, color=style.TRUTH_COLOR)
+        if row > column:
+            panel.yaxis.set_major_locator(ticks[row])
+            panel.yaxis.set_label_coords(-0.75, 0.5)
+            if (truth := truths[row]) is not None:
+                panel.axhline(truth, color=style.TRUTH_COLOR)
     return figure
 
 
@@ -105,56 +84,38 @@ def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-def _mark_truth(panel: Axes, across: float | None, upright: float | None) -> None:
-    """Draw the true values that are known."""
-    if across is not None:
-        panel.axvline(across, color=TRUTH_COLOR)
-    if upright is not None:
-        panel.axhline(upright, color=TRUTH_COLOR)
-
-
 def draw_trace(result: Result) -> Figure:
     """Draw, step by step, each ensemble's mean over its walkers and where 90 % of them are.
 
     All parameters, and the log density. Ensembles that stay apart or drift have not converged.
     """
-    names = [*(axis_label(p) for p in result.free), "log density (nats)"]
-    rows = -(-len(names) // 2)
-    figure = Figure(figsize=(11, 1.5 * rows + 0.6), layout="constrained")
-    grid = figure.subplots(rows, 2, sharex=True, squeeze=False)
-    steps = starts(result.draws.shape[0], 400)
+    names = [*map(style.axis_label, result.free), "log density (nats)"]
+    figure, panels = style.panel_grid(len(names), 2, 1.5, "step", sharex=True)
+    steps = style.starts(result.draws.shape[0], 400)
     series = np.concatenate([result.draws[steps], result.log_density[steps][..., None]], axis=-1)
     series = np.where(np.isfinite(series), series, np.nan)
     mean = np.mean(series, axis=2)
-    cuts, low, high = _spread(series)
+    # The quantiles are those of fifty stretches of steps; the last one's stand at its end, too.
+    cuts = np.append(style.starts(steps.size, 50), steps.size)
+    spread = [
+        np.quantile(series[a:b], [0.05, 0.95], axis=(0, 2)) for a, b in itertools.pairwise(cuts)
+    ]
+    low, high = np.stack([*spread, spread[-1]], axis=1)
     ends = np.append(steps, result.draws.shape[0])[cuts]
-    for i, panel in enumerate(hide_unused(grid, len(names), "step")):
-        panel.tick_params(labelbottom=bool(panel.get_xlabel()))
-        panel.set_ylabel(names[i])
+    for i, (panel, name) in enumerate(zip(panels, names, strict=True)):
+        panel.set_ylabel(name)
         for ensemble in range(series.shape[1]):
-            color = COLORS[ensemble % len(COLORS)]
-            edges = (low[:, ensemble, i], high[:, ensemble, i])
-            panel.fill_between(ends + 1, *edges, color=color, alpha=0.15, lw=0, step="post")
-            panel.plot(
-                steps + 1, mean[:, ensemble, i], color=color, label=f"ensemble {ensemble + 1}"
-            )
-    share_legend(figure)
+            edges = low[:, ensemble, i], high[:, ensemble, i]
+            look = _look(ensemble)
+            panel.fill_between(ends + 1, *edges, color=look["color"], alpha=0.15, lw=0, step="post")
+            panel.plot(steps + 1, mean[:, ensemble, i], **look)
+    style.share_legend(figure)
     return figure
 
 
-def _spread(series: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return where 90 % of the walkers are in each of some stretches of steps.
-
-    ``series`` is (steps, ensembles, walkers, any). Returns where the stretches begin and the last
-    one ends, (stretches + 1,), and from there on the 5 % and 95 % quantiles, (stretches + 1,
-    ensembles, any), the last stretch's twice.
-    """
-    cuts = np.append(starts(series.shape[0], 50), series.shape[0])
-    edges = [
-        np.quantile(series[a:b], [0.05, 0.95], axis=(0, 2)) for a, b in itertools.pairwise(cuts)
-    ]
-    low, high = np.stack([*edges, edges[-1]], axis=1)
-    return cuts, low, high
+def _look(ensemble: int) -> style.Look:
+    color = style.COLORS[ensemble % len(style.COLORS)]
+    return {"color": color, "label": f"ensemble {ensemble + 1}"}
 
 
 def draw_ranks(result: Result) -> Figure:
@@ -166,30 +127,25 @@ def draw_ranks(result: Result) -> Figure:
     its half width is 1.96 √((B − 1)(E − 1) τ/n).
     """
     steps, ensembles, walkers, free = result.draws.shape
-    columns = min(3, free)
-    rows = -(-free // columns)
-    figure = Figure(figsize=(11, 1.8 * rows + 0.6), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    labels = "rank among all draws (%)", "draws per bin\n(expected: 1)"
+    figure, panels = style.panel_grid(free, min(3, free), 1.8, *labels, sharex=True)
     # About 100,000 draws are ranked.
-    thinned = result.draws[starts(steps, max(100_000 // (ensembles * walkers), 1))]
-    for i, panel in enumerate(hide_unused(grid, free, "rank among all draws (%)")):
-        panel.tick_params(labelbottom=bool(panel.get_xlabel()))
-        panel.set_title(axis_label(result.free[i]))
+    thinned = result.draws[style.starts(steps, max(100_000 // (ensembles * walkers), 1))]
+    for i, panel in enumerate(panels):
+        panel.set_title(style.axis_label(result.free[i]))
         panel.margins(y=0.12)
-        if i % columns == 0:
-            panel.set_ylabel("draws per bin\n(expected: 1)")
+        panel.axhline(1.0, color="#777777", lw=0.8)
         time = float(np.maximum(result.outcome.check.autocorrelation[i], 1.0))
-        _draw_even(panel, steps * ensembles * walkers / time, ensembles)
+        if np.isfinite(time):
+            independent = steps * ensembles * walkers / time
+            reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
+            label = "what independent draws show"
+            band = max(1 - reach, 0.0), 1 + reach
+            panel.axhspan(*band, color=style.CHANCE_COLOR, lw=0, label=label)
+        edges = np.linspace(0, 100, RANK_BINS + 1)
         for ensemble, heights in enumerate(_rank_heights(thinned[..., i])):
-            panel.stairs(
-                heights,
-                np.linspace(0, 100, RANK_BINS + 1),
-                baseline=None,
-                color=COLORS[ensemble % len(COLORS)],
-                lw=1.2,
-                label=f"ensemble {ensemble + 1}",
-            )
-    share_legend(figure)
+            panel.stairs(heights, edges, baseline=None, lw=1.2, **_look(ensemble))
+    style.share_legend(figure)
     return figure
 
 
@@ -203,12 +159,3 @@ def _rank_heights(draws: FloatArray) -> FloatArray:
     counts = [np.histogram(ranks[:, e], edges)[0] for e in range(draws.shape[1])]
     heights: FloatArray = np.asarray(counts) * (RANK_BINS * draws.shape[1] / draws.size)
     return heights
-
-
-def _draw_even(panel: Axes, independent: float, ensembles: int) -> None:
-    """Draw what evenly spread ranks look like."""
-    panel.axhline(1.0, color="#777777", lw=0.8)
-    if np.isfinite(independent):
-        reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
-        band = (max(1 - reach, 0.0), 1 + reach)
-        panel.axhspan(*band, color="#dddddd", lw=0, label="what independent draws show")

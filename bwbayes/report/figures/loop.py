@@ -10,30 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import Bands, Kind
-from bwbayes.report.figures.style import (
-    BAND_COLORS,
-    BAND_NAMES,
-    MEAN_COLOR,
-    MEASURED_COLOR,
-    ZOOM_COLOR,
-    plain,
-    title,
-)
+from bwbayes.report.figures import style
 
-__all__ = ["along", "draw_loop", "paths", "polygons"]
+__all__ = ["LOOP_KINDS", "draw_loop", "path", "polygons"]
 
-SHOWN: tuple[Kind, ...] = ("sensor", "parameter")
-
-
-# The tip's panel is as high as this many sensor bands, or half the loop if that is less; a tenth of
-# it lies beyond the tip.
-TIP_HEIGHT = 4.0
-BEYOND = 0.1
-
-# Readings up to which their dots are large and dark.
-FEW = 5000
+LOOP_KINDS: tuple[Kind, ...] = ("sensor", "parameter")
 
 
 def draw_loop(predictions: Sequence[Bands]) -> Figure:
@@ -43,107 +26,80 @@ def draw_loop(predictions: Sequence[Bands]) -> Figure:
     loop's scale can be seen.
     """
     columns = len(predictions)
-    size = (max(3.6 * columns, 6.0), 7.2)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(2, columns, squeeze=False)
+    figure, axes = style.new_figure(max(3.6 * columns, 6.0), 7.2, 2, columns)
     for (full, tip), bands in zip(axes.T, predictions, strict=True):
-        for panel, dot in ((full, ","), (tip, ".")):
-            _draw(panel, bands, dot)
-            panel.set_xlabel("voltage (V)")
+        _draw(full, bands, ",")
+        _draw(tip, bands, ".")
         _zoom(full, tip, bands)
-        full.set_title(plain(title(bands)))
+        full.set_title(style.plain(style.title(bands)))
         tip.set_title("tip at the largest voltage")
     for panel in axes[:, 0]:
         panel.set_ylabel("displacement (µm)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    style.share_legend(figure)
     return figure
 
 
 def _draw(panel: Axes, bands: Bands, dot: str) -> None:
-    windows = paths(bands)
-    for kind in SHOWN:
-        panel.add_collection(_ribbon(bands, windows, kind))
-    for number, path in enumerate(windows):
-        label = "_nolegend_" if number else "mean"
-        panel.plot(bands.voltage[path], bands.mean[path], color=MEAN_COLOR, lw=0.7, label=label)
+    for segment in map(path, style.segments(bands)):
+        for kind in LOOP_KINDS:
+            # Opaque: what overlaps where the path turns must not look like a denser band.
+            look: style.Look = {
+                "facecolor": style.BAND_COLORS[kind],
+                "edgecolor": style.BAND_COLORS[kind],
+            }
+            corners = list(polygons(segment, kind))
+            panel.add_collection(
+                PolyCollection(corners, lw=0.4, label=style.BAND_NAMES[kind], **look)
+            )
+        panel.plot(segment.voltage, segment.mean, color=style.MEAN_COLOR, lw=0.7, label="mean")
     if bands.measured is not None:
-        panel.plot([], [], ".", color=MEASURED_COLOR, label="measured")
-        sparse = bands.measured.size <= FEW
-        dots = panel.plot(
-            bands.voltage, bands.measured, "." if sparse else dot, color=MEASURED_COLOR
-        )
-        size, alpha = (3.0, 0.7) if sparse else (2.0, 0.25)
-        dots[0].set(markersize=size, markeredgewidth=0.0, zorder=1.5, alpha=alpha)
+        panel.plot([], [], ".", color=style.MEASURED_COLOR, label="measured")
+        # Few readings have large and dark dots.
+        size, alpha, marker = (3.0, 0.7, ".") if bands.measured.size <= 5000 else (2.0, 0.25, dot)
+        dots: style.Look = {"ls": "", "ms": size, "mew": 0.0, "zorder": 1.5, "alpha": alpha}
+        panel.plot(bands.voltage, bands.measured, marker=marker, color=style.MEASURED_COLOR, **dots)
     panel.autoscale_view()
+    panel.set_xlabel("voltage (V)")
 
 
-def paths(bands: Bands) -> list[IntArray]:
-    """Return the samples to draw of each window."""
-    return [
-        window.start
-        + along(bands.voltage[window], bands.mean[window])  # no path from one to the next
-        for window in bands.windows
-    ]
+def path(bands: Bands, density: int = 300) -> Bands:
+    """Return the samples of a window that are drawn: one for each small step along the loop.
 
-
-def along(voltage: FloatArray, displacement: FloatArray) -> IntArray:
-    """Return the samples to draw: one for each small step along the loop.
-
-    A fast signal keeps its samples, a slow one loses those that fall on the same spot.
+    A fast signal keeps its samples, a slow one loses those that fall on the same spot: there are
+    ``density`` points in a unit of length, the ranges of voltage and displacement being one each.
     """
-    steps = [np.diff(x) / max(float(np.ptp(x)), 1e-300) for x in (voltage, displacement)]
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*steps))])
-    # Drawn points per unit of length, the ranges of voltage and displacement being one each.
-    corners: IntArray = np.unique(np.floor(300 * length), return_index=True)[1]
-    return np.union1d(corners, [voltage.size - 1])
+    steps = [np.diff(x) / max(float(np.ptp(x)), 1e-300) for x in (bands.voltage, bands.mean)]
+    length = np.append(0.0, np.cumsum(np.hypot(*steps)))
+    rows = np.unique(np.floor(density * length), return_index=True)[1]
+    return style.choose(bands, np.union1d(rows, [bands.voltage.size - 1]))
 
 
-def _ribbon(bands: Bands, windows: Sequence[IntArray], kind: Kind) -> PolyCollection:
-    """Return a band along paths that may turn back: a polygon from each turn to the next.
-
-    Opaque, because what overlaps where the path turns must not look like a denser band.
-    """
-    color = BAND_COLORS[kind]
-    corners = list(polygons(bands, windows, kind))
-    return PolyCollection(
-        corners, facecolor=color, edgecolor=color, linewidth=0.4, label=BAND_NAMES[kind]
-    )
-
-
-def polygons(bands: Bands, windows: Sequence[IntArray], kind: Kind) -> Iterator[FloatArray]:
-    """Yield the corners (corners, 2) of a 95 % band along paths, from each turn to the next."""
-    for path in windows:
-        for window in one_way(bands.voltage[path]):
-            at = path[window]
-            edges = np.append(bands.lower[kind, 95][at], bands.upper[kind, 95][at[::-1]])
-            yield np.stack([bands.voltage[np.append(at, at[::-1])], edges], 1)
-
-
-def one_way(voltage: FloatArray) -> list[slice]:
-    """Return the stretches of a voltage from turn to turn, each with the samples at its ends."""
+def polygons(bands: Bands, kind: Kind) -> Iterator[FloatArray]:
+    """Yield the corners (corners, 2) of a 95 % band along a path, from each turn to the next."""
+    voltage, lower, upper = bands.voltage, bands.lower[kind, 95], bands.upper[kind, 95]
     rising = np.diff(voltage) > 0
     turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
-    edges = [0, *turns.tolist(), voltage.size - 1]
-    return [slice(first, last + 1) for first, last in itertools.pairwise(edges)]
+    for start, stop in itertools.pairwise([0, *turns.tolist(), voltage.size - 1]):
+        there = np.arange(start, stop + 1)
+        back = there[::-1]
+        edges = np.append(lower[there], upper[back])
+        yield np.stack([voltage[np.append(there, back)], edges], 1)
 
 
 def _zoom(full: Axes, tip: Axes, bands: Bands) -> None:
-    """Cut the tip's panel to the tip and mark it on the whole loop."""
+    """Cut the tip's panel to the tip and mark it on the whole loop.
+
+    It is as high as four sensor bands, or half the loop if that is less, and a tenth of it lies
+    beyond the tip.
+    """
     inside = slice(None) if bands.inside is None else bands.inside
     voltage = bands.voltage[inside]
     lower, upper = bands.lower["sensor", 95][inside], bands.upper["sensor", 95][inside]
     at = int(np.argmax(voltage))
-    height = float(np.max(upper) - np.min(lower))
-    upright = min(TIP_HEIGHT * float(np.mean(upper - lower)), height / 2)
-    across = (float(np.ptp(voltage)) or 1.0) * upright / height
-    side = float(voltage[at]) - (1 - BEYOND) * across
-    top = float(upper[at]) + BEYOND * upright
-    tip.set_xlim(side, side + across)
-    tip.set_ylim(top - upright, top)
-    full.indicate_inset(
-        (side, top - upright, across, upright),
-        edgecolor=ZOOM_COLOR,
-        alpha=1.0,
-        linewidth=1.5,
-    )
+    whole = float(np.max(upper) - np.min(lower))
+    height = min(4.0 * float(np.mean(upper - lower)), whole / 2)
+    width = (float(np.ptp(voltage)) or 1.0) * height / whole
+    left, bottom = float(voltage[at]) - 0.9 * width, float(upper[at]) - 0.9 * height
+    tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
+    outline: style.Look = {"edgecolor": style.ZOOM_COLOR, "alpha": 1.0, "linewidth": 1.5}
+    full.indicate_inset((left, bottom, width, height), **outline)

@@ -10,14 +10,11 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.record import Record
-from bwbayes.report.figures.style import COLORS, LEAD_IN_COLOR, MEASURED_COLOR, zigzag
+from bwbayes.report.figures import style
 
 __all__ = ["record_drawings"]
-
-SPECTRUM_POINTS = 1500
 
 
 def record_drawings(
@@ -44,103 +41,77 @@ def record_drawings(
 
 def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Finding]) -> Figure:
     read = record.displacement is not None
-    figure = Figure(figsize=(11, 5.6 if read else 3.2), layout="constrained")
-    panels = figure.subplots(1 + read, 1, sharex=True, squeeze=False)[:, 0]
-    panels[0].plot(*zigzag(record.time, record.voltage), color=COLORS[0], lw=0.9)
+    figure, grid = style.new_figure(11, 5.6 if read else 3.2, 1 + read, sharex=True)
+    panels = grid[:, 0]
+    panels[0].plot(*style.zigzag(record.time, record.voltage), color=style.COLORS[0], lw=0.9)
     panels[0].set_ylabel("voltage (V)")
     if record.displacement is not None:
         rows = np.flatnonzero(record.has_reading)
         time, values = record.time[rows], record.displacement[rows]
-        # More readings are shown as a line.
         if rows.size < 2000:
-            panels[1].plot(time, values, ".", color=MEASURED_COLOR, ms=2.5, mew=0)
+            panels[1].plot(time, values, ".", color=style.MEASURED_COLOR, ms=2.5, mew=0)
         else:
-            panels[1].plot(*zigzag(time, _with_gaps(record, rows)), color=MEASURED_COLOR, lw=0.7)
+            # More readings are shown as a line, which ends at a gap that is longer than usual.
+            steps = np.diff(rows, prepend=rows[0])
+            values = np.where(steps > 3 * np.median(steps), np.nan, values)
+            panels[1].plot(*style.zigzag(time, values), color=style.MEASURED_COLOR, lw=0.7)
         panels[1].set_ylabel("displacement (µm)")
     for panel in panels:
         _mark(panel, record, training, findings)
     panels[-1].set_xlabel("time (s)")
-    handles, labels = panels[-1].get_legend_handles_labels()
-    if labels:
-        figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    style.share_legend(figure, ncols=4)
     return figure
-
-
-def _with_gaps(record: Record, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> FloatArray:
-    """Return the readings, nan at the first one behind a gap that is longer than usual."""
-    assert record.displacement is not None
-    values = record.displacement[rows].copy()
-    steps = np.diff(rows, prepend=rows[0])
-    values[steps > 3 * np.median(steps)] = np.nan
-    return values
 
 
 def _mark(
     panel: Axes, record: Record, training: Sequence[slice], findings: Sequence[Finding]
 ) -> None:
     """Show what is not fitted, and the parts of the record with which something is wrong."""
-    end = record.start + record.duration
-    label = "not fitted"
-    at = record.start
-    edges = [
+    at, end = record.start, record.start + record.duration
+    fitted = [
         (record.time[window.start], record.start + window.stop * record.interval)
         for window in training
     ]
-    for start, stop in [*edges, *([(end, end)] if edges else [])]:
+    for start, stop in [*fitted, (end, end)] if fitted else []:
         if start - at > record.interval / 2:
-            panel.axvspan(at, start, color=LEAD_IN_COLOR, alpha=0.25, lw=0, label=label)
-            label = "_nolegend_"
+            gray: style.Look = {"color": style.LEAD_IN_COLOR, "alpha": 0.25}
+            panel.axvspan(at, start, lw=0, label="not fitted", **gray)
         at = max(at, stop)
-    kinds: dict[str, str] = {}
-    for finding in findings:
-        if finding.stop - finding.start < 0.98 * record.duration:
-            color = kinds.setdefault(finding.kind, COLORS[1 + len(kinds) % (len(COLORS) - 2)])
-            panel.axvspan(
-                finding.start, finding.stop, color=color, alpha=0.3, lw=1, label=finding.kind
-            )
+    parts = [f for f in findings if f.stop - f.start < 0.98 * record.duration]
+    kinds = list(dict.fromkeys(finding.kind for finding in parts))
+    for finding in parts:
+        color = style.COLORS[1 + kinds.index(finding.kind) % (len(style.COLORS) - 2)]
+        span = finding.start, finding.stop
+        panel.axvspan(*span, color=color, alpha=0.3, lw=1, label=finding.kind)
 
 
 def _draw_loop(record: Record) -> Figure:
     assert record.displacement is not None
     rows = np.flatnonzero(record.has_reading)
     rows = rows[:: -(-rows.size // 20_000)]
-    figure = Figure(figsize=(6.4, 5.2), layout="constrained")
-    panel = figure.subplots()
-    dots = panel.scatter(
-        record.voltage[rows],
-        record.displacement[rows],
-        c=record.time[rows],
-        s=2.0,
-        lw=0,
-        cmap="viridis",
-        rasterized=True,
-    )
+    voltage, displacement = record.voltage[rows], record.displacement[rows]
+    figure, ((panel,),) = style.new_figure(6.4, 5.2)
+    look: style.Look = {"s": 2.0, "lw": 0, "cmap": "viridis", "rasterized": True}
+    dots = panel.scatter(voltage, displacement, c=record.time[rows], **look)
     figure.colorbar(dots, label="time (s)")
-    panel.set_xlabel("voltage (V)")
-    panel.set_ylabel("displacement (µm)")
+    panel.set(xlabel="voltage (V)", ylabel="displacement (µm)")
     return figure
 
 
-def _draw_drive(record: Record) -> Figure:
+def _draw_drive(record: Record, points: int = 1500) -> Figure:
     """Draw the spectrum of the voltage, above its mean, from one period a record on."""
     frequency, power = scipy.signal.periodogram(
         record.voltage, 1 / record.interval, "hann", scaling="spectrum"
     )
-    amplitude = np.sqrt(2 * power[1:])
-    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
-    panel = figure.subplots()
-    panel.loglog(*_thinned(frequency[1:], amplitude), color=COLORS[0], lw=0.9)
-    top = float(amplitude.max())
+    frequency, amplitude = frequency[1:], np.sqrt(2 * power[1:])
+    top, bottom = float(amplitude.max()), float(amplitude.min())
+    if frequency.size > points:
+        # The largest of each of some stretches that look alike on a log axis.
+        first = np.unique(np.geomspace(1, frequency.size, points).astype(np.int64)) - 1
+        frequency, amplitude = frequency[first], np.maximum.reduceat(amplitude, first)
+    figure, ((panel,),) = style.new_figure(6.4, 3.8)
+    panel.loglog(frequency, amplitude, color=style.COLORS[0], lw=0.9)
     # Six decades below the peak.
-    panel.set_ylim(max(top * 10.0**-6, float(amplitude.min()) / 2, 1e-12), 3 * top)
-    panel.set_xlabel("frequency (Hz)")
-    panel.set_ylabel("amplitude of the voltage (V)")
+    panel.set_ylim(max(top * 10.0**-6, bottom / 2, 1e-12), 3 * top)
+    panel.set(xlabel="frequency (Hz)", ylabel="amplitude of the voltage (V)")
     return figure
-
-
-def _thinned(frequency: FloatArray, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Keep the largest amplitude of each of some stretches that look alike on a log axis."""
-    if frequency.size <= SPECTRUM_POINTS:
-        return frequency, amplitude
-    first = np.unique(np.geomspace(1, frequency.size, SPECTRUM_POINTS).astype(np.int64)) - 1
-    return frequency[first], np.maximum.reduceat(amplitude, first)

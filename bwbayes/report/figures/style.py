@@ -6,13 +6,13 @@ lightness besides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import ArrayLike, FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands, Kind, titled
 from bwbayes.report.words import label_with_unit
@@ -25,25 +25,35 @@ if TYPE_CHECKING:
 __all__ = [
     "BAND_COLORS",
     "BAND_NAMES",
+    "CHANCE_COLOR",
     "COLORS",
     "EDGE_COLOR",
     "LEAD_IN_COLOR",
+    "LIMIT_COLOR",
     "MEAN_COLOR",
     "MEASURED_COLOR",
     "STYLE",
     "TRUTH_COLOR",
     "ZOOM_COLOR",
+    "Look",
     "axis_label",
+    "choose",
+    "draw_band",
+    "draw_ribbons",
     "envelope",
-    "hide_unused",
+    "new_figure",
+    "panel_grid",
     "plain",
+    "segments",
     "share_legend",
     "starts",
     "time_label",
     "title",
-    "with_gaps",
     "zigzag",
 ]
+
+# How something looks: keywords of what draws it.
+type Look = dict[str, Any]
 
 STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
@@ -72,6 +82,8 @@ MEAN_COLOR = "#D55E00"
 MEASURED_COLOR = "#222222"
 TRUTH_COLOR = "#E69F00"
 LEAD_IN_COLOR = "#999999"
+LIMIT_COLOR = "#777777"  # of what is expected
+CHANCE_COLOR = "#dddddd"  # of what chance does
 ZOOM_COLOR = "#CC79A7"
 
 # From the widest band, drawn first, to the narrowest.
@@ -115,22 +127,20 @@ def time_label(offset: float) -> str:
     return f"time after {offset:.15g} s (s)" if offset else "time (s)"
 
 
-def with_gaps(bands: Bands) -> Bands:
-    """Return bands of several windows with nan between them, where lines are to end."""
-    inside = bands.inside
-    if inside is None:
-        return bands
+def segments(bands: Bands) -> list[Bands]:
+    """Return the bands of each window by itself: no line or area goes from one to the next."""
+    return [bands.within([window]) for window in bands.windows]
 
-    def cut(values: FloatArray) -> FloatArray:
-        return np.where(inside, values, np.nan)
 
-    return replace(
-        bands,
-        voltage=cut(bands.voltage),
-        mean=cut(bands.mean),
-        lower={key: cut(edge) for key, edge in bands.lower.items()},
-        upper={key: cut(edge) for key, edge in bands.upper.items()},
-    )
+def choose(bands: Bands, rows: IntArray) -> Bands:
+    """Return the bands at some of their samples."""
+    changes: dict[str, Any] = {
+        name: None if (values := getattr(bands, name)) is None else values[rows]
+        for name in ("time", "voltage", "measured", "truth", "mean")
+    }
+    for side in ("lower", "upper"):
+        changes[side] = {band: edge[rows] for band, edge in getattr(bands, side).items()}
+    return replace(bands, **changes, inside=None)
 
 
 def starts(samples: int, count: int) -> IntArray:
@@ -160,20 +170,65 @@ def zigzag(
     return np.repeat(at, 2), np.stack([low, high], axis=1).ravel()
 
 
-def hide_unused(axes: np.ndarray[Any, Any], used: int, xlabel: str) -> list[Axes]:
-    """Return the first ``used`` panels of a grid, the lowest of each column with the x label."""
-    panels: list[Axes] = list(axes.flat)
+def new_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
+) -> tuple[Figure, Any]:
+    """Return a figure, inches, and its panels (rows, columns); ``options`` are of ``subplots``."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  # pages need words alone
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+def panel_grid(
+    count: int, columns: int, height: float, xlabel: str, ylabel: str = "", **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a grid of panels, each of a height in inches.
+
+    The lowest panel of each column has the x label, the first of each row the y label.
+    """
+    rows = -(-count // columns)
+    figure, grid = new_figure(11, height * rows + 0.6, rows, columns, **options)
+    panels: list[Axes] = list(grid.flat)
     for i, panel in enumerate(panels):
-        panel.set_visible(i < used)
-        if i < used <= i + axes.shape[1]:
-            panel.set_xlabel(xlabel)
-    return panels[:used]
+        panel.set_visible(i < count)
+        is_lowest = i < count <= i + columns
+        panel.set_xlabel(xlabel if is_lowest else "")
+        panel.set_ylabel("" if i % columns else ylabel)
+        if options.get("sharex"):
+            panel.tick_params(labelbottom=is_lowest)
+    return figure, panels[:count]
 
 
-def share_legend(figure: Figure, ncols: int = 8) -> None:
-    """Put one legend of all panels above them, where it hides no curve."""
+def draw_band(
+    panel: Axes, x: ArrayLike, mean: Any, edges: Any, label: str, color: str, style: str = "-"
+) -> None:
+    """Draw a mean (points,) with its band, two ``edges`` (points,), in the same color."""
+    panel.fill_between(x, *edges, fc=color, alpha=0.3, lw=0)
+    panel.plot(x, mean, style, ms=3, color=color, label=label)
+
+
+def draw_ribbons(
+    panel: Axes,
+    bands: Bands,
+    about: float | FloatArray = 0.0,
+    kinds: Sequence[Kind] = tuple(BAND_COLORS),
+) -> None:
+    """Draw 95 % bands along time less something, the widest first, the sensor's with an edge."""
+    for kind in kinds:
+        # Where the sensor's noise is small, its band would not be seen beside the displacement's.
+        edge: Look = {"ec": EDGE_COLOR, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
+        drawn = envelope(bands.time, bands.lower[kind, 95] - about, bands.upper[kind, 95] - about)
+        panel.fill_between(*drawn, fc=BAND_COLORS[kind], label=BAND_NAMES[kind], **edge)
+
+
+def share_legend(figure: Figure, ncols: int = 8, band: str = "") -> None:
+    """Put one legend of all panels above them; ``band`` names what :func:`draw_band` fills."""
+    if band:
+        figure.axes[0].fill_between([], [], fc="#888888", alpha=0.3, lw=0, label=band)
     handles: dict[str, Artist] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=ncols)
+    if handles:
+        figure.legend(handles.values(), handles, loc="outside upper center", ncols=ncols)

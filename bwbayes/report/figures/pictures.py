@@ -1,52 +1,97 @@
-"""What is said of a run's figures: their titles, what one reads from them, and what one would see.
-
-By the first word of a figure's name: ``bands`` for ``bands_training``.
-"""
+"""The pictures of a run, in the order in which one looks at them, and what is said of each."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from importlib import import_module
+from typing import Any
 
-__all__ = ["Caption", "caption"]
+from bwbayes.report.report import Figure, Picture
+from bwbayes.report.result import Result
+
+__all__ = ["Pictures", "pictures"]
+
+type Pictures = dict[str, Picture]
 
 
-class Caption(NamedTuple):
-    """A figure's title, how to read it, and what to say to those who do not see it."""
+def pictures(result: Result) -> Pictures:
+    """Return the pictures of a run by name, as far as what they show is known by now.
 
-    title: str
-    text: str
-    alt: str
+    ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME`` for each of
+    the result's bands, ``coverage``, ``innovations`` and ``spectrum`` (of several records
+    ``innovations_NAME`` and so on), ``corner``, ``trace`` and ``ranks``. Without convergence only
+    the last two; without bands or a measurement to hold them against, what needs them is left out.
+    """
+    shown: dict[str, tuple[Any, ...]] = {}
+    if result.outcome.converged:
+        shown = {
+            "loop": (result.looped,),
+            "agreement": (result.agreement,),
+            "loops": (result.loops,),
+            "steps": (result.steps,),
+            **{f"bands_{bands.name}": (bands,) for bands in result.bands},
+            "coverage": (result.scores and result.bands, result.scores),
+        }
+        several = len(result.innovations) > 1
+        for kind in ("innovations", "spectrum"):
+            for name, innovations in result.innovations.items():
+                shown[f"{kind}_{name}" if several else kind] = (innovations,)
+        shown["corner"] = (result,)
+    shown |= {"trace": (result,), "ranks": (result,)}
+    return {name: _picture(name, *what) for name, what in shown.items() if what[0]}
 
 
-CAPTIONS = {
-    "loop": Caption(
+def _picture(name: str, *shown: Any) -> Picture:
+    kind, _, record = name.partition("_")
+    module, title, caption, alt = PICTURES[kind]
+    draw = partial(_draw, module, f"draw_{kind}", *shown)
+    if record:
+        title, alt = f"{title}: {record}", f"{alt} ({record})"
+    return Picture(name, title, caption, draw, alt)
+
+
+def _draw(module: str, function: str, *shown: Any) -> Figure:
+    """Draw with a function of one of this package's modules, which are slow to load."""
+    figure: Figure = getattr(import_module(f"bwbayes.report.figures.{module}"), function)(*shown)
+    return figure
+
+
+# By the first word of a picture's name: the module that draws it, its title, how to read it, and
+# what to say to those who do not see it.
+PICTURES = {
+    "loop": (
+        "loop",
         "Hysteresis loop",
         "Displacement against voltage. New readings lie in the sensor band, the model in the "
         "parameter band.",
         "Displacement against voltage: readings, their mean, and the 95 % bands around it",
     ),
-    "loops": Caption(
+    "loops": (
+        "measured",
         "Major loop, minor loop and initial curve",
         "The model driven slowly, without dynamics, creep and offset. Left: displacement against "
         "voltage. Right: the same minus the straight line between the major loop's turning "
         "points, where the 95 % bands of the parameters can be seen.",
         "Displacement against voltage of major loop, minor loop and initial curve, with bands",
     ),
-    "agreement": Caption(
+    "agreement": (
+        "residuals",
         "Do the records agree?",
         "What each record's readings are off the joint fit, and off a fit of that record alone. "
         "The chi-square compares where both fits have the shared parameters with how far apart "
         "chance may put them.",
         "Residuals of each record in the joint fit and in a fit of its own, against time",
     ),
-    "steps": Caption(
+    "steps": (
+        "measured",
         "Step responses",
         "Displacement after a voltage step from zero, over the logarithm of time; on the right its "
         "growth from 0.1 s on. The step is ideal, whatever the amplifier did. Bands: 95 %, of the "
         "parameters.",
         "Displacement since a step, against the logarithm of time, with its band",
     ),
-    "bands": Caption(
+    "bands": (
+        "series",
         "Over time",
         "Voltage, displacement, and readings minus mean. Of all readings, 95 % should lie inside "
         "the sensor band; those of a lead-in, if any, served to estimate the sensor's offset and "
@@ -54,7 +99,8 @@ CAPTIONS = {
         "stretch: more of them lie outside than of all readings.",
         "Voltage, displacement with its 95 % bands, and readings minus mean, against time",
     ),
-    "coverage": Caption(
+    "coverage": (
+        "coverage",
         "Coverage and PIT",
         "Left: how much the bands cover, against what they promise; whiskers are one "
         "block-bootstrap standard error. It does not include that a record has one offset, and a "
@@ -64,7 +110,8 @@ CAPTIONS = {
         "bowl too narrow, a slope a bias.",
         "Measured against promised coverage of the bands, and a histogram of the readings' PIT",
     ),
-    "innovations": Caption(
+    "innovations": (
+        "residuals",
         "Innovations",
         "What each fitted reading adds to those before it: its residual minus what they predict "
         "of it, over its standard deviation. If model and noise model are right these are "
@@ -72,37 +119,32 @@ CAPTIONS = {
         "size from the start on, and the same wherever the drive is. Whiskers are 95 % of chance.",
         "Autocorrelation, normal quantiles, course in time and size by drive of the innovations",
     ),
-    "spectrum": Caption(
+    "spectrum": (
+        "residuals",
         "Spectrum of the residuals",
         "Amplitude spectral density of the residuals, and that of the noise model at the most "
         "probable draw. A peak above it is an oscillation that the noise model does not describe.",
         "Amplitude density of the residuals and of the noise model against frequency",
     ),
-    "corner": Caption(
+    "corner": (
+        "chain",
         "Posterior",
         "Each parameter, and each pair of parameters; contours hold 50 and 90 % of the draws. "
         "Crossing lines, if any, are the true values.",
         "Histogram of each parameter and contours of each pair of parameters",
     ),
-    "trace": Caption(
+    "trace": (
+        "chain",
         "Trace",
         "Each ensemble's mean over its walkers, step by step, and the spread of its walkers. "
         "Ensembles should lie on top of each other and not drift.",
         "Each parameter's mean and spread in each ensemble, step by step",
     ),
-    "ranks": Caption(
+    "ranks": (
+        "chain",
         "Ranks",
         "How the ranks of each ensemble's draws among all draws are spread. Each line should stay "
         "near one, mostly inside the gray stripe that independent draws would fill.",
         "Histograms of ranks, one line for each ensemble and a panel for each parameter",
     ),
 }
-
-
-def caption(name: str) -> Caption:
-    """Return what is said of a figure; of an unknown one, its name."""
-    kind, _, record = name.partition("_")
-    words = CAPTIONS.get(kind, Caption(kind, "", kind))
-    if not record:
-        return words
-    return Caption(f"{words.title}: {record}", words.text, f"{words.alt} ({record})")
